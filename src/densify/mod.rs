@@ -1,0 +1,1 @@
+//! Statistics, growing and pruning of anchors.

@@ -1,0 +1,1 @@
+//! Photometric, depth alignment, depth, depth gradient.

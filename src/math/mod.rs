@@ -1,0 +1,1 @@
+//! Scalar functions that the CPU twins share.

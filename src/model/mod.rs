@@ -1,0 +1,1 @@
+//! What is learnt: anchors, decoder, attention; files on disk.

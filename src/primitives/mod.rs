@@ -1,0 +1,1 @@
+//! Scan, sort, reduce, compact: know nothing of splats.

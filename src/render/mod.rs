@@ -1,0 +1,1 @@
+//! Cull, decode, project, bin, rasterize: forward and backward of a stage in one file.

@@ -1,0 +1,1 @@
+//! What was captured: cameras, photographs, masks, depth priors, points.
