@@ -1,1 +1,30 @@
-//! The machine room: device, memory, kernels, recorder, barriers, timings.
+//! The machine room: device, memory, kernels, recorder, barriers, timings. `vk::` appears nowhere else.
+//!
+//! A pass is one call: [`Recorder::run`] takes a kernel's typed bindings, its push constants and a number of threads.
+//! The recorder knows from the bindings what the pass reads and writes and records a barrier exactly where a hazard
+//! demands one. Every kernel has a CPU twin ([`Reference`]); [`Recorder::checked`] runs both and compares.
+
+pub mod check;
+pub mod device;
+pub mod error;
+pub mod hazards;
+pub mod kernel;
+pub mod memory;
+pub mod recorder;
+pub mod testing;
+pub mod timings;
+
+pub use check::{Check, Difference};
+pub use device::{DeviceInfo, Gpu, Options};
+pub use error::Error;
+pub use hazards::{Entry, Schedule};
+pub use kernel::{Access, Binding, Kernel, Reference, Slot};
+pub use memory::Buffer;
+pub use recorder::{Groups, Recorder, Submission, Threads};
+pub use timings::{Timing, Timings};
+
+/// The typed interfaces of all kernels, generated from `glsl/` by `build.rs`.
+#[allow(missing_docs, clippy::all, clippy::pedantic)]
+pub mod kernels {
+    include!(concat!(env!("OUT_DIR"), "/kernels.rs"));
+}

@@ -1,1 +1,3 @@
 //! Scan, sort, reduce, compact: know nothing of splats.
+
+pub mod dispatch;

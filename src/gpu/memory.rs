@@ -1,0 +1,217 @@
+//! Buffers: named, typed device memory from `gpu-allocator`.
+
+use std::marker::PhantomData;
+use std::sync::Arc;
+
+use ash::vk;
+use gpu_allocator::MemoryLocation;
+use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, AllocationScheme};
+
+use super::device::{Gpu, Inner};
+use super::error::{Error, Named};
+use super::hazards::Id;
+
+/// A typed array on the device. Freed when dropped, after the work in flight has ended.
+pub struct Buffer<T> {
+    memory: Memory,
+    len: usize,
+    element: PhantomData<fn() -> T>,
+}
+
+struct Memory {
+    raw: vk::Buffer,
+    bytes: u64,
+    name: &'static str,
+    allocation: Option<Allocation>,
+    gpu: Arc<Inner>,
+}
+
+/// A bound buffer without its type.
+#[derive(Clone, Copy, Debug)]
+pub struct Slot {
+    pub(super) raw: vk::Buffer,
+    pub(super) bytes: u64,
+    /// The buffer's name.
+    pub name: &'static str,
+}
+
+impl Slot {
+    pub(super) fn id(&self) -> Id {
+        ash::vk::Handle::as_raw(self.raw)
+    }
+}
+
+impl<T: bytemuck::Pod> Buffer<T> {
+    /// Number of elements.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+    /// True without elements.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+    /// Bytes of device memory.
+    pub fn bytes(&self) -> u64 {
+        self.memory.bytes
+    }
+    /// The name given at creation.
+    pub fn name(&self) -> &'static str {
+        self.memory.name
+    }
+    /// The buffer without its type.
+    pub fn slot(&self) -> Slot {
+        Slot { raw: self.memory.raw, bytes: self.memory.bytes, name: self.memory.name }
+    }
+    /// Host view of memory the host can see: of [`Gpu::readback`] buffers only.
+    pub(super) fn mapped(&self) -> Option<&[u8]> {
+        self.memory.allocation.as_ref().and_then(Allocation::mapped_slice)
+    }
+    /// The parts, without the Arc of the device; the caller frees them with [`Inner::discard`].
+    pub(super) fn into_parts(mut self) -> (vk::Buffer, Allocation) {
+        let allocation = self.memory.allocation.take().expect("a buffer owns its memory until it is dropped");
+        (self.memory.raw, allocation)
+    }
+    fn mapped_mut(&mut self) -> Option<&mut [u8]> {
+        self.memory.allocation.as_mut().and_then(Allocation::mapped_slice_mut)
+    }
+}
+
+impl Drop for Memory {
+    fn drop(&mut self) {
+        if let Some(allocation) = self.allocation.take() {
+            self.gpu.discard(self.raw, allocation);
+        }
+    }
+}
+
+impl Gpu {
+    /// An uninitialised device buffer of `len` elements.
+    ///
+    /// # Errors
+    /// [`Error::TooLarge`] when one binding cannot hold it, [`Error::OutOfMemory`] when the device cannot.
+    pub fn buffer<T: bytemuck::Pod>(&self, name: &'static str, len: usize) -> Result<Buffer<T>, Error> {
+        self.allocate(name, len, MemoryLocation::GpuOnly)
+    }
+
+    /// A buffer in host memory that the device writes and [`Gpu::read`] reads without a copy.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub fn readback<T: bytemuck::Pod>(&self, name: &'static str, len: usize) -> Result<Buffer<T>, Error> {
+        self.allocate(name, len, MemoryLocation::GpuToCpu)
+    }
+
+    /// A device buffer with these contents.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`], and whatever the copy meets.
+    pub fn upload<T: bytemuck::Pod>(&self, name: &'static str, data: &[T]) -> Result<Buffer<T>, Error> {
+        let buffer = self.buffer(name, data.len())?;
+        self.write(&buffer, data)?;
+        Ok(buffer)
+    }
+
+    /// Overwrites the first `data.len()` elements and waits.
+    ///
+    /// # Errors
+    /// Whatever the copy meets.
+    pub fn write<T: bytemuck::Pod>(&self, buffer: &Buffer<T>, data: &[T]) -> Result<(), Error> {
+        assert!(data.len() <= buffer.len(), "{}: {} elements into {}", buffer.name(), data.len(), buffer.len());
+        if data.is_empty() {
+            return Ok(());
+        }
+        let mut staging: Buffer<T> = self.allocate("staging", data.len(), MemoryLocation::CpuToGpu)?;
+        let bytes: &[u8] = bytemuck::cast_slice(data);
+        let mapped = staging.mapped_mut().expect("staging memory is host visible");
+        mapped[..bytes.len()].copy_from_slice(bytes);
+        let mut recorder = self.recorder()?;
+        recorder.copy(&staging, buffer, data.len());
+        recorder.submit()?.wait()?;
+        Ok(())
+    }
+
+    /// The contents of a buffer, after all submitted work that writes it was waited for.
+    ///
+    /// # Errors
+    /// Whatever the copy meets.
+    pub fn read<T: bytemuck::Pod>(&self, buffer: &Buffer<T>) -> Result<Vec<T>, Error> {
+        self.read_range(buffer, buffer.len())
+    }
+
+    /// The first `len` elements of a buffer.
+    ///
+    /// # Errors
+    /// As [`Gpu::read`].
+    pub fn read_range<T: bytemuck::Pod>(&self, buffer: &Buffer<T>, len: usize) -> Result<Vec<T>, Error> {
+        if let Some(bytes) = buffer.mapped() {
+            return Ok(bytemuck::pod_collect_to_vec(&bytes[..len * size_of::<T>()]));
+        }
+        let words = self.read_words(buffer.slot(), (len * size_of::<T>()) as u64)?;
+        Ok(bytemuck::pod_collect_to_vec(&words[..len * size_of::<T>() / 4]))
+    }
+
+    /// Raw words of a bound buffer.
+    pub(super) fn read_words(&self, slot: Slot, bytes: u64) -> Result<Vec<u32>, Error> {
+        if bytes == 0 {
+            return Ok(vec![]);
+        }
+        let staging: Buffer<u32> = self.readback("readback", (bytes / 4) as usize)?;
+        let mut recorder = self.recorder()?;
+        recorder.copy_bytes(slot, staging.slot(), bytes);
+        recorder.submit()?.wait()?;
+        let mapped = staging.mapped().expect("readback memory is host visible");
+        Ok(bytemuck::pod_collect_to_vec(&mapped[..bytes as usize]))
+    }
+
+    fn allocate<T: bytemuck::Pod>(
+        &self,
+        name: &'static str,
+        len: usize,
+        location: MemoryLocation,
+    ) -> Result<Buffer<T>, Error> {
+        const { assert!(size_of::<T>().is_multiple_of(4), "elements are made of 4-byte components") };
+        let bytes = (len * size_of::<T>()).max(4) as u64;
+        let limit = self.info().max_binding_bytes;
+        if location == MemoryLocation::GpuOnly && bytes > limit {
+            return Err(Error::TooLarge { name, bytes, limit, device: self.info().name.clone() });
+        }
+        let inner = self.inner();
+        let usage = vk::BufferUsageFlags::STORAGE_BUFFER
+            | vk::BufferUsageFlags::TRANSFER_SRC
+            | vk::BufferUsageFlags::TRANSFER_DST
+            | vk::BufferUsageFlags::INDIRECT_BUFFER;
+        let info = vk::BufferCreateInfo::default().size(bytes).usage(usage);
+        // SAFETY: the device outlives the buffer (the buffer holds an Arc of it), and the memory is bound before use.
+        let (raw, requirements) = unsafe {
+            let raw = inner.device.create_buffer(&info, None).named("creating a buffer")?;
+            (raw, inner.device.get_buffer_memory_requirements(raw))
+        };
+        let description = AllocationCreateDesc {
+            name,
+            requirements,
+            location,
+            linear: true,
+            allocation_scheme: AllocationScheme::GpuAllocatorManaged,
+        };
+        let allocation = match inner.allocate(&description) {
+            Ok(allocation) => allocation,
+            Err(source) => {
+                // SAFETY: never bound, never used.
+                unsafe { inner.device.destroy_buffer(raw, None) };
+                return Err(Error::OutOfMemory { name, bytes, device: self.info().name.clone(), source });
+            }
+        };
+        // SAFETY: fresh buffer, memory that meets its requirements.
+        unsafe { inner.device.bind_buffer_memory(raw, allocation.memory(), allocation.offset()) }
+            .named("binding a buffer's memory")?;
+        inner.name_object(raw, name);
+        let memory = Memory { raw, bytes, name, allocation: Some(allocation), gpu: inner.clone() };
+        Ok(Buffer { memory, len, element: PhantomData })
+    }
+}
+
+impl<T> std::fmt::Debug for Buffer<T> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}[{}]", self.memory.name, self.len)
+    }
+}

@@ -1,0 +1,585 @@
+//! Recording passes: barriers, labels, timestamps and crash markers come from one function.
+
+use ash::vk;
+use gpu_allocator::vulkan::Allocation;
+
+use super::check::Difference;
+use super::device::{Gpu, Inner, lock};
+use super::error::{Error, Named};
+use super::hazards::{Entry, Hazards, Id, Schedule};
+use super::kernel::{Access, Reference};
+use super::memory::{Buffer, Slot};
+use super::timings::Timing;
+
+/// Passes of one recording that can carry a timestamp and a crash marker; later ones run without.
+const MAX_PASSES: u32 = 1024;
+
+/// How many threads a pass has. Dispatch takes threads, never groups.
+#[derive(Clone, Copy)]
+pub enum Threads<'a> {
+    /// So many in a line; kernels number them with `thread_index()`.
+    Line(u64),
+    /// A grid.
+    Grid([u32; 3]),
+    /// As many as a count on the device says.
+    Counted(&'a Groups),
+}
+
+impl From<u32> for Threads<'_> {
+    fn from(n: u32) -> Self {
+        Threads::Line(n.into())
+    }
+}
+impl From<usize> for Threads<'_> {
+    fn from(n: usize) -> Self {
+        Threads::Line(n as u64)
+    }
+}
+impl From<[u32; 2]> for Threads<'_> {
+    fn from([x, y]: [u32; 2]) -> Self {
+        Threads::Grid([x, y, 1])
+    }
+}
+impl From<[u32; 3]> for Threads<'_> {
+    fn from(grid: [u32; 3]) -> Self {
+        Threads::Grid(grid)
+    }
+}
+impl<'a> From<&'a Groups> for Threads<'a> {
+    fn from(groups: &'a Groups) -> Self {
+        Threads::Counted(groups)
+    }
+}
+
+/// Workgroup counts on the device (x, y, z, and the count they come from), written by `primitives/dispatch`.
+#[derive(Debug)]
+pub struct Groups {
+    /// x, y, z of the dispatch, then the clamped count.
+    pub buffer: Buffer<u32>,
+    /// Threads of the workgroups they are meant for.
+    pub group: u32,
+}
+
+/// A command buffer with its queries and markers, used again and again.
+pub(super) struct Context {
+    commands: vk::CommandBuffer,
+    queries: vk::QueryPool,
+    fence: vk::Fence,
+    markers: (vk::Buffer, Allocation),
+}
+
+impl Context {
+    fn new(gpu: &Gpu) -> Result<Self, Error> {
+        let inner = gpu.inner();
+        // Without its Arc of the device: the device owns its contexts.
+        let markers = gpu.readback::<u32>("markers", MAX_PASSES as usize)?.into_parts();
+        let allocate =
+            vk::CommandBufferAllocateInfo::default().command_pool(inner.command_pool).command_buffer_count(1);
+        let queries =
+            vk::QueryPoolCreateInfo::default().query_type(vk::QueryType::TIMESTAMP).query_count(2 * MAX_PASSES);
+        // SAFETY: live device; destroyed in `destroy`.
+        unsafe {
+            Ok(Self {
+                commands: inner.device.allocate_command_buffers(&allocate).named("allocating a command buffer")?[0],
+                queries: inner.device.create_query_pool(&queries, None).named("creating a query pool")?,
+                fence: inner.device.create_fence(&vk::FenceCreateInfo::default(), None).named("creating a fence")?,
+                markers,
+            })
+        }
+    }
+
+    /// # Safety
+    /// Nothing in flight uses it.
+    pub(super) unsafe fn destroy(self, inner: &Inner) {
+        // SAFETY: by the caller's promise. The command buffer goes with its pool.
+        unsafe {
+            inner.device.destroy_query_pool(self.queries, None);
+            inner.device.destroy_fence(self.fence, None);
+            inner.discard(self.markers.0, self.markers.1);
+        }
+    }
+}
+
+/// Records passes. The first error is kept and returned by [`Recorder::submit`], so that a step reads as plain lines.
+pub struct Recorder<'g> {
+    gpu: &'g Gpu,
+    context: Option<Context>,
+    hazards: Hazards,
+    schedule: Schedule,
+    passes: Vec<&'static str>,
+    error: Option<Error>,
+    differences: Option<Vec<Difference>>,
+}
+
+/// Work given to the device.
+#[must_use = "wait() frees what the submission holds"]
+pub struct Submission<'g> {
+    gpu: &'g Gpu,
+    context: Option<Context>,
+    passes: Vec<&'static str>,
+    /// What was recorded.
+    pub schedule: Schedule,
+    /// GPU against twin, of a checked recording.
+    pub differences: Vec<Difference>,
+}
+
+impl Gpu {
+    /// A new recording.
+    ///
+    /// # Errors
+    /// When the device has no memory for a command buffer.
+    pub fn recorder(&self) -> Result<Recorder<'_>, Error> {
+        let context = lock(&self.inner().contexts).pop();
+        let context = context.map_or_else(|| Context::new(self), Ok)?;
+        let mut recorder = Recorder {
+            gpu: self,
+            context: Some(context),
+            hazards: Hazards::default(),
+            schedule: Schedule::default(),
+            passes: vec![],
+            error: None,
+            differences: None,
+        };
+        recorder.begin()?;
+        Ok(recorder)
+    }
+
+    /// A recording in which every pass runs at once, and its CPU twin on the same inputs beside it.
+    ///
+    /// # Errors
+    /// As [`Gpu::recorder`].
+    pub fn checked(&self) -> Result<Recorder<'_>, Error> {
+        let mut recorder = self.recorder()?;
+        recorder.differences = Some(vec![]);
+        Ok(recorder)
+    }
+}
+
+const SHADER: vk::PipelineStageFlags2 = vk::PipelineStageFlags2::COMPUTE_SHADER;
+const COPY: vk::PipelineStageFlags2 = vk::PipelineStageFlags2::ALL_TRANSFER;
+const INDIRECT: vk::PipelineStageFlags2 = vk::PipelineStageFlags2::DRAW_INDIRECT;
+
+impl<'g> Recorder<'g> {
+    /// The device it records for.
+    pub fn gpu(&self) -> &'g Gpu {
+        self.gpu
+    }
+
+    /// Runs kernel `K` with default constants on so many threads.
+    pub fn run<'t, K: Reference>(
+        &mut self,
+        kernel: K,
+        buffers: K::Buffers<'_>,
+        push: K::Push,
+        threads: impl Into<Threads<'t>>,
+    ) {
+        self.run_with(kernel, K::Constants::default(), buffers, push, threads);
+    }
+
+    /// Runs kernel `K` with these specialisation constants.
+    pub fn run_with<'t, K: Reference>(
+        &mut self,
+        _kernel: K,
+        constants: K::Constants,
+        buffers: K::Buffers<'_>,
+        push: K::Push,
+        threads: impl Into<Threads<'t>>,
+    ) {
+        if self.error.is_some() {
+            return;
+        }
+        let result = self.try_run::<K>(constants, &buffers, push, threads.into());
+        self.keep(result);
+    }
+
+    fn keep(&mut self, result: Result<(), Error>) {
+        if let Err(error) = result {
+            self.error.get_or_insert(error);
+        }
+    }
+
+    fn try_run<K: Reference>(
+        &mut self,
+        constants: K::Constants,
+        buffers: &K::Buffers<'_>,
+        push: K::Push,
+        threads: Threads<'_>,
+    ) -> Result<(), Error> {
+        let slots = K::slots(buffers);
+        for (i, a) in slots.iter().enumerate() {
+            for (j, b) in slots.iter().enumerate().skip(i + 1) {
+                let written = K::BINDINGS[i].access.writes() || K::BINDINGS[j].access.writes();
+                assert!(a.raw != b.raw || !written, "{}: {} is bound twice, once for writing", K::NAME, a.name);
+            }
+        }
+        let inputs = if self.differences.is_some() {
+            self.flush()?;
+            Some(self.download(&slots)?)
+        } else {
+            None
+        };
+        self.dispatch::<K>(&constants, &slots, &push, threads)?;
+        if let Some(mut words) = inputs {
+            self.flush()?;
+            let got = self.download(&slots)?;
+            K::reference(K::host(&mut words), push, constants);
+            for ((binding, got), want) in K::BINDINGS.iter().zip(&got).zip(&words) {
+                if binding.access.writes() {
+                    let difference = Difference::of_words(K::NAME, binding, got, want, K::check(binding.name));
+                    self.differences.as_mut().expect("checked mode").push(difference);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn download(&self, slots: &[Slot]) -> Result<Vec<Vec<u32>>, Error> {
+        slots.iter().map(|slot| self.gpu.read_words(*slot, slot.bytes)).collect()
+    }
+
+    pub(super) fn dispatch<K: Reference>(
+        &mut self,
+        constants: &K::Constants,
+        slots: &[Slot],
+        push: &K::Push,
+        threads: Threads<'_>,
+    ) -> Result<(), Error> {
+        let groups = match threads {
+            Threads::Line(n) => {
+                let groups = n.div_ceil(K::GROUP[0].into());
+                let limit = u64::from(self.gpu.info().max_groups.min(65535));
+                if groups <= limit { [groups as u32, 1, 1] } else { [limit as u32, groups.div_ceil(limit) as u32, 1] }
+            }
+            Threads::Grid(grid) => std::array::from_fn(|i| grid[i].div_ceil(K::GROUP[i])),
+            Threads::Counted(counted) => {
+                assert_eq!(K::GROUP, [counted.group, 1, 1], "{}: counted for groups of {}", K::NAME, counted.group);
+                [1, 1, 1]
+            }
+        };
+        if groups.contains(&0) {
+            return Ok(());
+        }
+        let pipeline = self.gpu.inner().pipeline::<K>(constants)?;
+        let mut accesses: Vec<(Id, &'static str, Access)> =
+            slots.iter().zip(K::BINDINGS).map(|(s, b)| (s.id(), s.name, b.access)).collect();
+        if let Threads::Counted(counted) = threads {
+            accesses.push((counted.buffer.slot().id(), counted.buffer.name(), Access::Read));
+        }
+        let infos: Vec<_> =
+            slots.iter().map(|s| [vk::DescriptorBufferInfo::default().buffer(s.raw).range(s.bytes)]).collect();
+        let writes: Vec<_> = infos
+            .iter()
+            .zip(K::BINDINGS)
+            .map(|(info, b)| {
+                vk::WriteDescriptorSet::default()
+                    .dst_binding(b.number)
+                    .descriptor_type(vk::DescriptorType::STORAGE_BUFFER)
+                    .buffer_info(info)
+            })
+            .collect();
+        let push = bytemuck::bytes_of(push);
+        let inner = self.gpu.inner().clone();
+        self.pass(K::NAME, &accesses, |commands| {
+            let device = &inner.device;
+            // SAFETY: live handles; the layout comes from the kernel's own reflection.
+            unsafe {
+                device.cmd_bind_pipeline(commands, vk::PipelineBindPoint::COMPUTE, pipeline.raw);
+                let bind_point = vk::PipelineBindPoint::COMPUTE;
+                inner.push_descriptor.cmd_push_descriptor_set(commands, bind_point, pipeline.layout, 0, &writes);
+                if !push.is_empty() {
+                    device.cmd_push_constants(commands, pipeline.layout, vk::ShaderStageFlags::COMPUTE, 0, push);
+                }
+                match threads {
+                    Threads::Counted(counted) => device.cmd_dispatch_indirect(commands, counted.buffer.slot().raw, 0),
+                    _ => device.cmd_dispatch(commands, groups[0], groups[1], groups[2]),
+                }
+            }
+        });
+        Ok(())
+    }
+
+    /// Sets every word of a buffer.
+    pub fn fill<T: bytemuck::Pod>(&mut self, buffer: &Buffer<T>, word: u32) {
+        let slot = buffer.slot();
+        let inner = self.gpu.inner().clone();
+        self.pass("fill", &[(slot.id(), slot.name, Access::Write)], |commands| {
+            // SAFETY: a live buffer with transfer usage.
+            unsafe { inner.device.cmd_fill_buffer(commands, slot.raw, 0, vk::WHOLE_SIZE, word) }
+        });
+    }
+
+    /// Sets a buffer to zero.
+    pub fn zero<T: bytemuck::Pod>(&mut self, buffer: &Buffer<T>) {
+        self.fill(buffer, 0);
+    }
+
+    /// Copies the first `len` elements.
+    pub fn copy<T: bytemuck::Pod>(&mut self, from: &Buffer<T>, to: &Buffer<T>, len: usize) {
+        assert!(len <= from.len() && len <= to.len(), "copy of {len} from {from:?} to {to:?}");
+        self.copy_bytes(from.slot(), to.slot(), (len * size_of::<T>()) as u64);
+    }
+
+    /// Copies `len` elements starting at `from_at` to `to_at`.
+    pub fn copy_range<T: bytemuck::Pod>(
+        &mut self,
+        from: &Buffer<T>,
+        from_at: usize,
+        to: &Buffer<T>,
+        to_at: usize,
+        len: usize,
+    ) {
+        assert!(from_at + len <= from.len() && to_at + len <= to.len(), "copy of {len} from {from:?} to {to:?}");
+        let size = size_of::<T>() as u64;
+        self.copy_region(from.slot(), from_at as u64 * size, to.slot(), to_at as u64 * size, len as u64 * size);
+    }
+
+    pub(super) fn copy_bytes(&mut self, from: Slot, to: Slot, bytes: u64) {
+        self.copy_region(from, 0, to, 0, bytes);
+    }
+
+    fn copy_region(&mut self, from: Slot, from_at: u64, to: Slot, to_at: u64, bytes: u64) {
+        if bytes == 0 {
+            return;
+        }
+        let inner = self.gpu.inner().clone();
+        let accesses = [(from.id(), from.name, Access::Read), (to.id(), to.name, Access::Write)];
+        self.pass("copy", &accesses, |commands| {
+            let region = [vk::BufferCopy { src_offset: from_at, dst_offset: to_at, size: bytes }];
+            // SAFETY: live buffers with transfer usage, regions within both.
+            unsafe { inner.device.cmd_copy_buffer(commands, from.raw, to.raw, &region) }
+        });
+    }
+
+    /// Everything around a pass: the barrier it needs, its label, crash marker and timestamps.
+    fn pass(
+        &mut self,
+        name: &'static str,
+        accesses: &[(Id, &'static str, Access)],
+        record: impl FnOnce(vk::CommandBuffer),
+    ) {
+        let inner = self.gpu.inner();
+        let reasons = self.hazards.enter(name, accesses, inner.options.serialize);
+        let context = self.context.as_ref().expect("a recorder has its context until it is submitted");
+        let commands = context.commands;
+        if !reasons.is_empty() {
+            self.schedule.entries.push(Entry::Barrier { reasons });
+            barrier(inner, commands);
+        }
+        let index = self.passes.len() as u32;
+        let tracked = index < MAX_PASSES;
+        let timed = tracked && inner.options.timestamps && inner.info.timestamp_period > 0.0;
+        let label = |text: &'static str| std::ffi::CString::new(text).unwrap_or_default();
+        // SAFETY: a command buffer in recording; markers are written each at an offset of its own.
+        unsafe {
+            if let Some(debug) = &inner.debug {
+                let label = label(name);
+                let info = vk::DebugUtilsLabelEXT::default().label_name(&label);
+                debug.cmd_begin_debug_utils_label(commands, &info);
+            }
+            if tracked {
+                let at = 4 * u64::from(index);
+                inner.device.cmd_fill_buffer(commands, context.markers.0, at, 4, 1);
+            }
+            let all = vk::PipelineStageFlags2::ALL_COMMANDS;
+            if timed {
+                inner.device.cmd_write_timestamp2(commands, all, context.queries, 2 * index);
+            }
+            record(commands);
+            if timed {
+                inner.device.cmd_write_timestamp2(commands, all, context.queries, 2 * index + 1);
+            }
+            if let Some(debug) = &inner.debug {
+                debug.cmd_end_debug_utils_label(commands);
+            }
+        }
+        self.passes.push(name);
+        let accesses = accesses.iter().map(|(_, buffer, access)| (*buffer, *access)).collect();
+        self.schedule.entries.push(Entry::Pass { name, accesses });
+    }
+
+    fn begin(&mut self) -> Result<(), Error> {
+        let inner = self.gpu.inner();
+        let context = self.context.as_ref().expect("begin comes before submit");
+        let info = vk::CommandBufferBeginInfo::default().flags(vk::CommandBufferUsageFlags::ONE_TIME_SUBMIT);
+        // SAFETY: the context is not in flight: it came from the free list or was waited for.
+        unsafe {
+            inner.device.begin_command_buffer(context.commands, &info).named("beginning a command buffer")?;
+            if inner.options.timestamps {
+                inner.device.cmd_reset_query_pool(context.commands, context.queries, 0, 2 * MAX_PASSES);
+            }
+            inner.device.cmd_fill_buffer(context.commands, context.markers.0, 0, vk::WHOLE_SIZE, 0);
+        }
+        // What earlier submissions wrote, and the markers' reset, come before everything here.
+        barrier(inner, context.commands);
+        self.hazards = Hazards::default();
+        self.passes.clear();
+        Ok(())
+    }
+
+    /// Ends the recording and gives it to the device.
+    ///
+    /// # Errors
+    /// The first error met while recording, or the device's refusal.
+    pub fn submit(mut self) -> Result<Submission<'g>, Error> {
+        if let Some(error) = self.error.take() {
+            return Err(error);
+        }
+        let context = self.context.take().expect("a recorder is submitted once");
+        let submission = Submission {
+            gpu: self.gpu,
+            context: Some(context),
+            passes: std::mem::take(&mut self.passes),
+            schedule: std::mem::take(&mut self.schedule),
+            differences: self.differences.take().unwrap_or_default(),
+        };
+        submission.start()?;
+        Ok(submission)
+    }
+
+    /// What was recorded so far, without running it.
+    pub fn schedule(&self) -> &Schedule {
+        &self.schedule
+    }
+
+    fn flush(&mut self) -> Result<(), Error> {
+        let context = self.context.take().expect("flush comes before submit");
+        let passes = std::mem::take(&mut self.passes);
+        let submission = Submission {
+            gpu: self.gpu,
+            context: Some(context),
+            passes,
+            schedule: Schedule::default(),
+            differences: vec![],
+        };
+        submission.start()?;
+        submission.wait()?;
+        let context = lock(&self.gpu.inner().contexts).pop();
+        self.context = Some(context.map_or_else(|| Context::new(self.gpu), Ok)?);
+        self.begin()
+    }
+}
+
+impl Drop for Recorder<'_> {
+    fn drop(&mut self) {
+        if let Some(context) = self.context.take() {
+            // SAFETY: recording, never submitted; ending it makes it reusable.
+            let _ = unsafe { self.gpu.inner().device.end_command_buffer(context.commands) };
+            lock(&self.gpu.inner().contexts).push(context);
+        }
+    }
+}
+
+fn barrier(inner: &Inner, commands: vk::CommandBuffer) {
+    let stages = SHADER | COPY | INDIRECT;
+    let writes = vk::AccessFlags2::SHADER_STORAGE_WRITE | vk::AccessFlags2::TRANSFER_WRITE;
+    let reads = vk::AccessFlags2::SHADER_STORAGE_READ
+        | vk::AccessFlags2::TRANSFER_READ
+        | vk::AccessFlags2::INDIRECT_COMMAND_READ;
+    let memory = [vk::MemoryBarrier2::default()
+        .src_stage_mask(stages)
+        .src_access_mask(writes)
+        .dst_stage_mask(stages)
+        .dst_access_mask(reads | writes)];
+    // SAFETY: a command buffer in recording, synchronization2 is enabled.
+    unsafe {
+        inner.device.cmd_pipeline_barrier2(commands, &vk::DependencyInfo::default().memory_barriers(&memory));
+    }
+}
+
+impl Submission<'_> {
+    fn start(&self) -> Result<(), Error> {
+        let inner = self.gpu.inner();
+        let context = self.context.as_ref().expect("a submission holds its context until it is waited for");
+        let host = [vk::MemoryBarrier2::default()
+            .src_stage_mask(SHADER | COPY)
+            .src_access_mask(vk::AccessFlags2::SHADER_STORAGE_WRITE | vk::AccessFlags2::TRANSFER_WRITE)
+            .dst_stage_mask(vk::PipelineStageFlags2::HOST)
+            .dst_access_mask(vk::AccessFlags2::HOST_READ)];
+        let commands = [vk::CommandBufferSubmitInfo::default().command_buffer(context.commands)];
+        let submit = [vk::SubmitInfo2::default().command_buffer_infos(&commands)];
+        // SAFETY: the command buffer is in recording and its fence unsignalled.
+        let result = unsafe {
+            inner.device.cmd_pipeline_barrier2(context.commands, &vk::DependencyInfo::default().memory_barriers(&host));
+            inner.device.end_command_buffer(context.commands).named("ending a command buffer")?;
+            inner.device.queue_submit2(inner.queue, &submit, context.fence)
+        };
+        inner.began();
+        self.lost(result)
+    }
+
+    fn lost(&self, result: ash::prelude::VkResult<()>) -> Result<(), Error> {
+        match result {
+            Ok(()) => Ok(()),
+            Err(vk::Result::ERROR_DEVICE_LOST) => {
+                let context = self.context.as_ref().expect("held until waited for");
+                let reached = context.markers.1.mapped_slice().map_or(0, |bytes| {
+                    bytemuck::pod_collect_to_vec::<u8, u32>(bytes).iter().take_while(|&&m| m == 1).count()
+                });
+                let pass = reached.checked_sub(1).and_then(|i| self.passes.get(i)).copied().unwrap_or("none");
+                Err(Error::DeviceLost { pass: pass.into() })
+            }
+            Err(result) => Err(Error::Vulkan { what: "submitting work", result }),
+        }
+    }
+
+    /// Waits for the end and returns the time of every pass (empty unless the device was opened with timestamps).
+    ///
+    /// # Errors
+    /// [`Error::DeviceLost`] with the last pass reached.
+    pub fn wait(mut self) -> Result<Vec<Timing>, Error> {
+        let inner = self.gpu.inner().clone();
+        let context = self.context.as_ref().expect("waited for once");
+        // SAFETY: the fence was given to the queue in `start`.
+        let result = unsafe { inner.device.wait_for_fences(&[context.fence], true, u64::MAX) };
+        self.lost(result)?;
+        let mut timings = vec![];
+        if inner.options.timestamps && inner.info.timestamp_period > 0.0 {
+            let timed = self.passes.len().min(MAX_PASSES as usize);
+            let mut ticks = vec![0u64; 2 * timed];
+            if timed > 0 {
+                // SAFETY: the queries were reset and written by the finished command buffer.
+                unsafe {
+                    let flags = vk::QueryResultFlags::TYPE_64 | vk::QueryResultFlags::WAIT;
+                    inner
+                        .device
+                        .get_query_pool_results(context.queries, 0, &mut ticks, flags)
+                        .named("reading timestamps")?;
+                }
+            }
+            let period = f64::from(inner.info.timestamp_period);
+            timings.extend(self.passes.iter().zip(ticks.chunks_exact(2)).map(|(name, t)| Timing {
+                name,
+                start: t[0] as f64 * period,
+                duration: t[1].saturating_sub(t[0]) as f64 * period,
+            }));
+        }
+        let context = self.context.take().expect("waited for once");
+        // SAFETY: the fence is signalled and nobody else waits for it.
+        unsafe { inner.device.reset_fences(&[context.fence]) }.named("resetting a fence")?;
+        lock(&inner.contexts).push(context);
+        inner.ended();
+        Ok(timings)
+    }
+
+    /// True when the device has finished it.
+    pub fn is_done(&self) -> bool {
+        let inner = self.gpu.inner();
+        // SAFETY: a live fence.
+        self.context.as_ref().is_none_or(|c| unsafe { inner.device.get_fence_status(c.fence) }.unwrap_or(true))
+    }
+}
+
+impl Drop for Submission<'_> {
+    fn drop(&mut self) {
+        if let Some(context) = self.context.take() {
+            let inner = self.gpu.inner();
+            // SAFETY: given to the queue in `start`; a failure here means the device is lost and nothing runs any more.
+            unsafe {
+                let _ = inner.device.wait_for_fences(&[context.fence], true, u64::MAX);
+                let _ = inner.device.reset_fences(&[context.fence]);
+            }
+            lock(&inner.contexts).push(context);
+            inner.ended();
+        }
+    }
+}

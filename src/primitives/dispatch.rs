@@ -1,0 +1,45 @@
+//! Indirect dispatch: from a count on the device to workgroups.
+
+use crate::gpu::kernels::primitives::dispatch;
+use crate::gpu::{Buffer, Error, Gpu, Groups, Recorder, Reference};
+
+impl Reference for dispatch::Kernel {
+    fn reference(host: dispatch::Host<'_>, push: dispatch::Push, (): ()) {
+        let n = host.count[0].min(push.capacity);
+        let groups = (n * push.factor).div_ceil(push.group);
+        host.groups.copy_from_slice(&[groups.min(push.limit), groups.div_ceil(push.limit), 1, n]);
+    }
+}
+
+/// Workgroup counts for kernels of `group` threads, one per item of a count on the device.
+///
+/// # Errors
+/// As [`Gpu::buffer`].
+pub fn groups(gpu: &Gpu, name: &'static str, group: u32) -> Result<Groups, Error> {
+    Ok(Groups { buffer: gpu.buffer(name, 4)?, group })
+}
+
+/// Sets `groups` for `factor` threads per item, at most `capacity` items.
+pub fn record(rec: &mut Recorder<'_>, count: &Buffer<u32>, groups: &Groups, capacity: u32, factor: u32) {
+    let limit = rec.gpu().info().max_groups.min(65535);
+    let push = dispatch::Push { capacity, factor, group: groups.group, limit };
+    rec.run(dispatch::Kernel, dispatch::Buffers { count, groups: &groups.buffer }, push, 1u32);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::testing;
+
+    #[test]
+    fn matches_its_twin() {
+        let gpu = testing::gpu();
+        for count in [0, 1, 63, 64, 65, 4096, 5_000_000, u32::MAX] {
+            for group in [1, 64, 256] {
+                let case = dispatch::Arrays { count: vec![count], groups: vec![u32::MAX; 4] };
+                let push = dispatch::Push { capacity: 10_000_000, factor: 3, group, limit: 65535 };
+                testing::assert_twin(dispatch::Kernel, &gpu, case, push, 1u32);
+            }
+        }
+    }
+}
