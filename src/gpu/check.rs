@@ -79,7 +79,7 @@ impl Difference {
             gg += g * g;
             ww += w * w;
             error = if distance.is_nan() { f64::INFINITY } else { error.max(distance) };
-            if !(distance <= limit) {
+            if distance.is_nan() || distance > limit {
                 exceeded += 1;
                 let excess = if distance.is_nan() { f64::INFINITY } else { distance - limit };
                 if worst.is_none() || excess > worst_excess {
