@@ -48,7 +48,7 @@ impl Drop for TestGpu {
 }
 
 /// Float32 not-a-number that no kernel writes: fill outputs with it to see what was left out.
-pub const UNWRITTEN: f32 = f32::NAN;
+pub const UNWRITTEN: f32 = f32::from_bits(0x7fc01234);
 
 /// Runs the kernel once on a case and returns all bindings afterwards.
 ///

@@ -1,0 +1,53 @@
+// Which tiles a Gaussian touches: those holding a pixel centre where its alpha can reach 1/255.
+//
+// alpha >= 1/255 is q(d) = xx dx^2 + 2 xy dx dy + yy dy^2 <= 2 ln(255 opacity) for conic (xx, xy, yy): an ellipse around
+// the mean. Per row of tiles its extent in x is found over the row's sample band; the right boundary x(dy) is concave, so
+// its maximum over a band lies at the ellipse's own extreme clamped into the band.
+
+// The bound on q, widened by what float32 rounding of q in the rasteriser may take away, so that culling never decides
+// a pixel: 1e-3 absolute, 1e-4 relative.
+float support_bound(float opacity) { return 2.0 * log(255.0 * opacity) * 1.0001 + 1e-3; }
+
+struct Support {
+  float bound;
+  vec3 covariance;
+  float narrow;   // variance of dx given dy, px^2: det / yy = 1 / conic.x
+  vec2 half_size; // of the bounding box, px
+  int row0, row1; // tile rows, inclusive
+};
+
+// Half the bounding box of {q <= bound} is sqrt(bound * covariance diagonal).
+Support support_of(vec2 mean, vec3 covariance, vec3 conic, float opacity, int tile, ivec2 tiles) {
+  Support s;
+  s.bound = support_bound(opacity);
+  s.covariance = covariance;
+  s.narrow = 1.0 / conic.x;
+  s.half_size = sqrt(max(s.bound, 0.0) * vec2(covariance.x, covariance.z));
+  // Tile row t holds the samples t*tile + 0.5 ... t*tile + tile - 0.5. Far-away means are clamped before the conversion
+  // to int, which is undefined beyond its range.
+  float low = clamp(mean.y - s.half_size.y, -1e6, 1e6), high = clamp(mean.y + s.half_size.y, -1e6, 1e6);
+  s.row0 = max(int(ceil((low - float(tile) + 0.5) / float(tile))), 0);
+  s.row1 = min(int(floor((high - 0.5) / float(tile))), tiles.y - 1);
+  if (!(s.bound >= 0.0)) s.row1 = s.row0 - 1;
+  return s;
+}
+
+// First and last tile column (inclusive, may be empty) of tile row `row`. Given dy, dx lies within
+// xy/yy dy +- sqrt((bound - dy^2/yy) det/yy): a form without differences of large products.
+ivec2 support_columns(Support s, vec2 mean, int row, int tile, ivec2 tiles) {
+  float low = float(row * tile) + 0.5 - mean.y, high = low + float(tile) - 1.0;
+  low = clamp(low, -s.half_size.y, s.half_size.y);
+  high = clamp(high, -s.half_size.y, s.half_size.y);
+  float slope = s.covariance.y / s.covariance.z;
+  float extreme = s.covariance.y / s.covariance.x * s.half_size.x; // dy where dx is largest
+  float at_right = clamp(extreme, low, high), at_left = clamp(-extreme, low, high);
+  float right = slope * at_right + sqrt(max(s.bound - at_right * at_right / s.covariance.z, 0.0) * s.narrow);
+  float left = slope * at_left - sqrt(max(s.bound - at_left * at_left / s.covariance.z, 0.0) * s.narrow);
+  // Near the tips the root's argument cancels to about 1e-7 bound: sqrt(1e-7) of the extent.
+  float slack = 1e-3 + 1e-3 * s.half_size.x;
+  float x1 = clamp(mean.x + right + slack, -1e6, 1e6);
+  float x0 = clamp(mean.x + left - slack, -1e6, 1e6);
+  int c0 = max(int(ceil((x0 - float(tile) + 0.5) / float(tile))), 0);
+  int c1 = min(int(floor((x1 - 0.5) / float(tile))), tiles.x - 1);
+  return ivec2(c0, c1);
+}

@@ -1,0 +1,46 @@
+#version 460
+#extension GL_EXT_scalar_block_layout : require
+#extension GL_GOOGLE_include_directive : require
+#include "thread.glsl"
+#include "tiles.glsl"
+// Conic of every Gaussian and the number of tiles it touches.
+layout(local_size_x = 64) in;
+layout(binding = 0, scalar) readonly buffer SlotCount { uint slot_count[]; }; // [1] slots in use
+layout(binding = 1, scalar) readonly buffer Mean { vec2 mean[]; };            // [slot] px
+layout(binding = 2, scalar) readonly buffer Covariance { vec3 covariance[]; }; // [slot] xx, xy, yy in px^2, 0.3 on the diagonal included
+layout(binding = 3, scalar) readonly buffer Depth { float depth[]; };         // [slot] camera z; 0 where the Gaussian does not exist
+layout(binding = 4, scalar) readonly buffer Opacity { float opacity[]; };     // [slot]
+layout(binding = 5, scalar) writeonly buffer Conic { vec3 conic[]; };         // [slot] inverse covariance xx, xy, yy in px^-2
+layout(binding = 6, scalar) writeonly buffer Tiles { uint tiles[]; };         // [slot] tiles touched
+layout(push_constant, scalar) uniform Push {
+  uvec2 grid; // tiles in x and y
+  uint tile;  // side of a tile, px
+} push;
+
+// covariance = S + 0.3 I with S positive semi-definite, so det >= 0.3 (xx + yy) - 0.09: a bound that the rounded
+// difference of products can fall short of for long needles. The products' rounding errors are added back (Kahan).
+float determinant(vec3 c) {
+  precise float product = c.y * c.y;
+  precise float error = fma(-c.y, c.y, product);
+  precise float difference = fma(c.x, c.z, -product);
+  return max(difference + error, 0.3 * (c.x + c.z) - 0.09);
+}
+
+void main() {
+  uint s = thread_index();
+  if (s >= slot_count[0]) return;
+  vec3 c = covariance[s];
+  float o = opacity[s];
+  uint n = 0u;
+  vec3 q = vec3(0.0);
+  if (depth[s] > 0.0) {
+    q = vec3(c.z, -c.y, c.x) / determinant(c);
+    Support support = support_of(mean[s], c, q, o, int(push.tile), ivec2(push.grid));
+    for (int row = support.row0; row <= support.row1; row++) {
+      ivec2 columns = support_columns(support, mean[s], row, int(push.tile), ivec2(push.grid));
+      n += uint(max(columns.y - columns.x + 1, 0));
+    }
+  }
+  conic[s] = q;
+  tiles[s] = n;
+}

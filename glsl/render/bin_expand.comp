@@ -1,0 +1,49 @@
+#version 460
+#extension GL_EXT_scalar_block_layout : require
+#extension GL_GOOGLE_include_directive : require
+#include "thread.glsl"
+#include "tiles.glsl"
+// One (Gaussian, tile) pair per tile touched, Gaussian after Gaussian in depth order: a stable sort by tile alone then
+// leaves every tile's list in depth order.
+layout(local_size_x = 64) in;
+layout(binding = 0, scalar) readonly buffer DrawnCount { uint drawn_count[]; }; // [1]
+layout(binding = 1, scalar) readonly buffer PairCount { uint pair_count[]; };   // [1] pairs; 0 when they do not fit
+layout(binding = 2, scalar) readonly buffer Order { uint order[]; };            // [rank] slot, nearest first
+layout(binding = 3, scalar) readonly buffer RankFirst { uint rank_first[]; };   // [rank] first pair
+layout(binding = 4, scalar) readonly buffer Tiles { uint tiles[]; };            // [slot] tiles touched
+layout(binding = 5, scalar) readonly buffer Mean { vec2 mean[]; };              // [slot] px
+layout(binding = 6, scalar) readonly buffer Covariance { vec3 covariance[]; };  // [slot] px^2
+layout(binding = 7, scalar) readonly buffer Conic { vec3 conic[]; };            // [slot] px^-2
+layout(binding = 8, scalar) readonly buffer Opacity { float opacity[]; };       // [slot]
+layout(binding = 9, scalar) writeonly buffer FirstPair { uint first_pair[]; };  // [slot] first pair of a Gaussian
+layout(binding = 10, scalar) writeonly buffer PairTile { uint pair_tile[]; };   // [pair] tile, row-major
+layout(binding = 11, scalar) writeonly buffer PairIndex { uint pair_index[]; }; // [pair] the pair's own number
+layout(binding = 12, scalar) writeonly buffer PairSlot { uint pair_slot[]; };   // [pair] slot of its Gaussian
+layout(push_constant, scalar) uniform Push {
+  uvec2 grid; // tiles in x and y
+  uint tile;  // side of a tile, px
+} push;
+void main() {
+  uint r = thread_index();
+  if (r >= drawn_count[0] || pair_count[0] == 0u) return;
+  uint s = order[r];
+  uint p = rank_first[r];
+  uint end = p + tiles[s];
+  first_pair[s] = p;
+  Support support = support_of(mean[s], covariance[s], conic[s], opacity[s], int(push.tile), ivec2(push.grid));
+  for (int row = support.row0; row <= support.row1; row++) {
+    ivec2 columns = support_columns(support, mean[s], row, int(push.tile), ivec2(push.grid));
+    for (int column = columns.x; column <= columns.y && p < end; column++, p++) {
+      pair_tile[p] = uint(row) * push.grid.x + uint(column);
+      pair_index[p] = p;
+      pair_slot[p] = s;
+    }
+  }
+  // Counting and this pass are two kernels; should a driver round them differently, a pair too many is dropped above
+  // and one too few goes to the tile behind the last, which nobody draws.
+  for (; p < end; p++) {
+    pair_tile[p] = push.grid.x * push.grid.y;
+    pair_index[p] = p;
+    pair_slot[p] = s;
+  }
+}

@@ -1,0 +1,154 @@
+#version 460
+#extension GL_EXT_scalar_block_layout : require
+#extension GL_EXT_control_flow_attributes : require
+#extension GL_KHR_shader_subgroup_basic : require
+#extension GL_KHR_shader_subgroup_vote : require
+#extension GL_KHR_shader_subgroup_ballot : require
+// variant narrow: NARROW
+// variant color: COLOR_ONLY
+// variant narrow_color: NARROW COLOR_ONLY
+//
+// Front-to-back blending of a tile's Gaussians (3D Gaussian Splatting, equation 3): colour, depth and transmittance.
+// The base kernel takes 16 x 16 tiles, 64 threads of 4 pixels, and passes Gaussians through shared memory. `narrow` is
+// for subgroups of 8 (CPU drivers): 8 x 8 tiles, one subgroup of 8 threads x 8 pixels; each lane loads one Gaussian and
+// broadcasts it, so there is no shared memory and no barrier. `color` leaves depth and transmittance out.
+#ifdef NARROW
+const uint TILE = 8u, THREADS = 8u, ROWS = 8u;
+layout(local_size_x = 8) in;
+#else
+const uint TILE = 16u, THREADS = 64u, ROWS = 4u;
+layout(local_size_x = 64) in;
+#endif
+layout(binding = 0, scalar) readonly buffer Ranges { uvec2 ranges[]; };         // [tile + 1] first, one past last in the sorted list
+layout(binding = 1, scalar) readonly buffer Sorted { uint sorted[]; };          // [pair] pair numbers by tile, nearest first
+layout(binding = 2, scalar) readonly buffer PairSlot { uint pair_slot[]; };     // [pair] slot of the Gaussian
+layout(binding = 3, scalar) readonly buffer Mean { vec2 mean[]; };              // [slot] px
+layout(binding = 4, scalar) readonly buffer Conic { vec3 conic[]; };            // [slot] px^-2
+layout(binding = 5, scalar) readonly buffer Opacity { float opacity[]; };       // [slot]
+layout(binding = 6, scalar) readonly buffer Color { vec3 color[]; };            // [slot] linear rgb
+layout(binding = 7, scalar) writeonly buffer Rgb { vec3 rgb[]; };               // [pixel] linear rgb, background included
+#ifndef COLOR_ONLY
+layout(binding = 8, scalar) readonly buffer Depth { float depth[]; };           // [slot] camera z
+layout(binding = 9, scalar) writeonly buffer DepthMap { float depth_map[]; };   // [pixel] sum of z alpha T, not divided by coverage
+layout(binding = 10, scalar) writeonly buffer Transmittance { float transmittance[]; }; // [pixel] what is left of the background
+#endif
+layout(push_constant, scalar) uniform Push {
+  uvec2 size;      // picture, px
+  uint tiles_x;    // tiles in x
+  vec3 background; // linear rgb
+} push;
+
+float T[ROWS];
+vec3 sum_rgb[ROWS];
+#ifndef COLOR_ONLY
+float sum_z[ROWS];
+#endif
+bool live[ROWS];
+vec2 pixel; // centre of this thread's first pixel
+
+void blend(vec2 m, vec3 q, float o, vec3 c, float z) {
+  float dx = pixel.x - m.x;
+  [[unroll]] for (uint r = 0u; r < ROWS; r++) {
+    float dy = pixel.y + float(r) - m.y;
+    precise float power = -0.5 * (q.x * dx * dx + q.z * dy * dy) - q.y * dx * dy;
+    float alpha = min(0.99, o * exp(power));
+    float after = T[r] * (1.0 - alpha);
+    bool hit = live[r] && alpha >= 1.0 / 255.0;
+    live[r] = live[r] && !(hit && after < 1e-4);
+    hit = hit && live[r];
+    float w = hit ? alpha * T[r] : 0.0;
+    sum_rgb[r] += w * c;
+#ifndef COLOR_ONLY
+    sum_z[r] += w * z;
+#endif
+    T[r] = hit ? after : T[r];
+  }
+}
+
+#ifndef NARROW
+const uint BATCH = 64u;
+shared vec2 s_mean[BATCH];
+shared vec3 s_conic[BATCH];
+shared float s_opacity[BATCH];
+shared vec3 s_color[BATCH];
+#ifndef COLOR_ONLY
+shared float s_depth[BATCH];
+#endif
+shared uint s_live;
+#endif
+
+void main() {
+  uint tile = gl_WorkGroupID.y * push.tiles_x + gl_WorkGroupID.x;
+  uint t = gl_LocalInvocationID.x;
+  uvec2 first = gl_WorkGroupID.xy * TILE + uvec2(t % TILE, t / TILE * ROWS);
+  pixel = vec2(first) + 0.5;
+  [[unroll]] for (uint r = 0u; r < ROWS; r++) {
+    T[r] = 1.0;
+    sum_rgb[r] = vec3(0.0);
+#ifndef COLOR_ONLY
+    sum_z[r] = 0.0;
+#endif
+    live[r] = first.x < push.size.x && first.y + r < push.size.y;
+  }
+  uvec2 range = ranges[tile];
+#ifdef NARROW
+  for (uint base = range.x; base < range.y; base += THREADS) {
+    // A lane beyond the end has opacity 0, which no pixel blends.
+    uint i = base + t;
+    bool some = i < range.y;
+    uint g = pair_slot[sorted[some ? i : range.x]];
+    vec2 m = mean[g];
+    vec3 q = conic[g];
+    float o = some ? opacity[g] : 0.0;
+    vec3 c = color[g];
+#ifdef COLOR_ONLY
+    float z = 0.0;
+#else
+    float z = depth[g];
+#endif
+#define BLEND(k) blend(subgroupBroadcast(m, k), subgroupBroadcast(q, k), subgroupBroadcast(o, k), subgroupBroadcast(c, k), subgroupBroadcast(z, k))
+    BLEND(0u); BLEND(1u); BLEND(2u); BLEND(3u); BLEND(4u); BLEND(5u); BLEND(6u); BLEND(7u);
+    bool any_live = false;
+    [[unroll]] for (uint r = 0u; r < ROWS; r++) any_live = any_live || live[r];
+    if (!subgroupAny(any_live)) break;
+  }
+#else
+  for (uint base = range.x; base < range.y; base += BATCH) {
+    uint i = base + t;
+    if (t == 0u) s_live = 0u;
+    barrier();
+    if (i < range.y) {
+      uint g = pair_slot[sorted[i]];
+      s_mean[t] = mean[g];
+      s_conic[t] = conic[g];
+      s_opacity[t] = opacity[g];
+      s_color[t] = color[g];
+#ifndef COLOR_ONLY
+      s_depth[t] = depth[g];
+#endif
+    }
+    bool any_live = false;
+    [[unroll]] for (uint r = 0u; r < ROWS; r++) any_live = any_live || live[r];
+    if (any_live) atomicOr(s_live, 1u);
+    barrier();
+    if (s_live == 0u) break;
+    uint n = min(BATCH, range.y - base);
+#ifdef COLOR_ONLY
+    for (uint k = 0u; k < n; k++) blend(s_mean[k], s_conic[k], s_opacity[k], s_color[k], 0.0);
+#else
+    for (uint k = 0u; k < n; k++) blend(s_mean[k], s_conic[k], s_opacity[k], s_color[k], s_depth[k]);
+#endif
+    barrier();
+  }
+#endif
+  [[unroll]] for (uint r = 0u; r < ROWS; r++) {
+    if (first.x < push.size.x && first.y + r < push.size.y) {
+      uint p = (first.y + r) * push.size.x + first.x;
+      rgb[p] = sum_rgb[r] + T[r] * push.background;
+#ifndef COLOR_ONLY
+      depth_map[p] = sum_z[r];
+      transmittance[p] = T[r];
+#endif
+    }
+  }
+}

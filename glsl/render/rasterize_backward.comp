@@ -1,0 +1,240 @@
+#version 460
+#extension GL_EXT_scalar_block_layout : require
+#extension GL_EXT_control_flow_attributes : require
+#extension GL_KHR_shader_subgroup_basic : require
+#extension GL_KHR_shader_subgroup_vote : require
+#extension GL_KHR_shader_subgroup_ballot : require
+#extension GL_KHR_shader_subgroup_arithmetic : require
+// variant narrow: NARROW
+// variant color: COLOR_ONLY
+// variant narrow_color: NARROW COLOR_ONLY
+// variant depth: NO_TRANSMITTANCE
+// variant narrow_depth: NARROW NO_TRANSMITTANCE
+//
+// Gradients of the blending, per (Gaussian, tile) pair. Front to back, as the forward pass, with what remains behind:
+// with v_i = c_i . g_rgb + z_i g_z, S = sum of w_i v_i + T_end (background . g_rgb + g_T) and A_i the sum's first i
+// terms, dL/dalpha_i = T_i v_i - (S - A_i) / (1 - alpha_i). As alpha <= 0.99 the divisor is at least 0.01; no chain of
+// divisions. The pair's gradients are summed over the tile's pixels in a fixed order and written to the pair's own
+// number, so nothing is added atomically. Every pair of the list is written, also behind the last one blended.
+// `depth` is for losses on colour and depth, `color` for losses on colour alone.
+#ifdef COLOR_ONLY
+#define NO_TRANSMITTANCE
+#else
+#define WITH_DEPTH
+#endif
+#ifdef NARROW
+const uint TILE = 8u, THREADS = 8u, ROWS = 8u;
+layout(local_size_x = 8) in;
+#else
+const uint TILE = 16u, THREADS = 64u, ROWS = 4u;
+layout(local_size_x = 64) in;
+#endif
+layout(binding = 0, scalar) readonly buffer Ranges { uvec2 ranges[]; };         // [tile + 1] first, one past last in the sorted list
+layout(binding = 1, scalar) readonly buffer Sorted { uint sorted[]; };          // [pair] pair numbers by tile, nearest first
+layout(binding = 2, scalar) readonly buffer PairSlot { uint pair_slot[]; };     // [pair] slot of the Gaussian
+layout(binding = 3, scalar) readonly buffer Mean { vec2 mean[]; };              // [slot] px
+layout(binding = 4, scalar) readonly buffer Conic { vec3 conic[]; };            // [slot] px^-2
+layout(binding = 5, scalar) readonly buffer Opacity { float opacity[]; };       // [slot]
+layout(binding = 6, scalar) readonly buffer Color { vec3 color[]; };            // [slot] linear rgb
+layout(binding = 7, scalar) readonly buffer Rgb { vec3 rgb[]; };                // [pixel] as rendered
+layout(binding = 8, scalar) readonly buffer GradRgb { vec3 grad_rgb[]; };       // [pixel]
+layout(binding = 9, scalar) writeonly buffer PairMean { vec2 pair_mean[]; };    // [pair] dL/d mean
+layout(binding = 10, scalar) writeonly buffer PairConic { vec3 pair_conic[]; }; // [pair] dL/d conic xx, xy, yy
+layout(binding = 11, scalar) writeonly buffer PairOpacity { float pair_opacity[]; }; // [pair] dL/d opacity
+layout(binding = 12, scalar) writeonly buffer PairColor { vec3 pair_color[]; }; // [pair] dL/d colour
+#ifdef WITH_DEPTH
+layout(binding = 13, scalar) readonly buffer Depth { float depth[]; };          // [slot] camera z
+layout(binding = 14, scalar) readonly buffer DepthMap { float depth_map[]; };   // [pixel] as rendered
+layout(binding = 15, scalar) readonly buffer GradDepthMap { float grad_depth_map[]; }; // [pixel]
+layout(binding = 16, scalar) writeonly buffer PairDepth { float pair_depth[]; }; // [pair] dL/d z
+#endif
+#ifndef NO_TRANSMITTANCE
+layout(binding = 17, scalar) readonly buffer Transmittance { float transmittance[]; }; // [pixel] as rendered
+layout(binding = 18, scalar) readonly buffer GradTransmittance { float grad_transmittance[]; }; // [pixel]
+#endif
+layout(push_constant, scalar) uniform Push {
+  uvec2 size;   // picture, px
+  uint tiles_x; // tiles in x
+} push;
+
+float T[ROWS];
+float remaining[ROWS]; // S - A_i
+vec3 g_rgb[ROWS];
+float g_z[ROWS];
+bool live[ROWS];
+vec2 pixel; // centre of this thread's first pixel
+
+// Sums over this thread's pixels for one Gaussian: of gp, gp dx, gp dy, gp dx^2, gp dx dy, gp dy^2 (gp = dL/d exponent).
+struct Sums {
+  vec2 first;
+  vec3 second;
+  float opacity;
+  vec3 color;
+  float z;
+};
+
+Sums sums_of(vec2 m, vec3 q, float o, vec3 c, float z) {
+  Sums s = Sums(vec2(0.0), vec3(0.0), 0.0, vec3(0.0), 0.0);
+  float dx = pixel.x - m.x;
+  [[unroll]] for (uint r = 0u; r < ROWS; r++) {
+    float dy = pixel.y + float(r) - m.y;
+    precise float power = -0.5 * (q.x * dx * dx + q.z * dy * dy) - q.y * dx * dy;
+    float e = exp(power);
+    float raw = o * e;
+    float alpha = min(0.99, raw);
+    float after = T[r] * (1.0 - alpha);
+    bool hit = live[r] && alpha >= 1.0 / 255.0;
+    live[r] = live[r] && !(hit && after < 1e-4);
+    hit = hit && live[r];
+    float w = hit ? alpha * T[r] : 0.0;
+    float v = dot(c, g_rgb[r]);
+#ifdef WITH_DEPTH
+    v += z * g_z[r];
+    s.z += w * g_z[r];
+#endif
+    s.color += w * g_rgb[r];
+    remaining[r] -= w * v;
+    float g_alpha = T[r] * v - remaining[r] / (1.0 - alpha);
+    g_alpha = hit && raw <= 0.99 ? g_alpha : 0.0; // the clamp at 0.99 passes no gradient
+    s.opacity += g_alpha * e;
+    float gp = g_alpha * raw;
+    s.first += gp * vec2(dx, dy);
+    s.second += gp * vec3(dx * dx, dx * dy, dy * dy);
+    T[r] = hit ? after : T[r];
+  }
+  return s;
+}
+
+void write(uint p, vec3 q, Sums s) {
+  pair_mean[p] = vec2(q.x * s.first.x + q.y * s.first.y, q.y * s.first.x + q.z * s.first.y);
+  pair_conic[p] = vec3(-0.5 * s.second.x, -s.second.y, -0.5 * s.second.z);
+  pair_opacity[p] = s.opacity;
+  pair_color[p] = s.color;
+#ifdef WITH_DEPTH
+  pair_depth[p] = s.z;
+#endif
+}
+
+Sums over_subgroup(Sums s) {
+  s.first = subgroupAdd(s.first);
+  s.second = subgroupAdd(s.second);
+  s.opacity = subgroupAdd(s.opacity);
+  s.color = subgroupAdd(s.color);
+#ifdef WITH_DEPTH
+  s.z = subgroupAdd(s.z);
+#endif
+  return s;
+}
+
+#ifndef NARROW
+const uint BATCH = 32u;
+const uint SUBGROUPS = 16u; // most there can be: 64 threads in subgroups of at least 4
+shared vec2 s_mean[BATCH];
+shared vec3 s_conic[BATCH];
+shared float s_opacity[BATCH];
+shared vec3 s_color[BATCH];
+#ifdef WITH_DEPTH
+shared float s_depth[BATCH];
+#endif
+shared vec2 s_first[BATCH * SUBGROUPS];
+shared vec3 s_second[BATCH * SUBGROUPS];
+shared vec3 s_color_sum[BATCH * SUBGROUPS];
+shared vec2 s_opacity_depth[BATCH * SUBGROUPS];
+#endif
+
+void main() {
+  uint tile = gl_WorkGroupID.y * push.tiles_x + gl_WorkGroupID.x;
+  uint t = gl_LocalInvocationID.x;
+  uvec2 first = gl_WorkGroupID.xy * TILE + uvec2(t % TILE, t / TILE * ROWS);
+  pixel = vec2(first) + 0.5;
+  [[unroll]] for (uint r = 0u; r < ROWS; r++) {
+    T[r] = 1.0;
+    live[r] = first.x < push.size.x && first.y + r < push.size.y;
+    uint p = live[r] ? (first.y + r) * push.size.x + first.x : 0u;
+    g_rgb[r] = grad_rgb[p];
+    float total = dot(rgb[p], g_rgb[r]);
+#ifdef WITH_DEPTH
+    g_z[r] = grad_depth_map[p];
+    total += depth_map[p] * g_z[r];
+#endif
+#ifndef NO_TRANSMITTANCE
+    total += transmittance[p] * grad_transmittance[p];
+#endif
+    remaining[r] = total;
+  }
+  uvec2 range = ranges[tile];
+#ifdef NARROW
+  for (uint base = range.x; base < range.y; base += THREADS) {
+    // A lane beyond the end has opacity 0, which no pixel blends.
+    uint i = base + t;
+    bool some = i < range.y;
+    uint p = sorted[some ? i : range.x];
+    uint g = pair_slot[p];
+    vec2 m = mean[g];
+    vec3 q = conic[g];
+    float o = some ? opacity[g] : 0.0;
+    vec3 c = color[g];
+#ifdef WITH_DEPTH
+    float z = depth[g];
+#else
+    float z = 0.0;
+#endif
+    Sums mine = Sums(vec2(0.0), vec3(0.0), 0.0, vec3(0.0), 0.0);
+#define SUM(k) { \
+      Sums s = over_subgroup(sums_of(subgroupBroadcast(m, k), subgroupBroadcast(q, k), subgroupBroadcast(o, k), subgroupBroadcast(c, k), subgroupBroadcast(z, k))); \
+      bool own = t == k; \
+      mine.first = own ? s.first : mine.first; \
+      mine.second = own ? s.second : mine.second; \
+      mine.opacity = own ? s.opacity : mine.opacity; \
+      mine.color = own ? s.color : mine.color; \
+      mine.z = own ? s.z : mine.z; \
+    }
+    SUM(0u) SUM(1u) SUM(2u) SUM(3u) SUM(4u) SUM(5u) SUM(6u) SUM(7u)
+    if (some) write(p, q, mine);
+  }
+#else
+  for (uint base = range.x; base < range.y; base += BATCH) {
+    uint n = min(BATCH, range.y - base);
+    barrier();
+    if (t < n) {
+      uint g = pair_slot[sorted[base + t]];
+      s_mean[t] = mean[g];
+      s_conic[t] = conic[g];
+      s_opacity[t] = opacity[g];
+      s_color[t] = color[g];
+#ifdef WITH_DEPTH
+      s_depth[t] = depth[g];
+#endif
+    }
+    barrier();
+    for (uint k = 0u; k < n; k++) {
+#ifdef WITH_DEPTH
+      float z = s_depth[k];
+#else
+      float z = 0.0;
+#endif
+      Sums s = over_subgroup(sums_of(s_mean[k], s_conic[k], s_opacity[k], s_color[k], z));
+      if (subgroupElect()) {
+        uint at = k * SUBGROUPS + gl_SubgroupID;
+        s_first[at] = s.first;
+        s_second[at] = s.second;
+        s_color_sum[at] = s.color;
+        s_opacity_depth[at] = vec2(s.opacity, s.z);
+      }
+    }
+    barrier();
+    if (t < n) {
+      Sums s = Sums(vec2(0.0), vec3(0.0), 0.0, vec3(0.0), 0.0);
+      for (uint u = 0u; u < gl_NumSubgroups; u++) {
+        uint at = t * SUBGROUPS + u;
+        s.first += s_first[at];
+        s.second += s_second[at];
+        s.color += s_color_sum[at];
+        s.opacity += s_opacity_depth[at].x;
+        s.z += s_opacity_depth[at].y;
+      }
+      write(sorted[base + t], s_conic[t], s);
+    }
+  }
+#endif
+}

@@ -1,0 +1,57 @@
+#version 460
+#extension GL_EXT_scalar_block_layout : require
+#extension GL_GOOGLE_include_directive : require
+#include "thread.glsl"
+// variant color: COLOR_ONLY
+//
+// A Gaussian's gradients: the sum over its pairs, which lie one behind the other, and from the conic to the covariance:
+// with Q = C^-1 and G the gradient of Q (off-diagonal entry halved to make it symmetric), dL/dC = -Q G Q.
+layout(local_size_x = 64) in;
+layout(binding = 0, scalar) readonly buffer SlotCount { uint slot_count[]; };   // [1] slots in use
+layout(binding = 1, scalar) readonly buffer Tiles { uint tiles[]; };            // [slot] tiles touched
+layout(binding = 2, scalar) readonly buffer PairCount { uint pair_count[]; };   // [1] pairs; 0 when they do not fit
+layout(binding = 3, scalar) readonly buffer FirstPair { uint first_pair[]; };   // [slot] first pair
+layout(binding = 4, scalar) readonly buffer Conic { vec3 conic[]; };            // [slot] px^-2
+layout(binding = 5, scalar) readonly buffer PairMean { vec2 pair_mean[]; };     // [pair]
+layout(binding = 6, scalar) readonly buffer PairConic { vec3 pair_conic[]; };   // [pair]
+layout(binding = 7, scalar) readonly buffer PairOpacity { float pair_opacity[]; }; // [pair]
+layout(binding = 8, scalar) readonly buffer PairColor { vec3 pair_color[]; };   // [pair]
+layout(binding = 9, scalar) writeonly buffer GradMean { vec2 grad_mean[]; };    // [slot] 1/px
+layout(binding = 10, scalar) writeonly buffer GradCovariance { vec3 grad_covariance[]; }; // [slot] of xx, the off-diagonal parameter, yy
+layout(binding = 11, scalar) writeonly buffer GradOpacity { float grad_opacity[]; }; // [slot]
+layout(binding = 12, scalar) writeonly buffer GradColor { vec3 grad_color[]; }; // [slot]
+#ifndef COLOR_ONLY
+layout(binding = 13, scalar) readonly buffer PairDepth { float pair_depth[]; }; // [pair]
+layout(binding = 14, scalar) writeonly buffer GradDepth { float grad_depth[]; }; // [slot]
+#endif
+void main() {
+  uint s = thread_index();
+  bool in_use = s < slot_count[0];
+  uint n = pair_count[0] == 0u || !in_use ? 0u : tiles[s];
+  uint p = n == 0u ? 0u : first_pair[s];
+  vec2 m = vec2(0.0);
+  vec3 g = vec3(0.0), c = vec3(0.0);
+  float o = 0.0, z = 0.0;
+  for (uint i = 0u; i < n; i++, p++) {
+    m += pair_mean[p];
+    g += pair_conic[p];
+    o += pair_opacity[p];
+    c += pair_color[p];
+#ifndef COLOR_ONLY
+    z += pair_depth[p];
+#endif
+  }
+  if (!in_use) return;
+  vec3 q = conic[s];
+  float h = 0.5 * g.y;
+  // R = Q G, then -R Q; rows (q.x q.y; q.y q.z) and (g.x h; h g.z).
+  vec2 r0 = vec2(q.x * g.x + q.y * h, q.x * h + q.y * g.z);
+  vec2 r1 = vec2(q.y * g.x + q.z * h, q.y * h + q.z * g.z);
+  grad_mean[s] = m;
+  grad_covariance[s] = -vec3(dot(r0, q.xy), dot(r0, q.yz) + dot(r1, q.xy), dot(r1, q.yz));
+  grad_opacity[s] = o;
+  grad_color[s] = c;
+#ifndef COLOR_ONLY
+  grad_depth[s] = z;
+#endif
+}

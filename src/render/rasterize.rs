@@ -1,0 +1,749 @@
+//! Rasterisation: tiles of Gaussians blended front to back, and back again.
+//!
+//! alpha = min(0.99, opacity exp(-1/2 d^T Q d)); a sample with alpha < 1/255 is skipped; a pixel is finished before the
+//! Gaussian that would bring its transmittance below 1e-4 (3D Gaussian Splatting, section 4). Depth is the sum of
+//! z alpha T, not divided by coverage. The support of a Gaussian is exactly {alpha >= 1/255}, so the picture does not
+//! depend on the tiles.
+
+use super::bin::{Binned, Tiling};
+use crate::gpu::kernels::render::{
+    rasterize, rasterize_backward, rasterize_backward_color, rasterize_backward_depth, rasterize_backward_narrow,
+    rasterize_backward_narrow_color, rasterize_backward_narrow_depth, rasterize_color, rasterize_gather,
+    rasterize_gather_color, rasterize_narrow, rasterize_narrow_color,
+};
+use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
+
+/// Largest alpha of a sample.
+pub const ALPHA_MAX: f64 = 0.99;
+/// Samples below this alpha are skipped.
+pub const ALPHA_MIN: f64 = 1.0 / 255.0;
+/// A pixel is finished before its transmittance falls below this.
+pub const TRANSMITTANCE_MIN: f64 = 1e-4;
+
+/// One sample of a Gaussian at a pixel: what forward and backward twins share. The decisions are float32 operations.
+struct Sample {
+    dx: f64,
+    dy: f64,
+    exponential: f64,
+    raw: f64,
+    alpha: f64,
+    visible: bool,
+}
+
+fn sample(pixel: [f32; 2], mean: [f32; 2], conic: [f32; 3], opacity: f32) -> Sample {
+    let (dx, dy) = (pixel[0] - mean[0], pixel[1] - mean[1]);
+    let power = -0.5 * (conic[0] * dx * dx + conic[2] * dy * dy) - conic[1] * dx * dy;
+    let visible = (opacity * power.exp()).min(0.99) >= 1.0 / 255.0;
+    let [xx, xy, yy] = conic.map(f64::from);
+    let (dx, dy) = (f64::from(pixel[0]) - f64::from(mean[0]), f64::from(pixel[1]) - f64::from(mean[1]));
+    let exponential = (-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy).exp();
+    let raw = f64::from(opacity) * exponential;
+    Sample { dx, dy, exponential, raw, alpha: raw.min(ALPHA_MAX), visible }
+}
+
+/// The Gaussians in screen space and their lists, as a twin sees them.
+struct Splats<'a> {
+    ranges: &'a [[u32; 2]],
+    sorted: &'a [u32],
+    pair_slot: &'a [u32],
+    mean: &'a [[f32; 2]],
+    conic: &'a [[f32; 3]],
+    opacity: &'a [f32],
+    color: &'a [[f32; 3]],
+}
+
+impl Splats<'_> {
+    /// Calls `blend(pair, slot, sample, transmittance before, weight)` for everything blended at a pixel; returns the
+    /// transmittance that is left.
+    fn walk(
+        &self,
+        pixel: [u32; 2],
+        tile: u32,
+        tiles_x: u32,
+        mut blend: impl FnMut(usize, usize, &Sample, f64, f64),
+    ) -> f64 {
+        let [first, end] = self.ranges[(pixel[1] / tile * tiles_x + pixel[0] / tile) as usize];
+        let centre = pixel.map(|v| v as f32 + 0.5);
+        let mut transmittance = 1.0;
+        // The decision to stop is made on the float32 product, as in the kernel.
+        let mut rounded = 1f32;
+        for &pair in &self.sorted[first as usize..end as usize] {
+            let slot = self.pair_slot[pair as usize] as usize;
+            let s = sample(centre, self.mean[slot], self.conic[slot], self.opacity[slot]);
+            if !s.visible {
+                continue;
+            }
+            let after = rounded * (1.0 - s.alpha as f32);
+            if after < 1e-4 {
+                break;
+            }
+            blend(pair as usize, slot, &s, transmittance, s.alpha * transmittance);
+            transmittance *= 1.0 - s.alpha;
+            rounded = after;
+        }
+        transmittance
+    }
+}
+
+/// Pictures compared with the twin's: a sample within float32 rounding of a threshold may flip, which changes a pixel
+/// by up to 1/255 of a colour. The exponential is good to a few units in the last place, so about one sample in 1e5 is
+/// that close; the band is one component in a thousand. Otherwise a sum of some hundred terms below one: 1e-5.
+const PICTURE: Check = Check { relative: 1e-5, absolute: 1e-5, band: 1e-3 };
+/// Gradients of a pair: sums over up to 256 pixels with cancellation in `S - A`, of relative size 1e-7 times the sum's
+/// largest term times 1/(1 - alpha) <= 100; a flipped sample moves all ten values of a pair and of those behind it.
+const PAIR: Check = Check { relative: 2e-4, absolute: 2e-5, band: 5e-3 };
+
+macro_rules! forward_twin {
+    ($module:ident, $tile:expr $(, $depth:ident)?) => {
+        impl Reference for $module::Kernel {
+            fn reference(host: $module::Host<'_>, push: $module::Push, (): ()) {
+                let $module::Host { ranges, sorted, pair_slot, mean, conic, opacity, color, rgb, .. } = host;
+                let splats = Splats { ranges, sorted, pair_slot, mean, conic, opacity, color };
+                let [width, height] = push.size;
+                for y in 0..height {
+                    for x in 0..width {
+                        let p = (y * width + x) as usize;
+                        let mut sum = [0f64; 3];
+                        let mut _z = 0f64;
+                        let left = splats.walk([x, y], $tile, push.tiles_x, |_, slot, _, _, w| {
+                            for c in 0..3 {
+                                sum[c] += w * f64::from(color[slot][c]);
+                            }
+                            $(_z += w * f64::from(host.$depth[slot]);)?
+                        });
+                        rgb[p] = std::array::from_fn(|c| (sum[c] + left * f64::from(push.background[c])) as f32);
+                        $(
+                            let _ = &host.$depth;
+                            host.depth_map[p] = _z as f32;
+                            host.transmittance[p] = left as f32;
+                        )?
+                    }
+                }
+            }
+            fn check(_: &'static str) -> Check {
+                PICTURE
+            }
+        }
+    };
+}
+forward_twin!(rasterize, 16, depth);
+forward_twin!(rasterize_narrow, 8, depth);
+forward_twin!(rasterize_color, 16);
+forward_twin!(rasterize_narrow_color, 8);
+
+/// Gradients of one pair.
+#[derive(Clone, Copy, Default)]
+struct PairGradient {
+    mean: [f64; 2],
+    conic: [f64; 3],
+    opacity: f64,
+    color: [f64; 3],
+    depth: f64,
+}
+
+/// A pixel's gradients times its result, and its gradients.
+struct Upstream {
+    total: f64,
+    rgb: [f64; 3],
+    z: f64,
+}
+
+fn backward(
+    splats: &Splats<'_>,
+    depth: Option<&[f32]>,
+    size: [u32; 2],
+    tile: u32,
+    tiles_x: u32,
+    upstream: impl Fn(usize) -> Upstream,
+) -> Vec<PairGradient> {
+    let mut pairs = vec![PairGradient::default(); splats.pair_slot.len()];
+    for y in 0..size[1] {
+        for x in 0..size[0] {
+            let up = upstream((y * size[0] + x) as usize);
+            let mut remaining = up.total;
+            splats.walk([x, y], tile, tiles_x, |pair, slot, s, before, w| {
+                let pair = &mut pairs[pair];
+                let mut v: f64 = (0..3).map(|c| f64::from(splats.color[slot][c]) * up.rgb[c]).sum();
+                v += depth.map_or(0.0, |d| f64::from(d[slot]) * up.z);
+                pair.depth += w * up.z;
+                for c in 0..3 {
+                    pair.color[c] += w * up.rgb[c];
+                }
+                remaining -= w * v;
+                let alpha = if s.raw <= ALPHA_MAX { before * v - remaining / (1.0 - s.alpha) } else { 0.0 };
+                pair.opacity += alpha * s.exponential;
+                let power = alpha * s.raw;
+                let [xx, xy, yy] = splats.conic[slot].map(f64::from);
+                pair.mean[0] += power * (xx * s.dx + xy * s.dy);
+                pair.mean[1] += power * (xy * s.dx + yy * s.dy);
+                pair.conic[0] -= 0.5 * power * s.dx * s.dx;
+                pair.conic[1] -= power * s.dx * s.dy;
+                pair.conic[2] -= 0.5 * power * s.dy * s.dy;
+            });
+        }
+    }
+    pairs
+}
+
+macro_rules! backward_twin {
+    ($module:ident, $tile:expr $(, depth: $depth:ident)? $(, transmittance: $transmittance:ident)?) => {
+        impl Reference for $module::Kernel {
+            fn reference(host: $module::Host<'_>, push: $module::Push, (): ()) {
+                let $module::Host { ranges, sorted, pair_slot, mean, conic, opacity, color, .. } = host;
+                let splats = Splats { ranges, sorted, pair_slot, mean, conic, opacity, color };
+                let mut _depth: Option<&[f32]> = None;
+                $(_depth = Some(host.$depth);)?
+                let gradients = backward(&splats, _depth, push.size, $tile, push.tiles_x, |p| {
+                    let rgb = host.grad_rgb[p].map(f64::from);
+                    let mut total: f64 = (0..3).map(|c| f64::from(host.rgb[p][c]) * rgb[c]).sum();
+                    let mut _z = 0.0;
+                    $(
+                        let _ = &host.$depth;
+                        _z = f64::from(host.grad_depth_map[p]);
+                        total += f64::from(host.depth_map[p]) * _z;
+                    )?
+                    $(total += f64::from(host.$transmittance[p]) * f64::from(host.grad_transmittance[p]);)?
+                    let z = _z;
+                    total += 0.0;
+                    Upstream { total, rgb, z }
+                });
+                for range in ranges.iter().take((push.tiles_x * push.size[1].div_ceil($tile)) as usize) {
+                    for &pair in &sorted[range[0] as usize..range[1] as usize] {
+                        let (p, g) = (pair as usize, &gradients[pair as usize]);
+                        host.pair_mean[p] = g.mean.map(|v| v as f32);
+                        host.pair_conic[p] = g.conic.map(|v| v as f32);
+                        host.pair_opacity[p] = g.opacity as f32;
+                        host.pair_color[p] = g.color.map(|v| v as f32);
+                        $(
+                            let _ = &host.$depth;
+                            host.pair_depth[p] = g.depth as f32;
+                        )?
+                    }
+                }
+            }
+            fn check(_: &'static str) -> Check {
+                PAIR
+            }
+        }
+    };
+}
+backward_twin!(rasterize_backward, 16, depth: depth, transmittance: transmittance);
+backward_twin!(rasterize_backward_narrow, 8, depth: depth, transmittance: transmittance);
+backward_twin!(rasterize_backward_depth, 16, depth: depth);
+backward_twin!(rasterize_backward_narrow_depth, 8, depth: depth);
+backward_twin!(rasterize_backward_color, 16);
+backward_twin!(rasterize_backward_narrow_color, 8);
+
+macro_rules! gather_twin {
+    ($module:ident $(, $depth:ident)?) => {
+        impl Reference for $module::Kernel {
+            fn reference(host: $module::Host<'_>, (): (), (): ()) {
+                for s in 0..host.slot_count[0] as usize {
+                    let n = if host.pair_count[0] == 0 { 0 } else { host.tiles[s] as usize };
+                    let first = if n == 0 { 0 } else { host.first_pair[s] as usize };
+                    let pairs = first..first + n;
+                    let sum = |f: &dyn Fn(usize) -> f32| pairs.clone().map(|p| f64::from(f(p))).sum::<f64>();
+                    let g: [f64; 3] = std::array::from_fn(|c| sum(&|p| host.pair_conic[p][c]));
+                    let [xx, xy, yy] = host.conic[s].map(f64::from);
+                    let q = [[xx, xy], [xy, yy]];
+                    let g = [[g[0], 0.5 * g[1]], [0.5 * g[1], g[2]]];
+                    let at = |i: usize, j: usize| -> f64 {
+                        -(0..2).flat_map(|a| (0..2).map(move |b| (a, b))).map(|(a, b)| q[i][a] * g[a][b] * q[b][j]).sum::<f64>()
+                    };
+                    host.grad_mean[s] = std::array::from_fn(|c| sum(&|p| host.pair_mean[p][c]) as f32);
+                    host.grad_covariance[s] = [at(0, 0) as f32, (at(0, 1) + at(1, 0)) as f32, at(1, 1) as f32];
+                    host.grad_opacity[s] = sum(&|p| host.pair_opacity[p]) as f32;
+                    host.grad_color[s] = std::array::from_fn(|c| sum(&|p| host.pair_color[p][c]) as f32);
+                    $(host.$depth[s] = sum(&|p| host.pair_depth[p]) as f32;)?
+                }
+            }
+            /// A running sum over a Gaussian's tiles whose terms cancel, relative to the tensor's largest element.
+            fn check(_: &'static str) -> Check {
+                Check { relative: 1e-4, absolute: 1e-5, band: 0.0 }
+            }
+        }
+    };
+}
+gather_twin!(rasterize_gather, grad_depth);
+gather_twin!(rasterize_gather_color);
+
+/// Gaussians in screen space, per slot.
+#[derive(Clone, Copy)]
+pub struct Projected<'a> {
+    /// `[1]` slots in use.
+    pub slot_count: &'a Buffer<u32>,
+    /// Workgroups for them.
+    pub slots: &'a Groups,
+    /// `[slot]` px.
+    pub mean: &'a Buffer<[f32; 2]>,
+    /// `[slot]` xx, xy, yy in px^2.
+    pub covariance: &'a Buffer<[f32; 3]>,
+    /// `[slot]` camera z, 0 where there is no Gaussian.
+    pub depth: &'a Buffer<f32>,
+    /// `[slot]`
+    pub opacity: &'a Buffer<f32>,
+    /// `[slot]` linear rgb.
+    pub color: &'a Buffer<[f32; 3]>,
+}
+
+/// What a loss or a file needs of the picture.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Outputs {
+    /// Colour alone.
+    Color,
+    /// Colour and depth (transmittance is written with depth).
+    ColorDepth,
+}
+
+/// A picture's buffers.
+pub struct Picture {
+    /// Width and height in pixels.
+    pub size: [u32; 2],
+    /// `[pixel]` linear rgb.
+    pub rgb: Buffer<[f32; 3]>,
+    /// Depth and transmittance, if asked for.
+    pub depth: Option<(Buffer<f32>, Buffer<f32>)>,
+}
+
+impl Picture {
+    /// Buffers for pictures of up to `pixels` pixels.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub fn new(gpu: &Gpu, size: [u32; 2], pixels: usize, outputs: Outputs) -> Result<Self, Error> {
+        let depth = match outputs {
+            Outputs::Color => None,
+            Outputs::ColorDepth => Some((gpu.buffer("depth_map", pixels)?, gpu.buffer("transmittance", pixels)?)),
+        };
+        Ok(Self { size, rgb: gpu.buffer("rgb", pixels)?, depth })
+    }
+}
+
+/// Draws the binned Gaussians.
+pub fn forward(
+    rec: &mut Recorder<'_>,
+    tiling: Tiling,
+    gaussians: Projected<'_>,
+    binned: Binned<'_>,
+    background: [f32; 3],
+    picture: &Picture,
+) {
+    let Projected { mean, depth, opacity, color, .. } = gaussians;
+    let Binned { ranges, sorted, pair_slot, conic, .. } = binned;
+    let size = picture.size;
+    let grid = tiling.grid(size);
+    let threads = [grid[0] * tiling.threads(), grid[1], 1];
+    let rgb = &picture.rgb;
+    macro_rules! draw {
+        ($module:ident $(, $field:ident)*) => {{
+            let buffers = $module::Buffers { ranges, sorted, pair_slot, mean, conic, opacity, color, rgb $(, $field)* };
+            rec.run($module::Kernel, buffers, $module::Push { size, tiles_x: grid[0], background }, threads);
+        }};
+    }
+    match (&picture.depth, tiling) {
+        (Some((depth_map, transmittance)), Tiling::Wide) => draw!(rasterize, depth, depth_map, transmittance),
+        (Some((depth_map, transmittance)), Tiling::Narrow) => draw!(rasterize_narrow, depth, depth_map, transmittance),
+        (None, Tiling::Wide) => draw!(rasterize_color),
+        (None, Tiling::Narrow) => draw!(rasterize_narrow_color),
+    }
+}
+
+/// Gradients with respect to the picture.
+#[derive(Clone, Copy)]
+pub struct PictureGradient<'a> {
+    /// `[pixel]`
+    pub rgb: &'a Buffer<[f32; 3]>,
+    /// `[pixel]`, of the depth map.
+    pub depth: Option<&'a Buffer<f32>>,
+    /// `[pixel]`, of the transmittance; only together with `depth`.
+    pub transmittance: Option<&'a Buffer<f32>>,
+}
+
+/// Gradients with respect to the Gaussians in screen space, and the per-pair scratch they are summed from.
+pub struct Backward {
+    pair_mean: Buffer<[f32; 2]>,
+    pair_conic: Buffer<[f32; 3]>,
+    pair_opacity: Buffer<f32>,
+    pair_color: Buffer<[f32; 3]>,
+    pair_depth: Option<Buffer<f32>>,
+    /// `[slot]` 1/px.
+    pub grad_mean: Buffer<[f32; 2]>,
+    /// `[slot]` of xx, the one off-diagonal parameter, yy.
+    pub grad_covariance: Buffer<[f32; 3]>,
+    /// `[slot]`
+    pub grad_opacity: Buffer<f32>,
+    /// `[slot]`
+    pub grad_color: Buffer<[f32; 3]>,
+    /// `[slot]`, when a loss looks at depth.
+    pub grad_depth: Option<Buffer<f32>>,
+}
+
+impl Backward {
+    /// Buffers for so many slots and pairs.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub fn new(gpu: &Gpu, slots: usize, pairs: usize, outputs: Outputs) -> Result<Self, Error> {
+        let depth = outputs == Outputs::ColorDepth;
+        Ok(Self {
+            pair_mean: gpu.buffer("pair_mean", pairs)?,
+            pair_conic: gpu.buffer("pair_conic", pairs)?,
+            pair_opacity: gpu.buffer("pair_opacity", pairs)?,
+            pair_color: gpu.buffer("pair_color", pairs)?,
+            pair_depth: depth.then(|| gpu.buffer("pair_depth", pairs)).transpose()?,
+            grad_mean: gpu.buffer("grad_mean", slots)?,
+            grad_covariance: gpu.buffer("grad_covariance", slots)?,
+            grad_opacity: gpu.buffer("grad_opacity", slots)?,
+            grad_color: gpu.buffer("grad_color", slots)?,
+            grad_depth: depth.then(|| gpu.buffer("grad_depth", slots)).transpose()?,
+        })
+    }
+
+    /// Walks back from the picture to the Gaussians in screen space.
+    pub fn record(
+        &self,
+        rec: &mut Recorder<'_>,
+        tiling: Tiling,
+        gaussians: Projected<'_>,
+        binned: Binned<'_>,
+        picture: &Picture,
+        gradient: PictureGradient<'_>,
+    ) {
+        let Projected { slot_count, slots, mean, depth, opacity, color, .. } = gaussians;
+        let Binned { ranges, sorted, pair_slot, conic, tiles, pair_count, first_pair } = binned;
+        let Self {
+            pair_mean,
+            pair_conic,
+            pair_opacity,
+            pair_color,
+            grad_mean,
+            grad_covariance,
+            grad_opacity,
+            grad_color,
+            ..
+        } = self;
+        let size = picture.size;
+        let grid = tiling.grid(size);
+        let threads = [grid[0] * tiling.threads(), grid[1], 1];
+        let (rgb, grad_rgb) = (&picture.rgb, gradient.rgb);
+        macro_rules! back {
+            ($module:ident $(, $field:ident)*) => {{
+                let buffers = $module::Buffers {
+                    ranges, sorted, pair_slot, mean, conic, opacity, color, rgb, grad_rgb, pair_mean, pair_conic,
+                    pair_opacity, pair_color $(, $field)*
+                };
+                rec.run($module::Kernel, buffers, $module::Push { size, tiles_x: grid[0] }, threads);
+            }};
+        }
+        match (&picture.depth, &self.pair_depth, &self.grad_depth, gradient.depth) {
+            (Some((depth_map, transmittance)), Some(pair_depth), Some(grad_depth), Some(grad_depth_map)) => {
+                match (gradient.transmittance, tiling) {
+                    (Some(grad_transmittance), Tiling::Wide) => {
+                        back!(
+                            rasterize_backward,
+                            depth,
+                            depth_map,
+                            grad_depth_map,
+                            pair_depth,
+                            transmittance,
+                            grad_transmittance
+                        );
+                    }
+                    (Some(grad_transmittance), Tiling::Narrow) => {
+                        back!(
+                            rasterize_backward_narrow,
+                            depth,
+                            depth_map,
+                            grad_depth_map,
+                            pair_depth,
+                            transmittance,
+                            grad_transmittance
+                        );
+                    }
+                    (None, Tiling::Wide) => {
+                        back!(rasterize_backward_depth, depth, depth_map, grad_depth_map, pair_depth)
+                    }
+                    (None, Tiling::Narrow) => {
+                        back!(rasterize_backward_narrow_depth, depth, depth_map, grad_depth_map, pair_depth);
+                    }
+                }
+                let buffers = rasterize_gather::Buffers {
+                    slot_count,
+                    tiles,
+                    pair_count,
+                    first_pair,
+                    conic,
+                    pair_mean,
+                    pair_conic,
+                    pair_opacity,
+                    pair_color,
+                    grad_mean,
+                    grad_covariance,
+                    grad_opacity,
+                    grad_color,
+                    pair_depth,
+                    grad_depth,
+                };
+                rec.run(rasterize_gather::Kernel, buffers, (), slots);
+            }
+            _ => {
+                match tiling {
+                    Tiling::Wide => back!(rasterize_backward_color),
+                    Tiling::Narrow => back!(rasterize_backward_narrow_color),
+                }
+                let buffers = rasterize_gather_color::Buffers {
+                    slot_count,
+                    tiles,
+                    pair_count,
+                    first_pair,
+                    conic,
+                    pair_mean,
+                    pair_conic,
+                    pair_opacity,
+                    pair_color,
+                    grad_mean,
+                    grad_covariance,
+                    grad_opacity,
+                    grad_color,
+                };
+                rec.run(rasterize_gather_color::Kernel, buffers, (), slots);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::testing::{self, UNWRITTEN};
+    use crate::math::tiles::{Support, conic};
+    use rand::{RngExt, SeedableRng};
+
+    /// Random Gaussians in screen space, binned on the host.
+    #[derive(Default)]
+    struct Scene {
+        covariance: Vec<[f32; 3]>,
+        mean: Vec<[f32; 2]>,
+        conic: Vec<[f32; 3]>,
+        opacity: Vec<f32>,
+        color: Vec<[f32; 3]>,
+        depth: Vec<f32>,
+        tiles: Vec<u32>,
+        first_pair: Vec<u32>,
+        pair_slot: Vec<u32>,
+        sorted: Vec<u32>,
+        ranges: Vec<[u32; 2]>,
+    }
+
+    fn scene(seed: u64, n: usize, size: [u32; 2], tiling: Tiling, largest: f32) -> Scene {
+        let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(seed);
+        let mut s = Scene::default();
+        let grid = tiling.grid(size);
+        for _ in 0..n {
+            let (angle, a, b) =
+                (rng.random_range(0f32..3.2), rng.random_range(0.3..largest), rng.random_range(0.3..largest));
+            let (sin, cos) = angle.sin_cos();
+            let (a, b) = (a * a, b * b);
+            s.covariance.push([
+                cos * cos * a + sin * sin * b + 0.3,
+                cos * sin * (a - b),
+                sin * sin * a + cos * cos * b + 0.3,
+            ]);
+            s.mean.push(std::array::from_fn(|i| rng.random_range(-4.0..size[i] as f32 + 4.0)));
+            s.opacity.push(rng.random_range(0.05..0.999));
+            s.color.push(std::array::from_fn(|_| rng.random_range(0.0..1.0)));
+            s.depth.push(rng.random_range(1.0..9.0));
+        }
+        let mut order: Vec<usize> = (0..n).collect();
+        order.sort_by(|&a, &b| s.depth[a].total_cmp(&s.depth[b]));
+        (s.tiles, s.first_pair) = (vec![0; n], vec![0; n]);
+        s.conic = s.covariance.iter().map(|&c| conic(c)).collect();
+        let mut pairs = vec![];
+        for slot in order {
+            let support =
+                Support::new(s.mean[slot], s.covariance[slot], s.conic[slot], s.opacity[slot], tiling.side(), grid);
+            let found = support.tiles(s.mean[slot], tiling.side(), grid);
+            s.first_pair[slot] = pairs.len() as u32;
+            s.tiles[slot] = found.len() as u32;
+            for tile in found {
+                pairs.push((tile, pairs.len() as u32));
+                s.pair_slot.push(slot as u32);
+            }
+        }
+        pairs.sort_by_key(|p| p.0);
+        s.ranges = vec![[0; 2]; (grid[0] * grid[1] + 1) as usize];
+        for (i, &(tile, pair)) in pairs.iter().enumerate() {
+            if s.ranges[tile as usize] == [0, 0] {
+                s.ranges[tile as usize][0] = i as u32;
+            }
+            s.ranges[tile as usize][1] = i as u32 + 1;
+            s.sorted.push(pair);
+        }
+        s
+    }
+
+    /// Bindings that only some variants have.
+    struct Extra {
+        depth: Vec<f32>,
+        pair_depth: Vec<f32>,
+        depth_map: Vec<f32>,
+        transmittance: Vec<f32>,
+        grad_depth_map: Vec<f32>,
+        grad_transmittance: Vec<f32>,
+    }
+
+    const SIZES: [[u32; 2]; 5] = [[1, 1], [17, 3], [63, 41], [64, 64], [129, 8]];
+
+    #[test]
+    fn forward_matches_its_twin() {
+        let gpu = testing::gpu();
+        for (i, size) in SIZES.into_iter().enumerate() {
+            for n in [0, 1, 65, 700] {
+                macro_rules! check {
+                    ($module:ident, $tiling:expr $(, $depth:ident)?) => {{
+                        let s = scene(i as u64, n, size, $tiling, 9.0);
+                        let pixels = (size[0] * size[1]) as usize;
+                        let grid = $tiling.grid(size);
+                        let case = $module::Arrays {
+                            ranges: s.ranges, sorted: s.sorted, pair_slot: s.pair_slot, mean: s.mean, conic: s.conic,
+                            opacity: s.opacity, color: s.color, rgb: vec![[UNWRITTEN; 3]; pixels],
+                            $($depth: s.depth, depth_map: vec![UNWRITTEN; pixels], transmittance: vec![UNWRITTEN; pixels],)?
+                        };
+                        let push = $module::Push { size, tiles_x: grid[0], background: [0.1, 0.2, 0.3] };
+                        let threads = [grid[0] * $tiling.threads(), grid[1], 1];
+                        testing::assert_twin($module::Kernel, &gpu, case, push, threads);
+                    }};
+                }
+                check!(rasterize, Tiling::Wide, depth);
+                check!(rasterize_color, Tiling::Wide);
+                if gpu.info().subgroup_size == 8 {
+                    check!(rasterize_narrow, Tiling::Narrow, depth);
+                    check!(rasterize_narrow_color, Tiling::Narrow);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn backward_matches_its_twin() {
+        let gpu = testing::gpu();
+        for (i, size) in SIZES.into_iter().enumerate() {
+            for n in [0, 1, 65, 300] {
+                macro_rules! check {
+                    ($forward:ident, $module:ident, $tiling:expr $(, $field:ident)*) => {{
+                        let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(i as u64);
+                        let s = scene(i as u64, n, size, $tiling, 9.0);
+                        let pixels = (size[0] * size[1]) as usize;
+                        let grid = $tiling.grid(size);
+                        let mut random = || (0..pixels).map(|_| rng.random_range(-1f32..1.0)).collect::<Vec<f32>>();
+                        let threads = [grid[0] * $tiling.threads(), grid[1], 1];
+                        let picture = $forward::Arrays {
+                            ranges: s.ranges.clone(), sorted: s.sorted.clone(), pair_slot: s.pair_slot.clone(),
+                            mean: s.mean.clone(), conic: s.conic.clone(), opacity: s.opacity.clone(),
+                            color: s.color.clone(), depth: s.depth.clone(), rgb: vec![[0.0; 3]; pixels],
+                            depth_map: vec![0.0; pixels], transmittance: vec![0.0; pixels],
+                        };
+                        let push = $forward::Push { size, tiles_x: grid[0], background: [0.1, 0.2, 0.3] };
+                        let picture = testing::run_once::<$forward::Kernel>(&gpu, &picture, push, threads);
+                        let pairs = s.pair_slot.len();
+                        let extra = Extra {
+                            depth: s.depth, pair_depth: vec![UNWRITTEN; pairs], depth_map: picture.depth_map,
+                            transmittance: picture.transmittance, grad_depth_map: random(), grad_transmittance: random(),
+                        };
+                        let grad_rgb = (0..pixels).map(|p| [extra.grad_depth_map[p], -extra.grad_transmittance[p], 0.5]).collect();
+                        let case = $module::Arrays {
+                            ranges: s.ranges, sorted: s.sorted, pair_slot: s.pair_slot, mean: s.mean, conic: s.conic,
+                            opacity: s.opacity, color: s.color, rgb: picture.rgb, grad_rgb,
+                            pair_mean: vec![[UNWRITTEN; 2]; pairs], pair_conic: vec![[UNWRITTEN; 3]; pairs],
+                            pair_opacity: vec![UNWRITTEN; pairs], pair_color: vec![[UNWRITTEN; 3]; pairs],
+                            $($field: extra.$field,)*
+                        };
+                        let push = $module::Push { size, tiles_x: grid[0] };
+                        testing::assert_twin($module::Kernel, &gpu, case, push, threads);
+                    }};
+                }
+                check!(
+                    rasterize,
+                    rasterize_backward,
+                    Tiling::Wide,
+                    depth,
+                    depth_map,
+                    grad_depth_map,
+                    pair_depth,
+                    transmittance,
+                    grad_transmittance
+                );
+                check!(rasterize, rasterize_backward_depth, Tiling::Wide, depth, depth_map, grad_depth_map, pair_depth);
+                check!(rasterize, rasterize_backward_color, Tiling::Wide);
+                if gpu.info().subgroup_size == 8 {
+                    check!(
+                        rasterize_narrow,
+                        rasterize_backward_narrow,
+                        Tiling::Narrow,
+                        depth,
+                        depth_map,
+                        grad_depth_map,
+                        pair_depth,
+                        transmittance,
+                        grad_transmittance
+                    );
+                    check!(
+                        rasterize_narrow,
+                        rasterize_backward_narrow_depth,
+                        Tiling::Narrow,
+                        depth,
+                        depth_map,
+                        grad_depth_map,
+                        pair_depth
+                    );
+                    check!(rasterize_narrow, rasterize_backward_narrow_color, Tiling::Narrow);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn gather_matches_its_twin() {
+        let gpu = testing::gpu();
+        for n in [0, 1, 63, 64, 65, 1000] {
+            let s = scene(n as u64, n, [90, 60], Tiling::Narrow, 9.0);
+            let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(1);
+            let pairs = s.pair_slot.len();
+            let mut random = || rng.random_range(-1f32..1.0);
+            let case = rasterize_gather::Arrays {
+                slot_count: vec![n as u32],
+                tiles: s.tiles,
+                pair_count: vec![pairs as u32],
+                first_pair: s.first_pair,
+                conic: s.conic,
+                pair_mean: (0..pairs).map(|_| [random(), random()]).collect(),
+                pair_conic: (0..pairs).map(|_| [random(), random(), random()]).collect(),
+                pair_opacity: (0..pairs).map(|_| random()).collect(),
+                pair_color: (0..pairs).map(|_| [random(), random(), random()]).collect(),
+                pair_depth: (0..pairs).map(|_| random()).collect(),
+                grad_mean: vec![[UNWRITTEN; 2]; n],
+                grad_covariance: vec![[UNWRITTEN; 3]; n],
+                grad_opacity: vec![UNWRITTEN; n],
+                grad_color: vec![[UNWRITTEN; 3]; n],
+                grad_depth: vec![UNWRITTEN; n],
+            };
+            testing::assert_twin(rasterize_gather::Kernel, &gpu, case.clone(), (), n);
+            let color = rasterize_gather_color::Arrays {
+                slot_count: case.slot_count,
+                tiles: case.tiles,
+                pair_count: vec![0],
+                first_pair: case.first_pair,
+                conic: case.conic,
+                pair_mean: case.pair_mean,
+                pair_conic: case.pair_conic,
+                pair_opacity: case.pair_opacity,
+                pair_color: case.pair_color,
+                grad_mean: case.grad_mean,
+                grad_covariance: case.grad_covariance,
+                grad_opacity: case.grad_opacity,
+                grad_color: case.grad_color,
+            };
+            testing::assert_twin(rasterize_gather_color::Kernel, &gpu, color, (), n);
+        }
+    }
+}
