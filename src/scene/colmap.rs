@@ -5,7 +5,7 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, BufReader, Read};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use super::{Error, Point};
 
@@ -44,8 +44,6 @@ pub struct Model {
     pub images: Vec<Image>,
     /// Sparse points in the file's order.
     pub points: Vec<Point>,
-    /// The files read, relative to nothing: for messages and notes.
-    pub files: Vec<PathBuf>,
 }
 
 const SUPPORTED: &str = "SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL and OPENCV";
@@ -137,7 +135,6 @@ pub fn read(scene: &Path) -> Result<Model, Error> {
             return Err(Error::File { path: images, what });
         }
     }
-    model.files = vec![cameras, images];
     for (name, read) in [
         ("points3D.bin", binary_points as fn(&Path) -> Result<Vec<Point>, Error>),
         ("points3D.txt", text_points),
@@ -146,7 +143,6 @@ pub fn read(scene: &Path) -> Result<Model, Error> {
         let path = folder.join(name);
         if path.is_file() {
             model.points = read(&path)?;
-            model.files.push(path);
             if !model.points.is_empty() {
                 return Ok(model);
             }
@@ -489,19 +485,22 @@ impl ply_rs_bw::ply::PropertyAccess for Vertex {
 
 fn ply_points(path: &Path) -> Result<Vec<Point>, Error> {
     let invalid = |what: String| Error::File { path: path.to_path_buf(), what };
+    // The parser's messages go on with the line's text and cause.
+    let unreadable = |e: ply_rs_bw::parser::ParseError| {
+        let text = e.to_string();
+        invalid(format!("not a readable PLY file: {}", text.lines().next().unwrap_or("no reason given")))
+    };
     let file = File::open(path).map_err(|source| Error::Io { path: path.to_path_buf(), source })?;
     let mut reader = ply_rs_bw::parser::Reader::new(BufReader::new(file));
     let parser = ply_rs_bw::parser::Parser::<Vertex>::new();
-    let header = parser.read_header(&mut reader).map_err(|e| invalid(format!("not a readable PLY file: {e}")))?;
+    let header = parser.read_header(&mut reader).map_err(unreadable)?;
     let Some((first, element)) = header.elements.first() else {
         return Err(invalid("the PLY file lists no vertices".into()));
     };
     if first != "vertex" {
         return Err(invalid(format!("the PLY file begins with '{first}', it must begin with its vertices")));
     }
-    let vertices = parser
-        .read_payload_for_element(&mut reader, element, &header)
-        .map_err(|e| invalid(format!("not a readable PLY file: {e}")))?;
+    let vertices = parser.read_payload_for_element(&mut reader, element, &header).map_err(unreadable)?;
     vertices
         .into_iter()
         .enumerate()

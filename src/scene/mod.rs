@@ -334,11 +334,8 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
             position += u32::from(!is_reference);
             !is_reference && (position - 1).is_multiple_of(config.test_every)
         });
-        notes.push(format!(
-            "{} of {} views are held out for testing; they show the object",
-            test.len(),
-            test.len() + train.len()
-        ));
+        let object = if no_masks { "" } else { "; they show the object" };
+        notes.push(format!("{} of {} views are held out for testing{object}", test.len(), test.len() + train.len()));
     }
     if train.is_empty() {
         let what = "no view is left to train on; check images/ against the model, and test_every".into();
@@ -364,17 +361,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     let reader = Reader { config, dilate: 0, tall_mask: layout.tall_test_mask };
     let loaded_test = read(&test, &reader)?;
 
-    let scales: BTreeSet<_> = loaded_train.iter().chain(&loaded_test).map(|l| (l.calibrated, l.picture)).collect();
-    for (calibrated, picture) in scales.iter().filter(|(calibrated, picture)| calibrated != picture) {
-        notes.push(format!(
-            "pictures are {}x{} but the model's camera is {}x{}: the camera is scaled by {:.6}",
-            picture[0],
-            picture[1],
-            calibrated[0],
-            calibrated[1],
-            f64::from(picture[0]) / f64::from(calibrated[0])
-        ));
-    }
+    notes.extend(scale_note(loaded_train.iter().chain(&loaded_test)));
     let stretched = loaded_test.iter().filter(|l| l.stretched_mask).count();
     if stretched > 0 {
         notes.push(format!(
@@ -438,7 +425,22 @@ fn summarise(
         Some([w, h]) if sizes.len() == 1 => format!("{w}x{h}"),
         _ => format!("{} different sizes", sizes.len()),
     };
-    notes.push(format!("{} train views at {size}, {} test views, {points} points", train.len(), test.len()));
+    let count = |kind| train.iter().filter(|v| v.prior.as_ref().is_some_and(|p| p.kind == kind)).count();
+    let having = [
+        (train.iter().filter(|v| v.mask.is_some()).count(), "masks"),
+        (count(PriorKind::Depth), "depth priors"),
+        (count(PriorKind::Disparity), "disparity priors"),
+    ];
+    let having: String = having.iter().filter(|(n, _)| *n > 0).map(|(n, what)| format!(", {n} {what}")).collect();
+    let inpainted = reference.map_or_else(String::new, |r| {
+        let prior = r.prior.as_ref().map_or("no", |p| p.kind.folder());
+        format!("reference view {} with {prior} prior; ", train[r.view].name)
+    });
+    notes.push(format!(
+        "{} train views at {size}{having}; {inpainted}{} test views; {points} points",
+        train.len(),
+        test.len()
+    ));
     let masks: Vec<&GrayImage> = train.iter().filter_map(|v| v.mask.as_ref()).collect();
     if masks.is_empty() {
         if config.masks {
@@ -474,6 +476,18 @@ fn summarise(
     if test.is_empty() {
         notes.push("no test views: there is nothing to evaluate on (test_every holds some out)".into());
     }
+}
+
+/// What was worked out where pictures are not as large as the model's cameras.
+fn scale_note<'a>(views: impl Iterator<Item = &'a Loaded>) -> Option<String> {
+    let sizes: BTreeSet<_> = views.map(|l| (l.picture, l.calibrated)).filter(|(p, c)| p != c).collect();
+    let (picture, calibrated) = sizes.first()?;
+    let scale = f64::from(picture[0]) / f64::from(calibrated[0]);
+    let ([w, h], [cw, ch]) = (picture, calibrated);
+    let others = if sizes.len() > 1 { format!("; {} more sizes likewise", sizes.len() - 1) } else { String::new() };
+    Some(format!(
+        "pictures are {w}x{h} but the model's camera is {cw}x{ch}: the camera is scaled by {scale:.6}{others}"
+    ))
 }
 
 /// Poses of the model by picture name.

@@ -8,7 +8,7 @@ use ndarray_npy::{ReadNpyError, ReadableElement, read_npy};
 
 use super::{Error, Prior, PriorKind, resample};
 
-/// File extensions read here, lower case, in the order they are preferred.
+/// File extensions read here, lower case.
 pub(super) const EXTENSIONS: [&str; 3] = ["npy", "exr", "png"];
 
 /// A prior as stored: row-major values and (width, height).

@@ -86,14 +86,12 @@ pub fn write(dir: &Path, options: &Options) -> Result<(), Error> {
     (0..train.len()).into_par_iter().try_for_each(|i| {
         let shot = &train[i];
         let name = format!("{}.png", shot.name);
-        let (picture, mask) = room.photograph(shot, true);
-        save(dir.join("images").join(&name), |path| picture.save(path))?;
-        save(dir.join("masks").join(&name), |path| mask.save(path))?;
+        save(dir.join("images").join(&name), |path| room.photograph(shot, true).save(path))?;
+        save(dir.join("masks").join(&name), |path| room.mask(shot).save(path))?;
         let mut rng = Pcg64::new(seed.into(), (PRIORS + 2 * i as u64).into());
         save_prior(&dir.join("depth").join(format!("{}.npy", shot.name)), &room.depth(shot, true), shot, &mut rng)?;
         if i == reference {
-            let (picture, _) = room.photograph(shot, false);
-            save(dir.join("reference").join(&name), |path| picture.save(path))?;
+            save(dir.join("reference").join(&name), |path| room.photograph(shot, false).save(path))?;
             let mut rng = Pcg64::new(seed.into(), (PRIORS + 2 * i as u64 + 1).into());
             let path = dir.join("reference").join(format!("{}_depth.npy", shot.name));
             save_prior(&path, &room.depth(shot, false), shot, &mut rng)?;
@@ -102,10 +100,8 @@ pub fn write(dir: &Path, options: &Options) -> Result<(), Error> {
     })?;
     test.par_iter().try_for_each(|shot| {
         let name = format!("{}.png", shot.name);
-        let (_, mask) = room.photograph(shot, true);
-        let (picture, _) = room.photograph(shot, false);
-        save(dir.join("test_images").join(&name), |path| picture.save(path))?;
-        save(dir.join("test_masks").join(&name), |path| mask.save(path))
+        save(dir.join("test_images").join(&name), |path| room.photograph(shot, false).save(path))?;
+        save(dir.join("test_masks").join(&name), |path| room.mask(shot).save(path))
     })?;
     let cloud = room.points(&train, points, &mut Pcg64::new(seed.into(), POINTS.into()));
     write_model(&dir.join("sparse/0"), &train, &test, &cloud)
@@ -283,8 +279,8 @@ impl Material {
                 let wavelength = 1.2 * 0.1f64.powf(f64::from(i) / 13.0);
                 let normal = |rng: &mut Pcg64| -> f64 { StandardNormal.sample(rng) };
                 let direction = dvec3(normal(rng), normal(rng), normal(rng)).normalize() * (TAU / wavelength);
-                let tint = dvec3(1.0, 1.0, 1.0) + 0.4 * dvec3(normal(rng), normal(rng), normal(rng));
-                Wave { direction, phase: rng.random_range(0.0..TAU), amplitude: 0.07 * wavelength.powf(0.3) * tint }
+                let tint = DVec3::ONE + 0.3 * dvec3(normal(rng), normal(rng), normal(rng));
+                Wave { direction, phase: rng.random_range(0.0..TAU), amplitude: 0.06 * wavelength.powf(0.25) * tint }
             })
             .collect();
         Material { base: DVec3::from(base), waves, pattern }
@@ -300,21 +296,32 @@ impl Material {
         } else {
             (at.y, at.z)
         };
-        let seam = match self.pattern {
-            Pattern::Plain => 0.0,
+        // How close a seam is, and which brick, tile or board this is.
+        let (seam, cell) = match self.pattern {
+            Pattern::Plain => (0.0, [0.0; 2]),
             Pattern::Bricks(width, height) => {
                 let row = (v / height).floor();
-                let shift = if row.rem_euclid(2.0) == 0.0 { 0.0 } else { 0.5 * width };
-                line(v, height, 0.018).max(line(u + shift, width, 0.018))
+                let along = u + if row.rem_euclid(2.0) == 0.0 { 0.0 } else { 0.5 * width };
+                (line(v, height, 0.018).max(line(along, width, 0.018)), [(along / width).floor(), row])
             }
-            Pattern::Tiles(pitch) => line(u, pitch, 0.015).max(line(v, pitch, 0.015)),
-            Pattern::Boards(width) => line(u, width, 0.02),
+            Pattern::Tiles(pitch) => {
+                (line(u, pitch, 0.015).max(line(v, pitch, 0.015)), [(u / pitch).floor(), (v / pitch).floor()])
+            }
+            Pattern::Boards(width) => (line(u, width, 0.02), [(u / width).floor(), 0.0]),
         };
         let waves: DVec3 = self.waves.iter().map(|w| w.amplitude * (w.direction.dot(at) + w.phase).sin()).sum();
         let light = 0.72 + 0.28 * normal.dot(dvec3(-0.45, -0.6, 0.66));
-        let surface = (self.base * (1.0 + waves * 2.0)).lerp(DVec3::splat(0.85) - 0.7 * self.base, 0.75 * seam);
-        (surface * light).clamp(DVec3::ZERO, DVec3::ONE)
+        let surface = self.base * (waves + 0.86 + 0.28 * shade(cell));
+        (surface.lerp(DVec3::splat(0.85) - 0.7 * self.base, 0.75 * seam) * light).clamp(DVec3::ZERO, DVec3::ONE)
     }
+}
+
+/// A number in [0, 1) for a cell, without order.
+fn shade([a, b]: [f64; 2]) -> f64 {
+    let mut bits =
+        (a as i64 as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ (b as i64 as u64).wrapping_mul(0xc2b2_ae3d_27d4_eb4f);
+    bits = (bits ^ (bits >> 31)).wrapping_mul(0xd6e8_feb8_6659_fd93);
+    (bits >> 11) as f64 / (1u64 << 53) as f64
 }
 
 /// Shapes with their materials; the object's come last.
@@ -327,9 +334,10 @@ struct Room {
 /// The first surface along a ray.
 struct Hit {
     depth: f64,
-    color: DVec3,
+    normal: DVec3,
     position: DVec3,
-    object: bool,
+    /// Index into [`Room::shapes`].
+    shape: usize,
 }
 
 impl Room {
@@ -339,11 +347,11 @@ impl Room {
         let walls = Shape::Walls { low: dvec3(-3.0, -3.5, 0.0), high: dvec3(3.0, 3.0, 3.0) };
         let mut material = |base, pattern| Material::new(base, pattern, &mut rng);
         let shapes = vec![
-            (walls, material([0.62, 0.42, 0.34], Pattern::Bricks(0.5, 0.22))),
-            (block([-3.0, -3.5, -0.1], [3.0, 3.0, 1e-6]), material([0.45, 0.50, 0.52], Pattern::Tiles(0.45))),
-            (block([-1.8, 1.6, 0.0], [0.35, 3.0, 0.6]), material([0.58, 0.47, 0.30], Pattern::Boards(0.3))),
+            (walls, material([0.68, 0.40, 0.32], Pattern::Bricks(0.5, 0.22))),
+            (block([-3.0, -3.5, -0.1], [3.0, 3.0, 1e-6]), material([0.55, 0.58, 0.60], Pattern::Tiles(0.45))),
+            (block([-1.8, 1.6, 0.0], [0.35, 3.0, 0.6]), material([0.66, 0.52, 0.32], Pattern::Boards(0.3))),
             (block([1.2, 2.3, 0.0], [1.9, 3.0, 1.5]), material([0.30, 0.46, 0.40], Pattern::Boards(0.23))),
-            (block([-0.01, 0.59, 0.0], [0.31, 0.91, 0.57]), material([0.75, 0.70, 0.60], Pattern::Plain)),
+            (block([-0.01, 0.59, 0.0], [0.31, 0.91, 0.57]), material([0.85, 0.82, 0.76], Pattern::Plain)),
             (
                 Shape::Sphere { center: dvec3(0.15, 0.75, 0.83), radius: 0.28 },
                 material([0.25, 0.35, 0.75], Pattern::Plain),
@@ -360,27 +368,36 @@ impl Room {
             .filter_map(|(i, (shape, _))| Some((i, shape.hit(eye, ray)?)))
             .min_by(|a, b| a.1.0.total_cmp(&b.1.0))
             .expect("a ray from inside the room ends at a wall");
-        let position = eye + ray * depth;
-        Hit { depth, color: self.shapes[index].1.color(position, normal), position, object: index >= self.object }
+        Hit { depth, normal, position: eye + ray * depth, shape: index }
     }
 
-    /// The anti-aliased picture, and the pixels of which some ray met the object.
-    fn photograph(&self, shot: &Shot, with_object: bool) -> (RgbImage, GrayImage) {
-        let [w, h] = shot.size;
-        let (mut picture, mut mask) = (RgbImage::new(w, h), GrayImage::new(w, h));
-        for (x, y, pixel) in picture.enumerate_pixels_mut() {
-            let (mut sum, mut object) = (DVec3::ZERO, false);
-            for s in 0..SAMPLES * SAMPLES {
-                let offset = |i: u32| (f64::from(i) + 0.5) / f64::from(SAMPLES);
-                let ray = shot.ray(f64::from(x) + offset(s % SAMPLES), f64::from(y) + offset(s / SAMPLES));
-                let hit = self.cast(shot.eye, ray, with_object);
-                sum += hit.color;
-                object |= hit.object;
-            }
-            *pixel = to_rgb8(sum / f64::from(SAMPLES * SAMPLES));
-            mask.put_pixel(x, y, Luma([if object { 255 } else { 0 }]));
-        }
-        (picture, mask)
+    fn color(&self, hit: &Hit) -> DVec3 {
+        self.shapes[hit.shape].1.color(hit.position, hit.normal)
+    }
+
+    /// The first surfaces along the rays of a pixel.
+    fn hits(&self, shot: &Shot, x: u32, y: u32, with_object: bool) -> impl Iterator<Item = Hit> {
+        (0..SAMPLES * SAMPLES).map(move |s| {
+            let offset = |i: u32| (f64::from(i) + 0.5) / f64::from(SAMPLES);
+            let ray = shot.ray(f64::from(x) + offset(s % SAMPLES), f64::from(y) + offset(s / SAMPLES));
+            self.cast(shot.eye, ray, with_object)
+        })
+    }
+
+    /// The anti-aliased picture.
+    fn photograph(&self, shot: &Shot, with_object: bool) -> RgbImage {
+        RgbImage::from_fn(shot.size[0], shot.size[1], |x, y| {
+            let sum: DVec3 = self.hits(shot, x, y, with_object).map(|hit| self.color(&hit)).sum();
+            to_rgb8(sum / f64::from(SAMPLES * SAMPLES))
+        })
+    }
+
+    /// The pixels of which some ray meets the object.
+    fn mask(&self, shot: &Shot) -> GrayImage {
+        GrayImage::from_fn(shot.size[0], shot.size[1], |x, y| {
+            let object = self.hits(shot, x, y, true).any(|hit| hit.shape >= self.object);
+            Luma([if object { 255 } else { 0 }])
+        })
     }
 
     /// Exact depth z at the pixel centres, row-major.
@@ -399,7 +416,7 @@ impl Room {
                 let hit = self.cast(shot.eye, shot.ray(x, y), true);
                 let mut noise =
                     || -> f64 { POINT_NOISE * hit.depth * Distribution::<f64>::sample(&StandardNormal, rng) };
-                (hit.position + dvec3(noise(), noise(), noise()), to_rgb8(hit.color))
+                (hit.position + dvec3(noise(), noise(), noise()), to_rgb8(self.color(&hit)))
             })
             .collect()
     }
@@ -488,9 +505,7 @@ mod tests {
         let room = Room::new(7);
         let (train, _) = Shot::all(&options());
         for shot in &train {
-            let (with, mask) = room.photograph(shot, true);
-            let (without, nothing) = room.photograph(shot, false);
-            assert!(nothing.as_raw().iter().all(|v| *v == 0));
+            let (with, without, mask) = (room.photograph(shot, true), room.photograph(shot, false), room.mask(shot));
             let (mut object, mut changed) = (0, 0);
             for ((a, b), m) in with.pixels().zip(without.pixels()).zip(mask.pixels()) {
                 assert!(m.0[0] == 255 || a == b, "a pixel outside the mask shows the object");
