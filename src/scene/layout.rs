@@ -1,0 +1,414 @@
+//! Which file is what: the folder layouts found in circulation, told apart by the folders they have.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use super::{Error, PriorKind, priors};
+
+/// Extensions of pictures and masks, lower case.
+const PICTURES: [&str; 3] = ["png", "jpg", "jpeg"];
+
+/// SPIn-NeRF's split of its 100 sorted pictures: the first 40 are test views, and the reference is number 29 of the rest.
+const SPIN_PICTURES: usize = 100;
+const SPIN_TEST: usize = 40;
+const SPIN_REFERENCE: usize = SPIN_TEST + 29;
+
+/// Size of some test masks of SPIn-NeRF's 1008 x 567 scenes: nine rows more than their pictures.
+const SPIN_TALL_MASK: ([u32; 2], [u32; 2]) = ([1008, 576], [1008, 567]);
+
+/// One photograph and what belongs to it.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Entry {
+    /// Path of the picture below its folder, without extension, with `/` between folders.
+    pub name: String,
+    pub image: PathBuf,
+    pub mask: Option<PathBuf>,
+    pub prior: Option<(PathBuf, PriorKind)>,
+}
+
+/// The inpainted picture of one train view.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct ReferenceFiles {
+    /// Name of the train view.
+    pub name: String,
+    pub image: PathBuf,
+    pub prior: Option<ReferencePrior>,
+}
+
+/// Where the depth prior of the inpainted picture is, and how its kind is known.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct ReferencePrior {
+    pub path: PathBuf,
+    /// Said by the file's name or its folder; otherwise it is found by comparison with the view's own prior.
+    pub kind: Option<PriorKind>,
+}
+
+/// The files of a scene.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Layout {
+    /// One clause: which layout and by what it was recognised.
+    pub found: String,
+    pub train: Vec<Entry>,
+    pub test: Vec<Entry>,
+    pub reference: Option<ReferenceFiles>,
+    /// The kind of prior that this layout has, if it has any.
+    pub kind: Option<PriorKind>,
+    pub notes: Vec<String>,
+    /// Test masks known to differ in size from their pictures: (mask size, picture size).
+    pub tall_test_mask: Option<([u32; 2], [u32; 2])>,
+}
+
+/// Files of one folder by name without extension.
+type Index = BTreeMap<String, PathBuf>;
+
+/// Finds out how `scene` is laid out and lists its files.
+///
+/// # Errors
+/// No pictures; two files of one name in a folder; `depth/` beside `disparity/`; a reference for no train view, or several.
+pub(super) fn find(scene: &Path) -> Result<Layout, Error> {
+    let spin_images =
+        ["images_4", "images_2", "images_8", "images"].into_iter().find(|name| scene.join(name).join("label").is_dir());
+    let gscream =
+        ["lama_input", "marigold_output", "images_4/mask_test"].into_iter().find(|name| scene.join(name).is_dir());
+    if let Some(by) = gscream {
+        gscream_copy(scene, by)
+    } else if let Some(images) = spin_images {
+        spin_nerf(scene, images)
+    } else {
+        plain(scene)
+    }
+}
+
+/// `images` or, where it is missing, a folder of smaller pictures.
+fn image_folder<'a>(scene: &Path, names: &[&'a str]) -> Result<&'a str, Error> {
+    names
+        .iter()
+        .copied()
+        .find(|name| scene.join(name).is_dir())
+        .ok_or_else(|| Error::NoImages { scene: scene.to_path_buf() })
+}
+
+fn plain(scene: &Path) -> Result<Layout, Error> {
+    let folder = image_folder(scene, &["images", "images_2", "images_4", "images_8"])?;
+    let (images, test_images) = (index(&scene.join(folder), &PICTURES)?, index(&scene.join("test_images"), &PICTURES)?);
+    if images.is_empty() {
+        return Err(Error::NoImages { scene: scene.to_path_buf() });
+    }
+    let (masks, test_masks) = (index(&scene.join("masks"), &PICTURES)?, index(&scene.join("test_masks"), &PICTURES)?);
+    let kind = match (scene.join("depth").is_dir(), scene.join("disparity").is_dir()) {
+        (true, true) => {
+            let what = "depth/ and disparity/ are both there; keep the one to train with".into();
+            return Err(Error::File { path: scene.to_path_buf(), what });
+        }
+        (true, false) => Some(PriorKind::Depth),
+        (false, true) => Some(PriorKind::Disparity),
+        (false, false) => None,
+    };
+    let priors = match kind {
+        Some(kind) => index(&scene.join(kind.folder()), &priors::EXTENSIONS)?,
+        None => Index::new(),
+    };
+    let train = entries(&images, |name| masks.get(name).cloned(), |name| Some((priors.get(name)?.clone(), kind?)));
+    let test = entries(&test_images, |name| test_masks.get(name).cloned(), |_| None);
+    let mut notes = Vec::new();
+    for (what, files, pictures) in [("masks", &masks, &images), ("test_masks", &test_masks, &test_images)] {
+        notes.extend(strays(what, files, pictures));
+    }
+    if let Some(kind) = kind {
+        notes.extend(strays(kind.folder(), &priors, &images));
+    }
+    let reference = reference(&scene.join("reference"), &train)?;
+    let found = format!("plain layout: pictures in {folder}/");
+    Ok(Layout { found, train, test, reference, kind, notes, tall_test_mask: None })
+}
+
+/// A note on files that belong to no picture.
+fn strays(what: &str, files: &Index, pictures: &Index) -> Option<String> {
+    let strays: Vec<&str> = files.keys().filter(|name| !pictures.contains_key(*name)).map(String::as_str).collect();
+    let first = strays.first()?;
+    Some(format!(
+        "{} of {} files in {what}/ belong to no picture and are left out (first: {first})",
+        strays.len(),
+        files.len()
+    ))
+}
+
+fn spin_nerf(scene: &Path, folder: &str) -> Result<Layout, Error> {
+    let images = scene.join(folder);
+    let masks = index(&images.join("label"), &PICTURES)?;
+    let test_masks = index(&images.join("test_label"), &PICTURES)?;
+    let split = spin_split(scene, &images, |name| masks.contains_key(name))?;
+    let train = entries(&split.train, |name| masks.get(name).cloned(), |_| None);
+    // Test masks are numbered in the order of the sorted pictures.
+    let position: BTreeMap<&String, usize> = split.test.keys().enumerate().map(|(i, name)| (name, i + 1)).collect();
+    let test_mask =
+        |name: &String| test_masks.get(name).or_else(|| test_masks.get(&format!("out_{:05}", position[name]))).cloned();
+    let test = entries(&split.test, test_mask, |_| None);
+    let (reference, note) = spin_reference(scene, &images, &train, split.reference.as_deref())?;
+    Ok(Layout {
+        found: format!("SPIn-NeRF's layout: pictures in {folder}/, train masks in {folder}/label/"),
+        train,
+        test,
+        reference,
+        kind: None,
+        notes: split.notes.into_iter().chain(note).collect(),
+        tall_test_mask: Some(SPIN_TALL_MASK),
+    })
+}
+
+fn gscream_copy(scene: &Path, by: &str) -> Result<Layout, Error> {
+    let folder = image_folder(scene, &["images_4", "images", "images_2", "images_8"])?;
+    let images = scene.join(folder);
+    let mut masks = Index::new();
+    for at in [scene.join("lama_input"), images.join("lama_input")] {
+        let files = index(&at, &PICTURES)?;
+        masks
+            .extend(files.into_iter().filter_map(|(name, path)| Some((name.strip_suffix("_mask")?.to_string(), path))));
+    }
+    // Copies that kept SPIn-NeRF's own masks.
+    for (name, path) in index(&images.join("label"), &PICTURES)? {
+        masks.entry(name).or_insert(path);
+    }
+    let test_masks = index(&images.join("mask_test"), &PICTURES)?;
+    let numbered = index(&images.join("test_label"), &PICTURES)?;
+    let depth = index(&scene.join("marigold_output/depth_npy"), &["npy"])?;
+    let depth: Index =
+        depth.into_iter().map(|(name, path)| (name.strip_suffix("_pred").unwrap_or(&name).to_string(), path)).collect();
+    let split = spin_split(scene, &images, |name| masks.contains_key(name) && !test_masks.contains_key(name))?;
+    let prior = |name: &String| Some((depth.get(name)?.clone(), PriorKind::Depth));
+    let train = entries(&split.train, |name| masks.get(name).cloned(), prior);
+    let position: BTreeMap<&String, usize> = split.test.keys().enumerate().map(|(i, name)| (name, i + 1)).collect();
+    let test_mask =
+        |name: &String| test_masks.get(name).or_else(|| numbered.get(&format!("out_{:05}", position[name]))).cloned();
+    let test = entries(&split.test, test_mask, |_| None);
+    let (mut reference, note) = spin_reference(scene, &images, &train, split.reference.as_deref())?;
+    let mut notes: Vec<String> = split.notes.into_iter().chain(note).collect();
+    if let Some(files) = &mut reference
+        && files.prior.is_none()
+        && let Some((path, kind)) = prior(&files.name)
+    {
+        notes.push(format!(
+            "the reference's depth is {}, as this layout has it (made from the inpainted picture)",
+            relative(scene, &path)
+        ));
+        files.prior = Some(ReferencePrior { path, kind: Some(kind) });
+    }
+    Ok(Layout {
+        found: format!("GScream's copy of SPIn-NeRF: pictures in {folder}/, recognised by {by}/"),
+        train,
+        test,
+        reference,
+        kind: (!depth.is_empty()).then_some(PriorKind::Depth),
+        notes,
+        tall_test_mask: Some(SPIN_TALL_MASK),
+    })
+}
+
+/// SPIn-NeRF's pictures, told apart.
+struct Split {
+    train: Index,
+    test: Index,
+    /// Name of the view that the benchmark inpaints.
+    reference: Option<String>,
+    notes: Vec<String>,
+}
+
+/// The benchmark's split by position where all 100 pictures are there, else by which pictures have a train mask.
+fn spin_split(scene: &Path, images: &Path, has_train_mask: impl Fn(&str) -> bool) -> Result<Split, Error> {
+    let mut all = index_flat(images, &PICTURES)?;
+    // A single inpainted picture beside the photographs is not one of them.
+    all.remove("reference");
+    if all.is_empty() {
+        return Err(Error::NoImages { scene: scene.to_path_buf() });
+    }
+    if all.len() == SPIN_PICTURES {
+        let reference = all.keys().nth(SPIN_REFERENCE).cloned();
+        let first_train = all.keys().nth(SPIN_TEST).cloned().expect("there are 100 names");
+        let train = all.split_off(&first_train);
+        let notes = vec![format!("the first {SPIN_TEST} of {SPIN_PICTURES} sorted names are test views")];
+        return Ok(Split { train, test: all, reference, notes });
+    }
+    let count = all.len();
+    let (train, test): (Index, Index) = all.into_iter().partition(|(name, _)| has_train_mask(name));
+    let notes = vec![format!(
+        "{count} pictures instead of {SPIN_PICTURES}: the {} with a train mask are train views, the others test views",
+        train.len()
+    )];
+    Ok(Split { train, test, reference: None, notes })
+}
+
+/// The inpainted picture in a SPIn-NeRF scene, wherever copies keep it, or a note on where it was looked for.
+fn spin_reference(
+    scene: &Path,
+    images: &Path,
+    train: &[Entry],
+    name: Option<&str>,
+) -> Result<(Option<ReferenceFiles>, Option<String>), Error> {
+    for folder in [scene.join("reference"), images.join("reference")] {
+        if let Some(found) = reference(&folder, train)? {
+            return Ok((Some(found), None));
+        }
+    }
+    let Some(name) = name else {
+        return Ok((None, Some("no reference/ with one inpainted picture was found".into())));
+    };
+    let mut candidates = Vec::new();
+    for root in [images, scene] {
+        for folder in ["lama_images", "lama_output", "inpainted"] {
+            // LaMa names its result after the mask file.
+            candidates.extend([name.to_string(), format!("{name}_mask")].map(|stem| root.join(folder).join(stem)));
+        }
+        candidates.push(root.join("reference"));
+    }
+    let found = candidates.into_iter().find_map(|stem| {
+        PICTURES
+            .into_iter()
+            .flat_map(|e| [e.to_string(), e.to_uppercase()])
+            .map(|e| with_extension(&stem, &e))
+            .find(|p| p.is_file())
+    });
+    Ok(match found {
+        Some(image) => {
+            let note = format!("the reference is {}, taken for the benchmark's view {name}", relative(scene, &image));
+            (Some(ReferenceFiles { name: name.to_string(), image, prior: None }), Some(note))
+        }
+        None => (
+            None,
+            Some(format!(
+                "no inpainted picture of the benchmark's reference view was found (looked for reference/{name}.png and lama_images/{name}.png)"
+            )),
+        ),
+    })
+}
+
+/// The one inpainted picture in `folder`, its train view and its prior; `None` if there is no such folder or no picture.
+///
+/// The prior is NAME_depth or NAME_disparity (`.npy`, `.exr`, `.png`), whose kind is said, or NAME (`.npy`, `.exr`).
+fn reference(folder: &Path, train: &[Entry]) -> Result<Option<ReferenceFiles>, Error> {
+    let kinds = [PriorKind::Depth, PriorKind::Disparity];
+    let suffixed = |name: &str| kinds.into_iter().any(|k| name.ends_with(k.suffix()));
+    let known = |name: &str| train.iter().any(|e| e.name == name);
+    let mut pictures = index(folder, &PICTURES)?;
+    pictures.retain(|name, _| known(name) || !suffixed(name));
+    if pictures.len() > 1 {
+        let names: Vec<&str> = pictures.keys().take(2).map(String::as_str).collect();
+        let what = format!(
+            "{} pictures ({}, ...); a scene has one reference view: keep one",
+            pictures.len(),
+            names.join(", ")
+        );
+        return Err(Error::File { path: folder.to_path_buf(), what });
+    }
+    let Some((name, image)) = pictures.into_iter().next() else {
+        return Ok(None);
+    };
+    if !known(&name) {
+        return Err(Error::ReferenceWithoutView { path: image });
+    }
+    let said = kinds.into_iter().flat_map(|kind| {
+        priors::EXTENSIONS.map(|e| (with_extension(&folder.join(format!("{name}{}", kind.suffix())), e), Some(kind)))
+    });
+    let unsaid = ["npy", "exr"].into_iter().map(|e| (with_extension(&folder.join(&name), e), None));
+    let found: Vec<_> = said.chain(unsaid).filter(|(path, _)| path.is_file()).collect();
+    if let [(first, _), (second, _), ..] = found.as_slice() {
+        let what = format!("the reference has a second prior, {}; keep one", second.display());
+        return Err(Error::File { path: first.clone(), what });
+    }
+    let prior = found.into_iter().next().map(|(path, kind)| ReferencePrior { path, kind });
+    Ok(Some(ReferenceFiles { name, image, prior }))
+}
+
+/// Adds an extension to a name that may contain dots.
+fn with_extension(stem: &Path, extension: &str) -> PathBuf {
+    let mut name = stem.as_os_str().to_os_string();
+    name.push(".");
+    name.push(extension);
+    PathBuf::from(name)
+}
+
+fn entries(
+    images: &Index,
+    mask: impl Fn(&String) -> Option<PathBuf>,
+    prior: impl Fn(&String) -> Option<(PathBuf, PriorKind)>,
+) -> Vec<Entry> {
+    images
+        .iter()
+        .map(|(name, image)| Entry { name: name.clone(), image: image.clone(), mask: mask(name), prior: prior(name) })
+        .collect()
+}
+
+/// A path below the scene, for notes.
+pub(super) fn relative(scene: &Path, path: &Path) -> String {
+    path.strip_prefix(scene).unwrap_or(path).display().to_string()
+}
+
+/// Removes picture extensions: `a.JPG` and COLMAP's mask name `a.jpg.png` both become `a`.
+pub(super) fn stem(name: &str) -> &str {
+    let mut stem = name;
+    while let Some((rest, extension)) = stem.rsplit_once('.') {
+        if rest.is_empty() || !PICTURES.iter().chain(&priors::EXTENSIONS).any(|e| extension.eq_ignore_ascii_case(e)) {
+            break;
+        }
+        stem = rest;
+    }
+    stem
+}
+
+/// The files of `folder` and of the folders below it that have one of `extensions`. A missing folder is an empty one.
+fn index(folder: &Path, extensions: &[&str]) -> Result<Index, Error> {
+    let mut out = Index::new();
+    let mut pending = vec![(folder.to_path_buf(), String::new())];
+    while let Some((at, prefix)) = pending.pop() {
+        for (path, name) in list(&at)? {
+            if path.is_dir() {
+                pending.push((path, format!("{prefix}{name}/")));
+            } else {
+                insert(&mut out, path, format!("{prefix}{name}"), extensions)?;
+            }
+        }
+    }
+    Ok(out)
+}
+
+/// Like [`index`], without the folders below.
+fn index_flat(folder: &Path, extensions: &[&str]) -> Result<Index, Error> {
+    let mut out = Index::new();
+    for (path, name) in list(folder)? {
+        if path.is_file() {
+            insert(&mut out, path, name, extensions)?;
+        }
+    }
+    Ok(out)
+}
+
+/// Visible entries of a folder; none if there is no such folder.
+fn list(folder: &Path) -> Result<Vec<(PathBuf, String)>, Error> {
+    let failed = |source| Error::Io { path: folder.to_path_buf(), source };
+    if !folder.is_dir() {
+        return Ok(Vec::new());
+    }
+    let mut out = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(failed)? {
+        let path = entry.map_err(failed)?.path();
+        if let Some(name) = path.file_name().and_then(|n| n.to_str()).filter(|n| !n.starts_with('.')) {
+            let name = name.to_string();
+            out.push((path, name));
+        }
+    }
+    Ok(out)
+}
+
+fn insert(out: &mut Index, path: PathBuf, name: String, extensions: &[&str]) -> Result<(), Error> {
+    let extension = name.rsplit_once('.').map_or("", |(_, e)| e);
+    if !extensions.iter().any(|e| extension.eq_ignore_ascii_case(e)) {
+        return Ok(());
+    }
+    let key = stem(&name).to_string();
+    if let Some(other) = out.get(&key) {
+        let (first, second) = if *other < path { (other.clone(), path) } else { (path, other.clone()) };
+        let what = format!("{} has the same name; keep one", second.display());
+        return Err(Error::File { path: first, what });
+    }
+    out.insert(key, path);
+    Ok(())
+}

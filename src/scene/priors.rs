@@ -1,0 +1,171 @@
+//! Depth priors on disk: `.npy`, `.exr` and `.png`, in any resolution with the picture's proportions.
+
+use std::path::Path;
+
+use image::DynamicImage;
+use ndarray::ArrayD;
+use ndarray_npy::{ReadNpyError, ReadableElement, read_npy};
+
+use super::{Error, Prior, PriorKind, resample};
+
+/// File extensions read here, lower case.
+pub(super) const EXTENSIONS: [&str; 3] = ["npy", "exr", "png"];
+
+/// A prior as stored: row-major values and (width, height).
+struct Map {
+    values: Vec<f32>,
+    size: [u32; 2],
+}
+
+/// Reads a prior and brings it to `size`, for a picture whose own size is `picture`.
+///
+/// Priors often come at a depth network's resolution: any size is accepted whose proportions are those of the picture
+/// within 1 %, and resampled by area (shrinking) or linearly (growing). 8- and 16-bit PNG is scaled to [0, 1]; NumPy and
+/// OpenEXR values are taken as they are.
+///
+/// # Errors
+/// Unreadable files, NaN or infinite values, other proportions than the picture's.
+pub(super) fn read(path: &Path, kind: PriorKind, picture: [u32; 2], size: [u32; 2]) -> Result<Prior, Error> {
+    let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
+    let map = match extension.as_str() {
+        "npy" => npy(path),
+        "exr" => exr(path),
+        _ => png(path),
+    }?;
+    if let Some(at) = map.values.iter().position(|v| !v.is_finite()) {
+        let (row, column) = (at / map.size[0] as usize, at % map.size[0] as usize);
+        return Err(Error::NotFinite { path: path.to_path_buf(), value: map.values[at], row, column });
+    }
+    let [w, h] = map.size.map(f64::from);
+    let proportion = (w / h) / (f64::from(picture[0]) / f64::from(picture[1]));
+    if (proportion - 1.0).abs() > 0.01 {
+        return Err(Error::PriorSize { path: path.to_path_buf(), size: map.size, picture });
+    }
+    Ok(Prior { kind, values: resample::map(&map.values, map.size, size) })
+}
+
+fn invalid(path: &Path, what: impl std::fmt::Display) -> Error {
+    Error::File { path: path.to_path_buf(), what: what.to_string() }
+}
+
+fn npy(path: &Path) -> Result<Map, Error> {
+    /// `None` if the file holds another element type.
+    fn typed<T: ReadableElement + Copy>(path: &Path, value: impl Fn(T) -> f32) -> Result<Option<Map>, Error> {
+        let array: ArrayD<T> = match read_npy(path) {
+            Ok(array) => array,
+            Err(ReadNpyError::WrongDescriptor(_)) => return Ok(None),
+            Err(ReadNpyError::Io(source)) => return Err(Error::Io { path: path.to_path_buf(), source }),
+            Err(e) => return Err(invalid(path, format!("not a readable NumPy array: {e}"))),
+        };
+        // Networks leave batch and channel axes of length 1 around the map.
+        let sides: Vec<usize> = array.shape().iter().copied().filter(|n| *n != 1).collect();
+        let &[h, w] = sides.as_slice() else {
+            return Err(invalid(path, format!("the array's shape is {:?}, it must be rows x columns", array.shape())));
+        };
+        let size = [w, h].map(|n| u32::try_from(n).unwrap_or(0));
+        if size.contains(&0) {
+            return Err(invalid(path, format!("the array's shape is {:?}", array.shape())));
+        }
+        // `iter` walks in logical (row-major) order whatever the order in memory.
+        Ok(Some(Map { values: array.iter().map(|v| value(*v)).collect(), size }))
+    }
+    let read = typed::<f32>(path, |v| v)?
+        .map_or_else(|| typed::<f64>(path, |v| v as f32), |m| Ok(Some(m)))?
+        .map_or_else(|| typed::<u8>(path, f32::from), |m| Ok(Some(m)))?
+        .map_or_else(|| typed::<u16>(path, f32::from), |m| Ok(Some(m)))?;
+    read.ok_or_else(|| {
+        invalid(path, "the array's type must be float32, float64, uint8 or uint16; save it with `.astype('float32')`")
+    })
+}
+
+fn exr(path: &Path) -> Result<Map, Error> {
+    let image = exr::image::read::read_first_flat_layer_from_file(path)
+        .map_err(|e| invalid(path, format!("not a readable OpenEXR picture: {e}")))?;
+    let layer = image.layer_data;
+    let channels = &layer.channel_data.list;
+    let named = |name: &str| channels.iter().find(|c| c.name.to_string().eq_ignore_ascii_case(name));
+    let channel = ["Z", "depth", "disparity", "Y", "R"]
+        .into_iter()
+        .find_map(named)
+        .or_else(|| channels.first())
+        .ok_or_else(|| invalid(path, "the OpenEXR picture has no channels"))?;
+    let size = [layer.size.0, layer.size.1].map(|n| u32::try_from(n).unwrap_or(0));
+    if size.contains(&0) {
+        return Err(invalid(path, "the OpenEXR picture is empty"));
+    }
+    Ok(Map { values: channel.sample_data.values_as_f32().collect(), size })
+}
+
+fn png(path: &Path) -> Result<Map, Error> {
+    let image = super::decode(path)?;
+    let size = [image.width(), image.height()];
+    let grey = |channels: &[f32]| channels[0] == channels[1] && channels[1] == channels[2];
+    let values = match image {
+        DynamicImage::ImageLuma8(i) => i.as_raw().iter().map(|v| f32::from(*v) / 255.0).collect(),
+        DynamicImage::ImageLumaA8(i) => i.pixels().map(|p| f32::from(p.0[0]) / 255.0).collect(),
+        DynamicImage::ImageLuma16(i) => i.as_raw().iter().map(|v| f32::from(*v) / 65535.0).collect(),
+        DynamicImage::ImageLumaA16(i) => i.pixels().map(|p| f32::from(p.0[0]) / 65535.0).collect(),
+        other => {
+            let rgb = other.into_rgb32f();
+            if !rgb.pixels().all(|p| grey(&p.0)) {
+                return Err(invalid(
+                    path,
+                    "a prior is one grey channel, this is a colour picture; save the values, not a colour map",
+                ));
+            }
+            rgb.pixels().map(|p| p.0[0]).collect()
+        }
+    };
+    Ok(Map { values, size })
+}
+
+/// Spearman's rank correlation of two maps of the same size over the pixels where `valid`; at most about 65,536 of them,
+/// evenly spread. `None` with fewer than 16 pixels or a constant side.
+pub(super) fn rank_correlation(a: &[f32], b: &[f32], valid: impl Fn(usize) -> bool) -> Option<f64> {
+    let usable: Vec<usize> = (0..a.len()).filter(|i| valid(*i)).collect();
+    let picked: Vec<usize> = usable.iter().copied().step_by(usable.len().div_ceil(1 << 16).max(1)).collect();
+    if picked.len() < 16 {
+        return None;
+    }
+    let (ra, rb) = (ranks(&picked, a), ranks(&picked, b));
+    let mean = (picked.len() - 1) as f64 / 2.0;
+    let dot = |x: &[f64], y: &[f64]| x.iter().zip(y).map(|(p, q)| (p - mean) * (q - mean)).sum::<f64>();
+    let scale = (dot(&ra, &ra) * dot(&rb, &rb)).sqrt();
+    (scale > 0.0).then(|| dot(&ra, &rb) / scale)
+}
+
+/// Ranks from 0, ties sharing their mean rank.
+fn ranks(picked: &[usize], values: &[f32]) -> Vec<f64> {
+    let mut order: Vec<usize> = (0..picked.len()).collect();
+    order.sort_by(|i, j| values[picked[*i]].total_cmp(&values[picked[*j]]));
+    let mut out = vec![0.0; picked.len()];
+    let mut start = 0;
+    for run in order.chunk_by(|i, j| values[picked[*i]] == values[picked[*j]]) {
+        let rank = start as f64 + (run.len() - 1) as f64 / 2.0;
+        run.iter().for_each(|i| out[*i] = rank);
+        start += run.len();
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rank_correlation_sees_monotone_relations() {
+        let depth: Vec<f32> = (0..400).map(|i| 1.0 + i as f32 * 0.1).collect();
+        let disparity: Vec<f32> = depth.iter().map(|z| 1.0 / z).collect();
+        let all = |_: usize| true;
+        assert!((rank_correlation(&depth, &disparity, all).expect("400 pixels") + 1.0).abs() < 1e-12);
+        assert!((rank_correlation(&depth, &depth, all).expect("400 pixels") - 1.0).abs() < 1e-12);
+        assert_eq!(rank_correlation(&depth, &[2.0; 400], all), None);
+        assert_eq!(rank_correlation(&depth, &disparity, |i| i < 15), None);
+        // Only valid pixels count: the second half is reversed.
+        let mixed: Vec<f32> = (0..400).map(|i| if i < 200 { depth[i] } else { -depth[i] }).collect();
+        assert!((rank_correlation(&depth, &mixed, |i| i < 200).expect("200 pixels") - 1.0).abs() < 1e-12);
+        // Ties share their rank: a step against a ramp of four is 2 / sqrt(5), by hand.
+        let (ramp, step): (Vec<f32>, Vec<f32>) = (0..16).map(|i| ((i / 4) as f32, (i / 8) as f32)).unzip();
+        assert!((rank_correlation(&ramp, &step, all).expect("16 pixels") - 2.0 / 5f64.sqrt()).abs() < 1e-12);
+    }
+}
