@@ -1,1 +1,5 @@
 //! Cull, decode, project, bin, rasterize: forward and backward of a stage in one file.
+
+pub mod config;
+
+pub use config::Config;
