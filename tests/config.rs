@@ -67,7 +67,7 @@ fn every_file_in_configs_is_a_preset_and_resolves() {
         assert_eq!(settings.validate(), Ok(()), "{name}");
         let steps = settings.train.iterations;
         assert!(settings.densify.until <= steps && settings.model.attention.start < steps, "{name}");
-        assert!(steps % settings.train.log_interval == 0, "{name} ends on a log line");
+        assert!(steps.is_multiple_of(settings.train.log_interval), "{name} ends on a log line");
     }
 }
 

@@ -122,7 +122,7 @@ pub enum Error {
         /// Which layer set it.
         origin: Origin,
         /// Key, value and reason.
-        invalid: Invalid,
+        invalid: Box<Invalid>,
     },
 }
 

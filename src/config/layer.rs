@@ -85,7 +85,7 @@ impl Layers {
         let keys = [Some(&invalid.key), invalid.against.as_ref()];
         let origin = keys.into_iter().flatten().find_map(|key| self.origins.get(key)).cloned();
         let origin = origin.unwrap_or(Origin::Default);
-        Error::Invalid { origin, invalid }
+        Error::Invalid { origin, invalid: Box::new(invalid) }
     }
 }
 
