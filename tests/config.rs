@@ -231,7 +231,8 @@ fn values_that_make_no_sense_are_refused_with_the_layer_that_set_them() {
         "densify.levels=0",
         "densify.coarsest_cell=8",
         "densify.min_opacity=2",
-        "densify.max_log_scaling=inf",
+        "densify.max_log_scaling=nan",
+        "densify.max_log_scaling=-inf",
     ];
     for set in refused {
         let message = refusal(&["--set", set]);
@@ -240,4 +241,5 @@ fn values_that_make_no_sense_are_refused_with_the_layer_that_set_them() {
     }
     assert!(resolve(&["--set", "optimizer.learning_rate.offset=[0, 0]"]).is_ok());
     assert!(resolve(&["--set", "model.voxel=-1"]).is_ok());
+    assert!(resolve(&["--set", "densify.max_log_scaling=inf"]).is_ok());
 }

@@ -29,7 +29,8 @@ pub struct Config {
     pub min_anchor_visits: u32,
     /// Mean opacity below which a seen anchor is pruned.
     pub min_opacity: f64,
-    /// Cap of the Gaussians' log-scales (the last three of an anchor's six; natural logarithm of scene units) after pruning.
+    /// Cap of the Gaussians' log-scales (the last three of an anchor's six; natural logarithm of scene units) after
+    /// pruning. It suits scenes a few units wide; infinity leaves the scales alone.
     pub max_log_scaling: f64,
     /// Most anchors; growing stops there. 0 means no limit but memory.
     pub max_anchors: u32,
@@ -90,6 +91,11 @@ impl Config {
         )
         .map_err(|invalid| invalid.against("levels"))?;
         ensure((0.0..=1.0).contains(&self.min_opacity), "min_opacity", self.min_opacity, "must be between 0 and 1")?;
-        ensure(self.max_log_scaling.is_finite(), "max_log_scaling", self.max_log_scaling, "must be finite")
+        ensure(
+            self.max_log_scaling > f64::NEG_INFINITY,
+            "max_log_scaling",
+            self.max_log_scaling,
+            "must be a number, or inf for no cap",
+        )
     }
 }
