@@ -1,1 +1,112 @@
 //! Settings: as written in TOML, and resolved.
+//!
+//! [`Settings`] nests the `Config` of every stage; a stage owns the meaning, the default and the limits of its own.
+//! Values come in layers, later ones winning: defaults, `--preset`, `--config`, `--set` in their order, explicit flags.
+//! Every layer is checked by itself, so that an unknown key or a wrong type is reported with its own file and line; a
+//! value that makes no sense is reported with the layer that set it.
+
+mod arguments;
+mod error;
+mod layer;
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+pub use arguments::SettingsArgs;
+pub use error::{Error, Invalid, Origin};
+use layer::Layers;
+
+/// The presets shipped with the program: name and TOML text (`configs/NAME.toml`).
+pub const PRESETS: [(&str, &str); 4] = [
+    ("gscream", include_str!("../../configs/gscream.toml")),
+    ("paper", include_str!("../../configs/paper.toml")),
+    ("lavapipe", include_str!("../../configs/lavapipe.toml")),
+    ("demo", include_str!("../../configs/demo.toml")),
+];
+
+/// Every setting of a run, resolved. The defaults are the paper's; `configs/gscream.toml` lists them with comments.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default, expecting = "a table")]
+pub struct Settings {
+    /// The loop.
+    pub train: crate::train::Config,
+    /// Reading the capture.
+    pub scene: crate::scene::Config,
+    /// What is learnt.
+    pub model: crate::model::Config,
+    /// How it is drawn.
+    pub render: crate::render::Config,
+    /// What it is compared with.
+    pub losses: crate::losses::Config,
+    /// How it changes.
+    pub optimizer: crate::optimizer::Config,
+    /// Where anchors come and go.
+    pub densify: crate::densify::Config,
+}
+
+/// One layer of settings; see [`Settings::resolve`].
+#[derive(Debug, Clone, PartialEq)]
+pub enum Source {
+    /// A preset by name, one of [`PRESETS`].
+    Preset(String),
+    /// A TOML file.
+    File(PathBuf),
+    /// `key=value` with a dotted key, as given to `--set`. The value is TOML; what is not TOML is a string.
+    Set(String),
+    /// An explicit flag such as `--iterations`, which sets one key.
+    Flag {
+        /// The flag as the user typed it.
+        flag: &'static str,
+        /// Dotted key that it sets.
+        key: &'static str,
+        /// Its value.
+        value: toml::Value,
+    },
+}
+
+impl Settings {
+    /// Lays the sources over the defaults, later ones winning, and checks the result.
+    ///
+    /// # Errors
+    /// An unreadable file, an unknown preset, broken TOML, an unknown key, a value of a wrong type (each with file,
+    /// line and key), or a value that makes no sense (with the layer that set it).
+    pub fn resolve(sources: &[Source]) -> Result<Self, Error> {
+        let mut layers = Layers::default();
+        for source in sources {
+            layers.push(source)?;
+        }
+        let settings = layers.settings()?;
+        settings.validate().map_err(|invalid| layers.blame(invalid))?;
+        Ok(settings)
+    }
+
+    /// Refuses values that no run could use; keys are dotted from the root.
+    pub fn validate(&self) -> Result<(), Invalid> {
+        ensure(self.scene.downscale > 0, "scene.downscale", self.scene.downscale, "must be at least 1")?;
+        self.train.validate().map_err(|invalid| invalid.inside("train"))?;
+        self.model.validate().map_err(|invalid| invalid.inside("model"))?;
+        self.render.validate().map_err(|invalid| invalid.inside("render"))?;
+        self.losses.validate().map_err(|invalid| invalid.inside("losses"))?;
+        self.optimizer.validate().map_err(|invalid| invalid.inside("optimizer"))?;
+        self.densify.validate().map_err(|invalid| invalid.inside("densify"))
+    }
+
+    /// The settings as TOML, every key written out; [`Settings::resolve`] reads it back to the same value.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).expect("settings are tables of plain values")
+    }
+}
+
+/// `Err` naming `key` and `value` unless the condition holds; `reason` completes "is VALUE, but ...".
+pub fn ensure(
+    holds: bool,
+    key: &str,
+    value: impl std::fmt::Display,
+    reason: impl std::fmt::Display,
+) -> Result<(), Invalid> {
+    if holds {
+        return Ok(());
+    }
+    Err(Invalid { key: key.to_owned(), value: value.to_string(), reason: reason.to_string(), against: None })
+}

@@ -1,1 +1,5 @@
 //! Photometric, depth alignment, depth, depth gradient.
+
+pub mod config;
+
+pub use config::Config;

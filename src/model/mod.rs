@@ -1,1 +1,7 @@
 //! What is learnt: anchors, decoder, attention; files on disk.
+
+pub mod config;
+pub mod files;
+pub mod init;
+
+pub use config::Config;

@@ -1,1 +1,5 @@
 //! Adam and its schedules.
+
+pub mod config;
+
+pub use config::Config;

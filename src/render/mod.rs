@@ -1,4 +1,7 @@
 //! Cull, decode, project, bin, rasterize: forward and backward of a stage in one file.
 
 pub mod bin;
+pub mod config;
 pub mod rasterize;
+
+pub use config::Config;

@@ -35,7 +35,7 @@ pub use camera::{Camera, distort, undistort};
 
 /// How a scene is read.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
+#[serde(deny_unknown_fields, default, expecting = "a table")]
 pub struct Config {
     /// Train at 1 / `downscale` of the pictures' size, each side rounded to the nearest pixel. At least 1.
     pub downscale: u32,

@@ -1,0 +1,101 @@
+use serde::{Deserialize, Serialize};
+
+use crate::config::{Invalid, ensure};
+
+/// Growing and pruning of anchors (Scaffold-GS, section 3.3).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default, expecting = "a table")]
+pub struct Config {
+    /// Whether anchors grow and are pruned at all.
+    pub enabled: bool,
+    /// First step after which anchors may change (GScream: 1,500).
+    pub from: u32,
+    /// Last step after which anchors may change (GScream: 15,000).
+    pub until: u32,
+    /// Steps between two rounds (GScream: 100).
+    pub every: u32,
+    /// First step whose gradients and opacities are counted (GScream: 500).
+    pub statistics_from: u32,
+    /// Mean screen-space gradient (in normalised device coordinates) from which a Gaussian asks for a new anchor at
+    /// the coarsest level; doubled at each finer level.
+    pub gradient_threshold: f64,
+    /// Grid levels, coarse to fine. Level i keeps a candidate with probability 1 - 0.5^(i + 1).
+    pub levels: u32,
+    /// Cell of the coarsest level, in voxels; each finer level divides it by 4 (16, 4, 1).
+    pub coarsest_cell: u32,
+    /// A Gaussian grows only if it was drawn in more than this many steps since the last round.
+    pub min_slot_visits: u32,
+    /// An anchor is pruned only if it was seen in more than this many steps.
+    pub min_anchor_visits: u32,
+    /// Mean opacity below which a seen anchor is pruned.
+    pub min_opacity: f64,
+    /// Cap of the Gaussians' log-scales (the last three of an anchor's six; natural logarithm of scene units) after
+    /// pruning. It suits scenes a few units wide; infinity leaves the scales alone.
+    pub max_log_scaling: f64,
+    /// Most anchors; growing stops there. 0 means no limit but memory.
+    pub max_anchors: u32,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            enabled: true,
+            from: 1_500,
+            until: 15_000,
+            every: 100,
+            statistics_from: 500,
+            gradient_threshold: 0.0002,
+            levels: 3,
+            coarsest_cell: 16,
+            min_slot_visits: 40,
+            min_anchor_visits: 80,
+            min_opacity: 0.005,
+            max_log_scaling: 0.05,
+            max_anchors: 0,
+        }
+    }
+}
+
+impl Config {
+    /// Refuses values that no run could use.
+    pub fn validate(&self) -> Result<(), Invalid> {
+        ensure(self.every > 0, "every", self.every, "must be at least 1")?;
+        ensure(
+            self.until >= self.from,
+            "until",
+            self.until,
+            format_args!("must not be before densify.from ({}); densify.enabled = false switches it off", self.from),
+        )
+        .map_err(|invalid| invalid.against("from"))?;
+        ensure(
+            self.statistics_from <= self.from,
+            "statistics_from",
+            self.statistics_from,
+            format_args!("must not be after densify.from ({})", self.from),
+        )
+        .map_err(|invalid| invalid.against("from"))?;
+        ensure(
+            self.gradient_threshold.is_finite() && self.gradient_threshold > 0.0,
+            "gradient_threshold",
+            self.gradient_threshold,
+            "must be positive",
+        )?;
+        ensure((1..=8).contains(&self.levels), "levels", self.levels, "must be between 1 and 8")?;
+        // A cell smaller than the voxel would let two anchors share one.
+        let finest = 4u32.pow(self.levels - 1);
+        ensure(
+            self.coarsest_cell >= finest,
+            "coarsest_cell",
+            self.coarsest_cell,
+            format_args!("must be at least 4^(levels - 1) = {finest}, so that the finest cell is not below a voxel"),
+        )
+        .map_err(|invalid| invalid.against("levels"))?;
+        ensure((0.0..=1.0).contains(&self.min_opacity), "min_opacity", self.min_opacity, "must be between 0 and 1")?;
+        ensure(
+            self.max_log_scaling > f64::NEG_INFINITY,
+            "max_log_scaling",
+            self.max_log_scaling,
+            "must be a number, or inf for no cap",
+        )
+    }
+}

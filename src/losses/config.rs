@@ -1,0 +1,105 @@
+use serde::{Deserialize, Serialize};
+
+use crate::config::{Invalid, ensure};
+
+/// Weights of the losses (GScream, equations 3 to 7). A weight of zero removes its term from the step.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default, expecting = "a table")]
+pub struct Config {
+    /// Share of 1 - SSIM in the colour loss; the rest is L1 (3DGS: 0.2).
+    pub ssim_weight: f64,
+    /// Colour weight of the reference view's pixels inside the mask (GScream's release: 20). Outside the mask every
+    /// view weighs 1; inside the mask other views weigh 0.
+    pub reference_inside_weight: f64,
+    /// The losses against depth priors.
+    pub depth: Depth,
+}
+
+/// L1 between the aligned rendered depth and the prior, and the total variation of their difference.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default, expecting = "a table")]
+pub struct Depth {
+    /// Whether depth priors are used at all.
+    pub enabled: bool,
+    /// L1 weight on every pixel of the reference view.
+    pub reference_weight: f64,
+    /// L1 weight added to `reference_weight` inside `reference_inside_region`.
+    pub reference_inside_weight: f64,
+    /// Where the added weight applies on the reference view.
+    pub reference_inside_region: Region,
+    /// L1 weight outside the mask on the other views.
+    pub other_weight: f64,
+    /// The multi-scale gradient of the depth difference.
+    pub gradient: DepthGradient,
+}
+
+/// Where the reference view's depth weighs more.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Region {
+    /// Inside the mask, as the paper has it.
+    Mask,
+    /// Inside a rectangle of 80 % of the mask's bounding box, placed at random each step in that box enlarged
+    /// 1.5 times, as the release has it.
+    RandomRectangle,
+}
+
+/// Total variation of the depth difference over pixels 1, 2, 4, ... apart.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default, expecting = "a table")]
+pub struct DepthGradient {
+    /// Weight of the whole term.
+    pub weight: f64,
+    /// Its factor on the reference view, all pixels.
+    pub reference_weight: f64,
+    /// Its factor on the other views, outside the mask.
+    pub other_weight: f64,
+    /// Number of scales: scale s takes every 2^s-th pixel.
+    pub scales: u32,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self { ssim_weight: 0.2, reference_inside_weight: 20.0, depth: Depth::default() }
+    }
+}
+
+impl Default for Depth {
+    fn default() -> Self {
+        Self {
+            enabled: true,
+            reference_weight: 1.0,
+            reference_inside_weight: 99.0,
+            reference_inside_region: Region::Mask,
+            other_weight: 0.1,
+            gradient: DepthGradient::default(),
+        }
+    }
+}
+
+impl Default for DepthGradient {
+    fn default() -> Self {
+        Self { weight: 0.5, reference_weight: 1.0, other_weight: 0.1, scales: 4 }
+    }
+}
+
+impl Config {
+    /// Refuses values that no run could use.
+    pub fn validate(&self) -> Result<(), Invalid> {
+        ensure((0.0..=1.0).contains(&self.ssim_weight), "ssim_weight", self.ssim_weight, "must be between 0 and 1")?;
+        let weights = [
+            ("reference_inside_weight", self.reference_inside_weight),
+            ("depth.reference_weight", self.depth.reference_weight),
+            ("depth.reference_inside_weight", self.depth.reference_inside_weight),
+            ("depth.other_weight", self.depth.other_weight),
+            ("depth.gradient.weight", self.depth.gradient.weight),
+            ("depth.gradient.reference_weight", self.depth.gradient.reference_weight),
+            ("depth.gradient.other_weight", self.depth.gradient.other_weight),
+        ];
+        for (key, weight) in weights {
+            ensure(weight.is_finite() && weight >= 0.0, key, weight, "must be zero or a positive number")?;
+        }
+        let scales = self.depth.gradient.scales;
+        ensure((1..=8).contains(&scales), "depth.gradient.scales", scales, "must be between 1 and 8")
+    }
+}

@@ -1,0 +1,69 @@
+use serde::{Deserialize, Serialize};
+
+use crate::config::{Invalid, ensure};
+
+/// What is learnt: anchors, their offsets, and the attention between them.
+///
+/// The feature length (32) and the decoders' hidden width (32) belong to the kernels and are not settings.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default, expecting = "a table")]
+pub struct Config {
+    /// Edge of the grid to which points are snapped to become anchors, in scene units (Scaffold-GS: 0.001 in general,
+    /// GScream: 0.005 for SPIn-NeRF scenes). Zero or less means the median nearest-neighbour distance of the points.
+    pub voxel: f64,
+    /// Gaussians per anchor (Scaffold-GS: 10).
+    pub offsets: u32,
+    /// Bidirectional cross-attention between anchors inside and around the mask.
+    pub attention: Attention,
+}
+
+/// Bidirectional cross-attention (GScream, equation 8). It takes part only where a scene has masks.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default, expecting = "a table")]
+pub struct Attention {
+    /// Whether attention is trained and applied at all.
+    pub enabled: bool,
+    /// First step with attention (GScream: 15,000).
+    pub start: u32,
+    /// Edge of the square patch placed near the mask's bounding box, in pixels of the training image (GScream: 256).
+    pub patch: u32,
+    /// Most anchors taken from each side of the mask's border (GScream: 2,000).
+    pub tokens: u32,
+    /// A step goes without attention unless each side has more anchors than this (GScream: 11).
+    pub min_tokens: u32,
+    /// Share of the attention's output in the blended feature, `f <- blend * attention(f) + (1 - blend) * f` (GScream: 0.03).
+    pub blend: f64,
+    /// Write the blended features back into the parameters and cut the gradient to them, as GScream's release does,
+    /// instead of letting gradients flow through the attention, as the paper says.
+    pub write_back: bool,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self { voxel: 0.001, offsets: 10, attention: Attention::default() }
+    }
+}
+
+impl Default for Attention {
+    fn default() -> Self {
+        Self { enabled: true, start: 15_000, patch: 256, tokens: 2_000, min_tokens: 11, blend: 0.03, write_back: false }
+    }
+}
+
+impl Config {
+    /// Refuses values that no run could use.
+    pub fn validate(&self) -> Result<(), Invalid> {
+        ensure(self.voxel.is_finite(), "voxel", self.voxel, "must be finite (0 derives it from the points)")?;
+        ensure((1..=32).contains(&self.offsets), "offsets", self.offsets, "must be between 1 and 32")?;
+        let attention = &self.attention;
+        ensure(attention.patch > 0, "attention.patch", attention.patch, "must be at least 1 pixel")?;
+        ensure(
+            attention.tokens > attention.min_tokens,
+            "attention.tokens",
+            attention.tokens,
+            format_args!("must be above attention.min_tokens ({})", attention.min_tokens),
+        )
+        .map_err(|invalid| invalid.against("attention.min_tokens"))?;
+        ensure((0.0..=1.0).contains(&attention.blend), "attention.blend", attention.blend, "must be between 0 and 1")
+    }
+}

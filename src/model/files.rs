@@ -1,0 +1,474 @@
+//! The model on disk: `point_cloud.ply` for the anchors and `weights.safetensors` for the networks.
+//!
+//! `point_cloud.ply` has the attribute names of Scaffold-GS files, one float32 vertex per anchor, binary little endian:
+//! `x y z nx ny nz f_offset_0.. f_anchor_feat_0..31 opacity scale_0..5 rot_0..3`.
+//! - `f_offset_{c K + k}` is component c of offset k: such files hold the (K, 3) offsets transposed to (3, K).
+//! - `scale_*` are the six log-scales (natural logarithm of scene units): three for the offsets, three for the Gaussians.
+//! - `nx ny nz` are zero; `opacity` and `rot_*` are an anchor's own, which nothing reads: logit(0.1) and (1, 0, 0, 0).
+//!
+//! `weights.safetensors` has float32 tensors under PyTorch's names, weights as (outputs, inputs):
+//! `mlp_{opacity,cov,color}.{0,2}.{weight,bias}` and, if attention was trained,
+//! `{to_qk,context_to_qk,to_v,context_to_v}.weight` and `{to_out,context_to_out}.{weight,bias}`.
+
+use std::cell::Cell;
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
+use std::path::{Path, PathBuf};
+
+use atomic_write_file::AtomicWriteFile;
+use ply_rs_bw::parser::{Parser, Reader};
+use ply_rs_bw::ply::{
+    ElementDef, Encoding, Header, Property, PropertyAccess, PropertyAccessResult, PropertyDef, PropertyType, ScalarType,
+};
+use ply_rs_bw::writer::Writer;
+use safetensors::tensor::TensorView;
+use safetensors::{Dtype, SafeTensors};
+
+/// Length of an anchor's feature.
+pub const FEATURES: usize = 32;
+/// Inputs of a decoder: feature, unit view direction, distance.
+pub const DECODER_INPUTS: usize = FEATURES + 4;
+/// Hidden width of a decoder.
+pub const DECODER_HIDDEN: usize = 32;
+/// Width of the attention's projections: 8 heads of 64.
+pub const ATTENTION_WIDTH: usize = 512;
+/// The anchors' file within a model's folder.
+pub const POINT_CLOUD: &str = "point_cloud.ply";
+/// The networks' file within a model's folder.
+pub const WEIGHTS: &str = "weights.safetensors";
+
+/// logit(0.1), the opacity that such files carry for an anchor itself.
+const PLACEHOLDER_OPACITY: f32 = -2.197_224_6;
+
+/// The anchors of a scene.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Anchors {
+    /// \[anchor\] position, scene units.
+    pub position: Vec<[f32; 3]>,
+    /// \[anchor\] feature.
+    pub feature: Vec<[f32; FEATURES]>,
+    /// \[anchor, offset, xyz\] offsets of the Gaussians, in units of the anchor's first three scales.
+    pub offset: Vec<f32>,
+    /// Gaussians per anchor, K.
+    pub offsets_per_anchor: usize,
+    /// \[anchor\] log-scales: three for the offsets, three for the Gaussians.
+    pub log_scaling: Vec<[f32; 6]>,
+}
+
+/// A float32 tensor, row-major.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Tensor {
+    /// Its extents, outermost first.
+    pub shape: Vec<usize>,
+    /// Its values, as many as the product of the extents.
+    pub data: Vec<f32>,
+}
+
+/// The networks, by PyTorch's names.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Weights {
+    /// Name to tensor.
+    pub tensors: BTreeMap<String, Tensor>,
+}
+
+impl Weights {
+    /// Whether the attention's projections are there.
+    pub fn has_attention(&self) -> bool {
+        self.tensors.contains_key("to_qk.weight")
+    }
+}
+
+/// Names and shapes of all tensors for K Gaussians per anchor: the decoders, then the attention if asked for.
+pub fn weight_shapes(offsets_per_anchor: usize, attention: bool) -> Vec<(String, Vec<usize>)> {
+    let mut shapes = Vec::new();
+    for (head, outputs) in [("opacity", 1), ("cov", 7), ("color", 3)] {
+        let outputs = outputs * offsets_per_anchor;
+        shapes.push((format!("mlp_{head}.0.weight"), vec![DECODER_HIDDEN, DECODER_INPUTS]));
+        shapes.push((format!("mlp_{head}.0.bias"), vec![DECODER_HIDDEN]));
+        shapes.push((format!("mlp_{head}.2.weight"), vec![outputs, DECODER_HIDDEN]));
+        shapes.push((format!("mlp_{head}.2.bias"), vec![outputs]));
+    }
+    if attention {
+        for name in ["to_qk", "context_to_qk", "to_v", "context_to_v"] {
+            shapes.push((format!("{name}.weight"), vec![ATTENTION_WIDTH, FEATURES]));
+        }
+        for name in ["to_out", "context_to_out"] {
+            shapes.push((format!("{name}.weight"), vec![FEATURES, ATTENTION_WIDTH]));
+            shapes.push((format!("{name}.bias"), vec![FEATURES]));
+        }
+    }
+    shapes
+}
+
+/// Why a model cannot be saved or loaded.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A file or folder that cannot be read or written.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// A file that is not what its name says, or is cut off.
+    #[error("{}: {reason}", path.display())]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong and, where there is something to do, what.
+        reason: String,
+    },
+    /// A PLY file without an attribute that a model needs.
+    #[error("{}: no vertex attribute `{attribute}`; it is not a point cloud of Scaffold-GS anchors", path.display())]
+    MissingAttribute {
+        /// The file.
+        path: PathBuf,
+        /// The attribute.
+        attribute: String,
+    },
+    /// An attribute that is NaN or infinite.
+    #[error("{}: attribute `{attribute}` of vertex {vertex} is {value}, not a finite number", path.display())]
+    NotFinite {
+        /// The file.
+        path: PathBuf,
+        /// The attribute.
+        attribute: String,
+        /// The vertex, counted from 0.
+        vertex: usize,
+        /// Its value.
+        value: f32,
+    },
+    /// A model in memory whose parts do not fit each other.
+    #[error("the model cannot be saved: {0}")]
+    Inconsistent(String),
+}
+
+/// Writes both files into `folder`, creating it. Each file replaces its predecessor only when both are complete, so that
+/// a crash while writing leaves the old model.
+///
+/// # Errors
+/// A folder that cannot be written, or a model whose parts do not fit each other.
+pub fn save(folder: &Path, anchors: &Anchors, weights: &Weights) -> Result<(), Error> {
+    check(anchors, weights)?;
+    std::fs::create_dir_all(folder).map_err(|source| Error::Io { path: folder.to_owned(), source })?;
+    let (cloud, networks) = (folder.join(POINT_CLOUD), folder.join(WEIGHTS));
+    let cloud_file = write_temporary(&cloud, |out| write_anchors(out, anchors))?;
+    let networks_file = write_temporary(&networks, |out| write_weights(out, weights))?;
+    cloud_file.commit().map_err(|source| Error::Io { path: cloud, source })?;
+    networks_file.commit().map_err(|source| Error::Io { path: networks, source })
+}
+
+/// Reads what [`save`] wrote, or another program's files of the same layout: attributes in any order, of any scalar type
+/// and in any PLY encoding; attributes that a model does not need are ignored.
+///
+/// # Errors
+/// A missing or foreign file, a missing attribute or tensor, a wrong count or shape, a value that is not finite.
+pub fn load(folder: &Path) -> Result<(Anchors, Weights), Error> {
+    let anchors = load_anchors(&folder.join(POINT_CLOUD))?;
+    let weights = load_weights(&folder.join(WEIGHTS), anchors.offsets_per_anchor)?;
+    Ok((anchors, weights))
+}
+
+fn check(anchors: &Anchors, weights: &Weights) -> Result<(), Error> {
+    let n = anchors.position.len();
+    let k = anchors.offsets_per_anchor;
+    if anchors.feature.len() != n || anchors.log_scaling.len() != n || anchors.offset.len() != n * k * 3 || k == 0 {
+        return Err(Error::Inconsistent(format!(
+            "{n} positions, {} features, {} log-scales and {} offset components for {k} offsets per anchor",
+            anchors.feature.len(),
+            anchors.log_scaling.len(),
+            anchors.offset.len(),
+        )));
+    }
+    let expected: BTreeMap<_, _> = weight_shapes(k, weights.has_attention()).into_iter().collect();
+    for (name, shape) in &expected {
+        match weights.tensors.get(name) {
+            None => return Err(Error::Inconsistent(format!("tensor `{name}` is missing"))),
+            Some(tensor) if tensor.shape != *shape || tensor.data.len() != shape.iter().product::<usize>() => {
+                return Err(Error::Inconsistent(format!(
+                    "tensor `{name}` has shape {:?} and {} values instead of {shape:?}",
+                    tensor.shape,
+                    tensor.data.len()
+                )));
+            }
+            Some(_) => {}
+        }
+    }
+    match weights.tensors.keys().find(|name| !expected.contains_key(*name)) {
+        Some(name) => Err(Error::Inconsistent(format!("tensor `{name}` belongs to no network"))),
+        None => Ok(()),
+    }
+}
+
+fn write_temporary(
+    path: &Path,
+    write: impl FnOnce(&mut BufWriter<&mut AtomicWriteFile>) -> io::Result<()>,
+) -> Result<AtomicWriteFile, Error> {
+    let failed = |source| Error::Io { path: path.to_owned(), source };
+    let mut file = AtomicWriteFile::open(path).map_err(failed)?;
+    let mut out = BufWriter::with_capacity(1 << 20, &mut file);
+    write(&mut out).and_then(|()| out.flush()).map_err(failed)?;
+    drop(out);
+    Ok(file)
+}
+
+// ---------------------------------------------------------------- point_cloud.ply
+
+/// The attributes of a vertex, in the order of the file.
+fn attributes(offsets_per_anchor: usize) -> Vec<String> {
+    let numbered = |stem: &'static str, count| (0..count).map(move |i| format!("{stem}_{i}"));
+    ["x", "y", "z", "nx", "ny", "nz"]
+        .map(str::to_owned)
+        .into_iter()
+        .chain(numbered("f_offset", 3 * offsets_per_anchor))
+        .chain(numbered("f_anchor_feat", FEATURES))
+        .chain(["opacity".to_owned()])
+        .chain(numbered("scale", 6))
+        .chain(numbered("rot", 4))
+        .collect()
+}
+
+/// The scalar values of a vertex in the order of the header's properties. The library asks for and hands over properties
+/// in that order, so that no name is looked up per value; a list property counts as one NaN.
+#[derive(Default)]
+struct Row {
+    values: Vec<f32>,
+    next: Cell<usize>,
+}
+
+impl PropertyAccess for Row {
+    fn new() -> Self {
+        Self { values: Vec::with_capacity(96), next: Cell::new(0) }
+    }
+
+    fn set_property(&mut self, _name: &str, property: Property) -> PropertyAccessResult {
+        self.values.push(property.to_f32_lossy().unwrap_or(f32::NAN));
+        PropertyAccessResult::Set
+    }
+
+    fn set_float(&mut self, _name: &str, value: f32) -> PropertyAccessResult {
+        self.values.push(value);
+        PropertyAccessResult::Set
+    }
+
+    fn get_float(&self, _name: &str) -> Option<f32> {
+        let next = self.next.get();
+        self.next.set(next + 1);
+        self.values.get(next).copied()
+    }
+}
+
+fn write_anchors(out: &mut impl Write, anchors: &Anchors) -> io::Result<()> {
+    let k = anchors.offsets_per_anchor;
+    let mut vertex = ElementDef::new("vertex".to_owned());
+    vertex.count = anchors.position.len();
+    for name in attributes(k) {
+        let property = PropertyDef::new(name.clone(), PropertyType::Scalar(ScalarType::Float));
+        vertex.properties.insert(name, property);
+    }
+    let mut header = Header::new();
+    header.encoding = Encoding::BinaryLittleEndian;
+    header.elements.insert(vertex.name.clone(), vertex.clone());
+    let writer = Writer::<Row>::new();
+    writer.write_header(out, &header)?;
+    let mut row = Row::new();
+    for anchor in 0..vertex.count {
+        row.next.set(0);
+        row.values.clear();
+        row.values.extend(anchors.position[anchor]);
+        row.values.extend([0.0; 3]);
+        let offset = &anchors.offset[anchor * k * 3..(anchor + 1) * k * 3];
+        row.values.extend((0..3).flat_map(|component| offset.iter().skip(component).step_by(3)));
+        row.values.extend(anchors.feature[anchor]);
+        row.values.push(PLACEHOLDER_OPACITY);
+        row.values.extend(anchors.log_scaling[anchor]);
+        row.values.extend([1.0, 0.0, 0.0, 0.0]);
+        writer.write_little_endian_element(out, &row, &vertex)?;
+    }
+    Ok(())
+}
+
+/// Reads the anchors of a `point_cloud.ply`; see [`load`].
+///
+/// # Errors
+/// As [`load`].
+pub fn load_anchors(path: &Path) -> Result<Anchors, Error> {
+    let broken = |reason: String| Error::Format { path: path.to_owned(), reason };
+    let file = File::open(path).map_err(|source| Error::Io { path: path.to_owned(), source })?;
+    let mut reader = Reader::new(BufReader::with_capacity(1 << 20, file));
+    let parser = Parser::<Row>::new();
+    let header = parser.read_header(&mut reader).map_err(|error| broken(format!("not a PLY file ({error})")))?;
+    let mut columns = None;
+    let mut anchors = Anchors::default();
+    for element in header.elements.values() {
+        if element.name == "vertex" {
+            let found = Columns::find(path, element)?;
+            anchors.offsets_per_anchor = found.offset.len() / 3;
+            columns = Some(found);
+        }
+        // Elements after the vertices are of no use.
+        if element.name != "vertex" && columns.is_some() {
+            return Ok(anchors);
+        }
+        for index in 0..element.count {
+            let row = read_row(&parser, &mut reader, header.encoding, element).map_err(|error| {
+                let (count, name) = (element.count, &element.name);
+                broken(format!("cut off or damaged at {name} {index} of {count}, which its header declares ({error})"))
+            })?;
+            if let Some(columns) = &columns {
+                columns.append(path, index, &row.values, &mut anchors)?;
+            }
+        }
+    }
+    if columns.is_none() {
+        return Err(broken("a PLY file without vertices".to_owned()));
+    }
+    let mut rest = reader.into_inner();
+    let left = rest.fill_buf().map_err(|source| Error::Io { path: path.to_owned(), source })?;
+    if header.encoding != Encoding::Ascii && !left.is_empty() {
+        return Err(broken("goes on after the last vertex that its header declares".to_owned()));
+    }
+    Ok(anchors)
+}
+
+fn read_row<R: BufRead>(
+    parser: &Parser<Row>,
+    reader: &mut Reader<R>,
+    encoding: Encoding,
+    element: &ElementDef,
+) -> io::Result<Row> {
+    let row = match encoding {
+        Encoding::BinaryLittleEndian => parser.read_little_endian_element(reader.get_mut(), element)?,
+        Encoding::BinaryBigEndian => parser.read_big_endian_element(reader.get_mut(), element)?,
+        Encoding::Ascii => {
+            let mut line = String::new();
+            if reader.get_mut().read_line(&mut line)? == 0 {
+                return Err(io::ErrorKind::UnexpectedEof.into());
+            }
+            parser.read_ascii_element(&line, element)?
+        }
+    };
+    Ok(row)
+}
+
+/// Where a model's attributes stand in a row of the file.
+struct Columns {
+    names: Vec<String>,
+    position: [usize; 3],
+    /// Component-major, as in the file: `[component * K + offset]`.
+    offset: Vec<usize>,
+    feature: [usize; FEATURES],
+    log_scaling: [usize; 6],
+}
+
+impl Columns {
+    fn find(path: &Path, vertex: &ElementDef) -> Result<Self, Error> {
+        let names: Vec<String> = vertex.properties.values().map(|property| property.name.clone()).collect();
+        let index: BTreeMap<&str, usize> = names.iter().enumerate().map(|(i, name)| (name.as_str(), i)).collect();
+        let column = |attribute: String| match index.get(attribute.as_str()) {
+            Some(&i) => Ok(i),
+            None => Err(Error::MissingAttribute { path: path.to_owned(), attribute }),
+        };
+        fn numbered<const N: usize>(
+            stem: &str,
+            column: &impl Fn(String) -> Result<usize, Error>,
+        ) -> Result<[usize; N], Error> {
+            let mut columns = [0; N];
+            for (i, at) in columns.iter_mut().enumerate() {
+                *at = column(format!("{stem}_{i}"))?;
+            }
+            Ok(columns)
+        }
+        let position = [column("x".into())?, column("y".into())?, column("z".into())?];
+        let feature = numbered("f_anchor_feat", &column)?;
+        if index.contains_key(format!("f_anchor_feat_{FEATURES}").as_str()) {
+            let reason =
+                format!("anchors have more than {FEATURES} feature components; this program decodes {FEATURES}");
+            return Err(Error::Format { path: path.to_owned(), reason });
+        }
+        // The highest number says how many there should be, in threes, so that a gap is named.
+        let numbers = names.iter().filter_map(|name| name.strip_prefix("f_offset_")?.parse::<usize>().ok());
+        let components = numbers.max().map_or(3, |last| (last / 3).saturating_add(1).saturating_mul(3));
+        let offset = (0..components).map(|i| column(format!("f_offset_{i}"))).collect::<Result<_, _>>()?;
+        let log_scaling = numbered("scale", &column)?;
+        Ok(Self { position, offset, feature, log_scaling, names })
+    }
+
+    fn append(&self, path: &Path, vertex: usize, row: &[f32], anchors: &mut Anchors) -> Result<(), Error> {
+        let value = |column: usize| match row[column] {
+            value if value.is_finite() => Ok(value),
+            value => {
+                let attribute = self.names[column].clone();
+                Err(Error::NotFinite { path: path.to_owned(), attribute, vertex, value })
+            }
+        };
+        fn gather<const N: usize>(
+            columns: &[usize; N],
+            value: &impl Fn(usize) -> Result<f32, Error>,
+        ) -> Result<[f32; N], Error> {
+            let mut values = [0.0; N];
+            for (to, &column) in values.iter_mut().zip(columns) {
+                *to = value(column)?;
+            }
+            Ok(values)
+        }
+        anchors.position.push(gather(&self.position, &value)?);
+        anchors.feature.push(gather(&self.feature, &value)?);
+        anchors.log_scaling.push(gather(&self.log_scaling, &value)?);
+        let k = self.offset.len() / 3;
+        for offset in 0..k {
+            for component in 0..3 {
+                anchors.offset.push(value(self.offset[component * k + offset])?);
+            }
+        }
+        Ok(())
+    }
+}
+
+// ---------------------------------------------------------------- weights.safetensors
+
+fn write_weights(out: &mut impl Write, weights: &Weights) -> io::Result<()> {
+    let bytes: BTreeMap<&str, Vec<u8>> = weights
+        .tensors
+        .iter()
+        .map(|(name, tensor)| (name.as_str(), tensor.data.iter().flat_map(|v| v.to_le_bytes()).collect()))
+        .collect();
+    let mut views = Vec::with_capacity(bytes.len());
+    for (name, tensor) in &weights.tensors {
+        let view =
+            TensorView::new(Dtype::F32, tensor.shape.clone(), &bytes[name.as_str()]).map_err(io::Error::other)?;
+        views.push((name.as_str(), view));
+    }
+    out.write_all(&safetensors::serialize(views, None).map_err(io::Error::other)?)
+}
+
+/// Reads the networks for K Gaussians per anchor; see [`load`].
+///
+/// # Errors
+/// As [`load`].
+pub fn load_weights(path: &Path, offsets_per_anchor: usize) -> Result<Weights, Error> {
+    let broken = |reason: String| Error::Format { path: path.to_owned(), reason };
+    let mut bytes = Vec::new();
+    File::open(path)
+        .and_then(|mut file| file.read_to_end(&mut bytes))
+        .map_err(|source| Error::Io { path: path.to_owned(), source })?;
+    let file = SafeTensors::deserialize(&bytes)
+        .map_err(|error| broken(format!("not a safetensors file, or cut off ({error})")))?;
+    let attention = file.tensor("to_qk.weight").is_ok();
+    let mut tensors = BTreeMap::new();
+    for (name, shape) in weight_shapes(offsets_per_anchor, attention) {
+        let view = file.tensor(&name).map_err(|_| broken(format!("no tensor `{name}`")))?;
+        if view.dtype() != Dtype::F32 || view.shape() != shape {
+            let (kind, found) = (view.dtype(), view.shape());
+            return Err(broken(format!("tensor `{name}` is {kind:?} {found:?}; this model needs F32 {shape:?}")));
+        }
+        let data: Vec<f32> = view.data().as_chunks().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+        if let Some(index) = data.iter().position(|value| !value.is_finite()) {
+            return Err(broken(format!("value {index} of tensor `{name}` is {}, not a finite number", data[index])));
+        }
+        tensors.insert(name, Tensor { shape, data });
+    }
+    Ok(Weights { tensors })
+}

@@ -1,0 +1,312 @@
+//! The model before the first step: anchors from structure-from-motion points, networks from a seed.
+
+use std::collections::BTreeMap;
+use std::num::NonZero;
+
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use rand::distr::{Distribution, Uniform};
+use rand_pcg::Pcg64;
+
+use super::files::{ATTENTION_WIDTH, Anchors, FEATURES, Tensor, Weights, weight_shapes};
+
+/// Why a model cannot start from these points.
+#[derive(Debug, thiserror::Error, PartialEq)]
+pub enum Error {
+    /// Nothing to start from.
+    #[error("the reconstruction has no points: training starts from its sparse point cloud")]
+    NoPoints,
+    /// A point that is NaN or infinite.
+    #[error("point {index} of the reconstruction is not finite ({position:?})")]
+    NotFinite {
+        /// Its index.
+        index: usize,
+        /// Its coordinates.
+        position: [f32; 3],
+    },
+    /// A voxel derived from points that all coincide.
+    #[error("the voxel cannot be derived from points that all coincide: set model.voxel to a positive length")]
+    NoSpacing,
+    /// A point beyond the grid's 32-bit cells.
+    #[error(
+        "point {index} of the reconstruction ({position:?}) lies more than 2^31 voxels of {voxel} from the origin: \
+         raise model.voxel or remove the point"
+    )]
+    TooFar {
+        /// Its index.
+        index: usize,
+        /// Its coordinates.
+        position: [f32; 3],
+        /// The voxel's edge.
+        voxel: f64,
+    },
+}
+
+/// Anchors at the start of training, and the grid they stand on.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Initial {
+    /// One anchor per occupied voxel, sorted by cell (x, then y, then z).
+    pub anchors: Anchors,
+    /// Edge of the voxel in scene units: the one asked for, or the one derived from the points.
+    pub voxel: f64,
+}
+
+/// Snaps points to the voxel grid, one anchor per occupied cell at `round(p / voxel) * voxel` (Scaffold-GS, section 3.1).
+///
+/// `voxel <= 0` stands for the median nearest-neighbour distance of the points. Features and offsets are zero. All six
+/// log-scales of an anchor are the logarithm of [`mean_distance_to_nearest`] with the voxel as its floor. The order of
+/// the points and their duplicates do not matter.
+///
+/// # Errors
+/// No points, points that are not finite or too far for 32-bit cells, or no spacing to derive a voxel from.
+pub fn anchors(points: &[[f32; 3]], voxel: f64, offsets_per_anchor: usize) -> Result<Initial, Error> {
+    if points.is_empty() {
+        return Err(Error::NoPoints);
+    }
+    let broken = points.iter().enumerate().find(|(_, p)| !p.iter().all(|v| v.is_finite()));
+    if let Some((index, &position)) = broken {
+        return Err(Error::NotFinite { index, position });
+    }
+    let voxel = if voxel > 0.0 { voxel } else { median_nearest_distance(points).ok_or(Error::NoSpacing)? };
+    let mut cells = Vec::with_capacity(points.len());
+    for (index, &position) in points.iter().enumerate() {
+        let cell = position.map(|v| (f64::from(v) / voxel).round_ties_even());
+        if cell.iter().any(|v| v.abs() > f64::from(i32::MAX)) {
+            return Err(Error::TooFar { index, position, voxel });
+        }
+        cells.push(cell.map(|v| v as i32));
+    }
+    cells.sort_unstable();
+    cells.dedup();
+    let position: Vec<[f32; 3]> = cells.iter().map(|cell| cell.map(|v| (f64::from(v) * voxel) as f32)).collect();
+    let log_scaling = mean_distance_to_nearest(&position, voxel).into_iter().map(|d| [d.ln() as f32; 6]).collect();
+    let anchors = Anchors {
+        feature: vec![[0.0; FEATURES]; position.len()],
+        offset: vec![0.0; position.len() * offsets_per_anchor * 3],
+        offsets_per_anchor,
+        log_scaling,
+        position,
+    };
+    Ok(Initial { anchors, voxel })
+}
+
+/// Mean distance of each position to its three nearest neighbours, or to as many as there are; at least `floor`.
+///
+/// `floor` must be positive. It is what a lone position gets, and it keeps the logarithm finite where positions coincide:
+/// anchors of different cells are a voxel apart, but far from the origin float32 may round two of them together.
+pub fn mean_distance_to_nearest(positions: &[[f32; 3]], floor: f64) -> Vec<f64> {
+    nearest_distances(positions, 3)
+        .into_iter()
+        .map(|distances| match distances.len() {
+            0 => floor,
+            n => (distances.iter().sum::<f64>() / n as f64).max(floor),
+        })
+        .collect()
+}
+
+/// Median over the distinct points of the distance to the nearest other one (the lower of two middle values); `None`
+/// if all points coincide.
+pub fn median_nearest_distance(points: &[[f32; 3]]) -> Option<f64> {
+    let mut distinct = points.to_vec();
+    // -0 and 0 are the same place.
+    distinct.iter_mut().flatten().for_each(|v| *v += 0.0);
+    distinct.sort_unstable_by(|a, b| a.iter().map(|v| v.to_bits()).cmp(b.iter().map(|v| v.to_bits())));
+    distinct.dedup();
+    let mut distances: Vec<f64> = nearest_distances(&distinct, 1).into_iter().flatten().collect();
+    if distances.is_empty() {
+        return None;
+    }
+    let middle = (distances.len() - 1) / 2;
+    Some(*distances.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+/// Distances of each position to its `count` nearest others, ascending; fewer if there are fewer others.
+fn nearest_distances(positions: &[[f32; 3]], count: usize) -> Vec<Vec<f64>> {
+    use rayon::prelude::*;
+
+    // Float64, so that a distance is the exact one between the float32 positions.
+    let wide: Vec<[f64; 3]> = positions.iter().map(|p| p.map(f64::from)).collect();
+    let Some(asked) = NonZero::new((count + 1).min(positions.len())) else { return Vec::new() };
+    let tree: ImmutableKdTree<f64, 3> = ImmutableKdTree::new_from_slice(&wide);
+    wide.par_iter()
+        .map(|p| {
+            let found = tree.nearest_n::<SquaredEuclidean>(p, asked);
+            // The first is the position itself, or one that coincides with it: distance 0 either way.
+            found.iter().skip(1).map(|neighbour| neighbour.distance.sqrt()).collect()
+        })
+        .collect()
+}
+
+/// Stream of the generator that draws initial weights, apart from the streams of other random choices of the same seed.
+const WEIGHTS_STREAM: u128 = 0x6465_636f_6465_7273;
+
+/// Networks in PyTorch's default initialisation of `Linear`: weights and biases uniform in
+/// +-1/sqrt(fan in). Decoders first, so that they are the same with and without attention.
+pub fn weights(seed: u64, offsets_per_anchor: usize, attention: bool) -> Weights {
+    let mut generator = Pcg64::new(u128::from(seed), WEIGHTS_STREAM);
+    let mut tensors = BTreeMap::new();
+    for (name, shape) in weight_shapes(offsets_per_anchor, attention) {
+        let bound = 1.0 / (fan_in(&name, &shape) as f32).sqrt();
+        let uniform = Uniform::new_inclusive(-bound, bound).expect("the bound is positive and finite");
+        let data = (0..shape.iter().product()).map(|_| uniform.sample(&mut generator)).collect();
+        tensors.insert(name, Tensor { shape, data });
+    }
+    Weights { tensors }
+}
+
+/// Inputs of the layer that the tensor belongs to. A bias has as many as the weight beside it.
+fn fan_in(name: &str, shape: &[usize]) -> usize {
+    match shape {
+        [_, inputs] => *inputs,
+        _ if name.starts_with("mlp_") && name.contains(".0.") => super::files::DECODER_INPUTS,
+        _ if name.starts_with("mlp_") => super::files::DECODER_HIDDEN,
+        _ => ATTENTION_WIDTH,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Distances to the three nearest others by comparing all pairs.
+    fn brute_force(positions: &[[f32; 3]], floor: f64) -> Vec<f64> {
+        positions
+            .iter()
+            .enumerate()
+            .map(|(i, p)| {
+                let distance =
+                    |q: &[f32; 3]| (0..3).map(|c| f64::from(p[c]) - f64::from(q[c])).map(|d| d * d).sum::<f64>();
+                let mut all: Vec<f64> =
+                    positions.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, q)| distance(q).sqrt()).collect();
+                all.sort_by(f64::total_cmp);
+                all.truncate(3);
+                let mean = all.iter().sum::<f64>() / all.len() as f64;
+                if all.is_empty() { floor } else { mean.max(floor) }
+            })
+            .collect()
+    }
+
+    fn random_points(count: usize, seed: u64) -> Vec<[f32; 3]> {
+        let mut generator = Pcg64::new(u128::from(seed), 3);
+        let uniform = Uniform::new(-4.0f32, 4.0).expect("a range");
+        (0..count).map(|_| [(); 3].map(|()| uniform.sample(&mut generator))).collect()
+    }
+
+    #[test]
+    fn one_to_four_points_have_the_mean_of_the_neighbours_there_are() {
+        let points = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 8.0]];
+        let expected: [&[f64]; 4] = [
+            &[0.25],
+            &[1.0, 1.0],
+            &[(1.0 + 3.0) / 2.0, (1.0 + 10f64.sqrt()) / 2.0, (3.0 + 10f64.sqrt()) / 2.0],
+            &[
+                (1.0 + 3.0 + 8.0) / 3.0,
+                (1.0 + 10f64.sqrt() + 65f64.sqrt()) / 3.0,
+                (3.0 + 10f64.sqrt() + 73f64.sqrt()) / 3.0,
+                (8.0 + 65f64.sqrt() + 73f64.sqrt()) / 3.0,
+            ],
+        ];
+        for (count, expected) in (1..=4).zip(expected) {
+            let initial = anchors(&points[..count], 0.25, 10).expect("points");
+            assert_eq!(initial.anchors.position.len(), count);
+            for (position, log_scaling) in initial.anchors.position.iter().zip(&initial.anchors.log_scaling) {
+                let index = points.iter().position(|p| p == position).expect("points on the grid stay");
+                assert_eq!(*log_scaling, [expected[index].ln() as f32; 6], "{count} points, point {index}");
+            }
+            assert!(initial.anchors.feature.iter().flatten().chain(&initial.anchors.offset).all(|v| *v == 0.0));
+            assert_eq!(initial.anchors.offset.len(), count * 30);
+        }
+    }
+
+    #[test]
+    fn points_snap_to_the_grid_and_become_unique_whatever_their_order() {
+        let points = [[0.26, -0.26, 0.0], [0.3, -0.2, 0.1], [0.0, 0.0, 0.0], [-0.0, 0.1, -0.1], [9.99, 0.0, 0.0]];
+        let initial = anchors(&points, 0.5, 1).expect("points");
+        assert_eq!(initial.anchors.position, [[0.0, 0.0, 0.0], [0.5, -0.5, 0.0], [0.5, 0.0, 0.0], [10.0, 0.0, 0.0]]);
+        let mut doubled: Vec<_> = points.iter().rev().copied().collect();
+        doubled.extend(points);
+        assert_eq!(anchors(&doubled, 0.5, 1).expect("points"), initial);
+    }
+
+    #[test]
+    fn the_median_spacing_counts_distinct_points_once() {
+        // Nearest distances of 0, 1, 3, 7: 1, 1, 2, 4.
+        let line = |xs: &[f32]| xs.iter().map(|&x| [x, 0.0, 0.0]).collect::<Vec<_>>();
+        assert_eq!(median_nearest_distance(&line(&[0.0, 1.0, 3.0, 7.0])), Some(1.0));
+        assert_eq!(median_nearest_distance(&line(&[0.0, 3.0, 7.0])), Some(3.0));
+        assert_eq!(median_nearest_distance(&line(&[0.0, 3.0, 7.0, 7.0, 7.0, 7.0, -0.0])), Some(3.0));
+        assert_eq!(median_nearest_distance(&line(&[2.0, 2.0, 2.0])), None);
+        assert_eq!(median_nearest_distance(&[]), None);
+        let points = line(&[0.0, 3.0, 7.0]);
+        for voxel in [0.0, -1.0] {
+            assert_eq!(anchors(&points, voxel, 1).expect("points").voxel, 3.0);
+        }
+    }
+
+    #[test]
+    fn coinciding_positions_get_the_floor() {
+        let many = vec![[1.0f32, 2.0, 3.0]; 1000];
+        assert!(mean_distance_to_nearest(&many, 1e-3).iter().all(|d| *d == 1e-3));
+        let log = anchors(&many, 0.5, 1).expect("points").anchors.log_scaling;
+        assert_eq!(log, [[0.5f32.ln(); 6]]);
+        // Far from the origin cells of 1e-4 collapse in float32, and their scales stay finite.
+        let far: Vec<_> = (0..50).map(|i| [5000.0 + 5e-4 * i as f32, 0.0, 0.0]).collect();
+        assert!(anchors(&far, 1e-4, 1).expect("points").anchors.log_scaling.iter().flatten().all(|v| v.is_finite()));
+    }
+
+    #[test]
+    fn neighbours_are_those_of_all_pairs() {
+        let mut points = random_points(700, 1);
+        // A plane of the grid: many equal coordinates on an axis.
+        points.extend((0..400).map(|i| [(i % 20) as f32 * 0.5, (i / 20) as f32 * 0.5, 1.0]));
+        for (got, expected) in mean_distance_to_nearest(&points, 1e-9).iter().zip(brute_force(&points, 1e-9)) {
+            // Sums of three float64 squares in either order differ by a few units in the last place.
+            assert!((got - expected).abs() <= 1e-14 * expected, "{got} {expected}");
+        }
+    }
+
+    #[test]
+    fn a_capture_of_73_000_points_takes_seconds() {
+        let start = std::time::Instant::now();
+        let initial = anchors(&random_points(73_000, 2), 0.0, 10).expect("points");
+        assert!(initial.anchors.position.len() > 50_000 && initial.voxel > 0.05 && initial.voxel < 0.15);
+        let cells = anchors(&random_points(73_000, 2), 0.4, 10).expect("points");
+        // 20 cells of 0.4 an axis and half a cell at either end: nearly all of 21^3 are hit.
+        assert!((9_000..=9_261).contains(&cells.anchors.position.len()), "{}", cells.anchors.position.len());
+        assert!(start.elapsed().as_secs() < 20, "{:?}", start.elapsed());
+    }
+
+    #[test]
+    fn what_cannot_start_is_refused() {
+        assert_eq!(anchors(&[], 0.1, 10), Err(Error::NoPoints));
+        assert_eq!(anchors(&[[1.0; 3]; 5], 0.0, 10), Err(Error::NoSpacing));
+        let nan = anchors(&[[0.0; 3], [0.0, f32::INFINITY, 0.0]], 0.1, 10);
+        assert!(matches!(nan, Err(Error::NotFinite { index: 1, .. })));
+        assert!(matches!(anchors(&[[1e7, 0.0, 0.0]], 1e-3, 10), Err(Error::TooFar { index: 0, .. })));
+    }
+
+    #[test]
+    fn weights_are_uniform_in_the_bound_of_their_fan_in_and_repeat_with_the_seed() {
+        let drawn = weights(5, 10, true);
+        assert_eq!(drawn, weights(5, 10, true));
+        assert_ne!(drawn, weights(6, 10, true));
+        let decoders = weights(5, 10, false);
+        assert!(decoders.tensors.iter().all(|(name, tensor)| drawn.tensors[name] == *tensor));
+        assert_eq!((decoders.tensors.len(), drawn.tensors.len()), (12, 20));
+        for (name, tensor) in &drawn.tensors {
+            let inputs: f64 = match name.as_str() {
+                "to_out.weight" | "to_out.bias" | "context_to_out.weight" | "context_to_out.bias" => 512.0,
+                name if name.starts_with("mlp_") && name.contains(".0.") => 36.0,
+                _ => 32.0,
+            };
+            let bound = 1.0 / inputs.sqrt();
+            let n = tensor.data.len() as f64;
+            let mean = tensor.data.iter().map(|v| f64::from(*v)).sum::<f64>() / n;
+            let largest = tensor.data.iter().fold(0.0f64, |m, v| m.max(f64::from(v.abs())));
+            assert!(largest <= bound * (1.0 + 1e-6), "{name}");
+            // The largest of n uniform magnitudes falls below 1 - 20/n with probability e^-20; the mean's standard
+            // deviation is bound / sqrt(3 n), and 6 of them are exceeded once in 5e8.
+            assert!(largest >= bound * (1.0 - 20.0 / n), "{name}");
+            assert!(mean.abs() <= 6.0 * bound / (3.0 * n).sqrt(), "{name}");
+        }
+    }
+}

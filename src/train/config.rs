@@ -1,0 +1,67 @@
+use serde::{Deserialize, Serialize};
+
+use crate::config::{Invalid, ensure};
+
+/// The training loop: how long, in which order, what is written when.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default, expecting = "a table")]
+pub struct Config {
+    /// Training steps, one view each (GScream: 30,000).
+    pub iterations: u32,
+    /// Seed of every random choice: initial weights, view order, patches, growing.
+    pub seed: u64,
+    /// How the next view is drawn.
+    pub view_order: ViewOrder,
+    /// Colour behind the scene, RGB in \[0, 1\] (GScream: black).
+    pub background: [f64; 3],
+    /// Steps between two lines of the JSON log.
+    pub log_interval: u32,
+    /// Steps between two evaluations on the test views; 0 evaluates only at the end.
+    pub eval_interval: u32,
+    /// Steps between two checkpoints; 0 writes only the final one.
+    pub checkpoint_interval: u32,
+}
+
+/// How the next training view is drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ViewOrder {
+    /// Without replacement: every view once, in an order shuffled anew for each round (3DGS, Scaffold-GS, GScream).
+    Shuffled,
+    /// Sorted by name, again and again: for comparing two programs step by step.
+    Sequential,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            iterations: 30_000,
+            seed: 0,
+            view_order: ViewOrder::Shuffled,
+            background: [0.0; 3],
+            log_interval: 100,
+            eval_interval: 5_000,
+            checkpoint_interval: 5_000,
+        }
+    }
+}
+
+impl Config {
+    /// Refuses values that no run could use.
+    pub fn validate(&self) -> Result<(), Invalid> {
+        ensure(self.iterations > 0, "iterations", self.iterations, "must be at least 1")?;
+        ensure(
+            i64::try_from(self.seed).is_ok(),
+            "seed",
+            self.seed,
+            "must be below 2^63, the largest integer a TOML file holds",
+        )?;
+        ensure(
+            self.background.iter().all(|channel| (0.0..=1.0).contains(channel)),
+            "background",
+            format_args!("{:?}", self.background),
+            "must be three numbers between 0 and 1",
+        )?;
+        ensure(self.log_interval > 0, "log_interval", self.log_interval, "must be at least 1")
+    }
+}
