@@ -3,7 +3,7 @@
 // Workgroup counts for as many threads as a count on the device says.
 layout(local_size_x = 1) in;
 layout(binding = 0, scalar) readonly buffer Count { uint count[]; };    // [1] items
-layout(binding = 1, scalar) writeonly buffer DispatchGroups { uint groups[]; }; // [4] x, y, z of the dispatch; items after clamping
+layout(binding = 1, scalar) writeonly buffer Groups { uint groups[]; }; // [4] x, y, z of the dispatch; items after clamping
 layout(push_constant, scalar) uniform Push {
   uint capacity; // the count is clamped to this
   uint factor;   // threads per item

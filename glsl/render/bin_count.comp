@@ -1,11 +1,11 @@
 #version 460
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_GOOGLE_include_directive : require
-#include "thread.glsl"
 #include "tiles.glsl"
 // Conic of every Gaussian and the number of tiles it touches.
 layout(local_size_x = 64) in;
-layout(binding = 0, scalar) readonly buffer SlotCount { uint slot_count[]; }; // [1] slots in use
+#include "thread.glsl"
+layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };       // [4] x, y, z of the dispatch; visible anchors
 layout(binding = 1, scalar) readonly buffer Mean { vec2 mean[]; };            // [slot] px
 layout(binding = 2, scalar) readonly buffer Covariance { vec3 covariance[]; }; // [slot] xx, xy, yy in px^2, 0.3 on the diagonal included
 layout(binding = 3, scalar) readonly buffer Depth { float depth[]; };         // [slot] camera z; 0 where the Gaussian does not exist
@@ -15,6 +15,7 @@ layout(binding = 6, scalar) writeonly buffer Tiles { uint tiles[]; };         //
 layout(push_constant, scalar) uniform Push {
   uvec2 grid; // tiles in x and y
   uint tile;  // side of a tile, px
+  uint offsets; // slots per visible anchor
 } push;
 
 // covariance = S + 0.3 I with S positive semi-definite, so det >= 0.3 (xx + yy) - 0.09: a bound that the rounded
@@ -28,7 +29,7 @@ float determinant(vec3 c) {
 
 void main() {
   uint s = thread_index();
-  if (s >= slot_count[0]) return;
+  if (s >= groups[3] * push.offsets) return;
   vec3 c = covariance[s];
   float o = opacity[s];
   uint n = 0u;

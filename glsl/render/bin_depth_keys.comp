@@ -1,9 +1,9 @@
 #version 460
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_GOOGLE_include_directive : require
-#include "thread.glsl"
 // Sort keys by depth. Depths are positive, so their bits order as they do; equal depths keep the slots' order.
 layout(local_size_x = 64) in;
+#include "thread.glsl"
 layout(binding = 0, scalar) readonly buffer DrawnCount { uint drawn_count[]; }; // [1] Gaussians that touch a tile
 layout(binding = 1, scalar) readonly buffer Drawn { uint drawn[]; };            // [drawn] their slots, ascending
 layout(binding = 2, scalar) readonly buffer Depth { float depth[]; };           // [slot] camera z

@@ -1,11 +1,11 @@
 #version 460
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_GOOGLE_include_directive : require
-#include "thread.glsl"
 #include "tiles.glsl"
 // One (Gaussian, tile) pair per tile touched, Gaussian after Gaussian in depth order: a stable sort by tile alone then
 // leaves every tile's list in depth order.
 layout(local_size_x = 64) in;
+#include "thread.glsl"
 layout(binding = 0, scalar) readonly buffer DrawnCount { uint drawn_count[]; }; // [1]
 layout(binding = 1, scalar) readonly buffer PairCount { uint pair_count[]; };   // [1] pairs; 0 when they do not fit
 layout(binding = 2, scalar) readonly buffer Order { uint order[]; };            // [rank] slot, nearest first

@@ -1,9 +1,9 @@
 #version 460
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_GOOGLE_include_directive : require
-#include "thread.glsl"
 // First and one-past-last pair of every tile in the sorted list. Tiles without pairs stay as they were (zero).
 layout(local_size_x = 64) in;
+#include "thread.glsl"
 layout(binding = 0, scalar) readonly buffer PairCount { uint pair_count[]; };   // [1]
 layout(binding = 1, scalar) readonly buffer SortedTile { uint sorted_tile[]; }; // [pair] tile, ascending
 layout(binding = 2, scalar) buffer Ranges { uvec2 ranges[]; };                  // [tile + 1] first, one past last

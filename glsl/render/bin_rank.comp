@@ -1,9 +1,9 @@
 #version 460
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_GOOGLE_include_directive : require
-#include "thread.glsl"
 // Tile counts in depth order.
 layout(local_size_x = 64) in;
+#include "thread.glsl"
 layout(binding = 0, scalar) readonly buffer DrawnCount { uint drawn_count[]; }; // [1]
 layout(binding = 1, scalar) readonly buffer Order { uint order[]; };            // [rank] slot, nearest first
 layout(binding = 2, scalar) readonly buffer Tiles { uint tiles[]; };            // [slot] tiles touched

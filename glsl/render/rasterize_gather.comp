@@ -1,13 +1,13 @@
 #version 460
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_GOOGLE_include_directive : require
-#include "thread.glsl"
 // variant color: COLOR_ONLY
 //
 // A Gaussian's gradients: the sum over its pairs, which lie one behind the other, and from the conic to the covariance:
 // with Q = C^-1 and G the gradient of Q (off-diagonal entry halved to make it symmetric), dL/dC = -Q G Q.
 layout(local_size_x = 64) in;
-layout(binding = 0, scalar) readonly buffer SlotCount { uint slot_count[]; };   // [1] slots in use
+#include "thread.glsl"
+layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };       // [4] x, y, z of the dispatch; visible anchors
 layout(binding = 1, scalar) readonly buffer Tiles { uint tiles[]; };            // [slot] tiles touched
 layout(binding = 2, scalar) readonly buffer PairCount { uint pair_count[]; };   // [1] pairs; 0 when they do not fit
 layout(binding = 3, scalar) readonly buffer FirstPair { uint first_pair[]; };   // [slot] first pair
@@ -24,10 +24,13 @@ layout(binding = 12, scalar) writeonly buffer GradColor { vec3 grad_color[]; }; 
 layout(binding = 13, scalar) readonly buffer PairDepth { float pair_depth[]; }; // [pair]
 layout(binding = 14, scalar) writeonly buffer GradDepth { float grad_depth[]; }; // [slot]
 #endif
+layout(push_constant, scalar) uniform Push {
+  uint offsets; // slots per visible anchor
+} push;
 void main() {
   uint s = thread_index();
-  bool in_use = s < slot_count[0];
-  uint n = pair_count[0] == 0u || !in_use ? 0u : tiles[s];
+  if (s >= groups[3] * push.offsets) return;
+  uint n = pair_count[0] == 0u ? 0u : tiles[s];
   uint p = n == 0u ? 0u : first_pair[s];
   vec2 m = vec2(0.0);
   vec3 g = vec3(0.0), c = vec3(0.0);
@@ -41,7 +44,6 @@ void main() {
     z += pair_depth[p];
 #endif
   }
-  if (!in_use) return;
   vec3 q = conic[s];
   float h = 0.5 * g.y;
   // R = Q G, then -R Q; rows (q.x q.y; q.y q.z) and (g.x h; h g.z).

@@ -1,7 +1,7 @@
 //! Counts against capacities: what does not fit is reported, never dropped silently.
 
-use crate::gpu::Reference;
 use crate::gpu::kernels::primitives::limit;
+use crate::gpu::{Buffer, Error, Gpu, Recorder, Reference};
 
 impl Reference for limit::Kernel {
     fn reference(host: limit::Host<'_>, push: limit::Push, (): ()) {
@@ -12,6 +12,81 @@ impl Reference for limit::Kernel {
             host.overflow[0] |= 1 << push.bit;
         }
         host.counters[push.counter as usize] = wanted;
+    }
+}
+
+/// What is counted on the device in a step.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Counter {
+    /// Anchors in view.
+    Visible,
+    /// Gaussians that touch a tile.
+    Drawn,
+    /// (Gaussian, tile) pairs.
+    Pairs,
+}
+
+/// Number of [`Counter`]s.
+pub const COUNTERS: usize = 3;
+
+/// The sticky overflow flag and the counters of a step.
+pub struct Limits {
+    overflow: Buffer<u32>,
+    counters: Buffer<u32>,
+    slots: Buffer<u32>,
+}
+
+impl Limits {
+    /// With the flag down.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub fn new(gpu: &Gpu) -> Result<Self, Error> {
+        Ok(Self {
+            overflow: gpu.upload("overflow", &[0])?,
+            counters: gpu.upload("counters", &[0; COUNTERS])?,
+            slots: gpu.upload("slot_count", &[0])?,
+        })
+    }
+
+    /// `[1]` one bit per [`Counter`] that did not fit; stays up until [`Limits::lower`].
+    pub fn overflow(&self) -> &Buffer<u32> {
+        &self.overflow
+    }
+
+    /// `[COUNTERS]` what there was, whether it fitted or not.
+    pub fn counters(&self) -> &Buffer<u32> {
+        &self.counters
+    }
+
+    /// `[1]` slots in use: visible anchors times Gaussians per anchor.
+    pub fn slots(&self) -> &Buffer<u32> {
+        &self.slots
+    }
+
+    /// `count = wanted * factor` if `wanted <= capacity`, otherwise 0 and the flag goes up.
+    pub fn record(
+        &self,
+        rec: &mut Recorder<'_>,
+        wanted: &Buffer<u32>,
+        count: &Buffer<u32>,
+        capacity: u32,
+        counter: Counter,
+        factor: u32,
+    ) {
+        let buffers = limit::Buffers { wanted, count, overflow: &self.overflow, counters: &self.counters };
+        let push = limit::Push { capacity, bit: counter as u32, counter: counter as u32, factor };
+        rec.run(limit::Kernel, buffers, push, 1u32);
+    }
+
+    /// Notes a count that always fits.
+    pub fn note(&self, rec: &mut Recorder<'_>, count: &Buffer<u32>, counter: Counter) {
+        rec.copy_range(count, 0, &self.counters, counter as usize, 1);
+    }
+
+    /// Lowers the flag, once the buffers have grown.
+    pub fn lower(&self, rec: &mut Recorder<'_>) {
+        rec.zero(&self.overflow);
     }
 }
 

@@ -3,13 +3,19 @@
 //! Gaussians are sorted by depth once (few), their (Gaussian, tile) pairs are written in that order, and a stable sort
 //! by tile alone (few bits) then leaves every tile's list in depth order; equal depths keep the slots' order.
 
+use super::rasterize::Projected;
 use crate::gpu::kernels::render::{bin_count, bin_depth_keys, bin_expand, bin_ranges, bin_rank};
-use crate::gpu::{Buffer, Check, Reference};
+use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
 use crate::math::tiles::{Support, conic};
+use crate::primitives::compact::Compact;
+use crate::primitives::limit::{Counter, Limits};
+use crate::primitives::scan::Scan;
+use crate::primitives::sort::{Pairs, Sort};
+use crate::primitives::{Count, dispatch};
 
 impl Reference for bin_count::Kernel {
     fn reference(host: bin_count::Host<'_>, push: bin_count::Push, (): ()) {
-        for s in 0..host.slot_count[0] as usize {
+        for s in 0..(host.groups[3] * push.offsets) as usize {
             (host.conic[s], host.tiles[s]) = if host.depth[s] > 0.0 {
                 let (m, c) = (host.mean[s], host.covariance[s]);
                 let q = conic(c);
@@ -137,4 +143,141 @@ pub struct Binned<'a> {
     pub sorted: &'a Buffer<u32>,
     /// `[tile + 1]` first and one past last in `sorted`.
     pub ranges: &'a Buffer<[u32; 2]>,
+}
+
+/// The stage: its lists for so many slots and pairs.
+pub struct Bin {
+    tiling: Tiling,
+    pairs: u32,
+    conic: Buffer<[f32; 3]>,
+    tiles: Buffer<u32>,
+    first_pair: Buffer<u32>,
+    drawn: Buffer<u32>,
+    drawn_count: Buffer<u32>,
+    drawn_groups: Groups,
+    depth_keys: Buffer<u32>,
+    depth_values: Buffer<u32>,
+    rank_tiles: Buffer<u32>,
+    rank_first: Buffer<u32>,
+    pair_total: Buffer<u32>,
+    pair_count: Buffer<u32>,
+    pair_groups: Groups,
+    pair_tile: Buffer<u32>,
+    pair_index: Buffer<u32>,
+    pair_slot: Buffer<u32>,
+    ranges: Buffer<[u32; 2]>,
+    compact: Compact,
+    depth_sort: Sort,
+    scan: Scan,
+    tile_sort: Sort,
+}
+
+impl Bin {
+    /// Lists for at most `slots` Gaussians, `pairs` (Gaussian, tile) pairs and pictures of at most `size`.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub fn new(gpu: &Gpu, tiling: Tiling, slots: u32, pairs: u32, size: [u32; 2]) -> Result<Self, Error> {
+        let (n, p) = (slots as usize, pairs as usize);
+        let grid = tiling.grid(size);
+        Ok(Self {
+            tiling,
+            pairs,
+            conic: gpu.buffer("conic", n)?,
+            tiles: gpu.buffer("tiles", n)?,
+            first_pair: gpu.buffer("first_pair", n)?,
+            drawn: gpu.buffer("drawn", n)?,
+            drawn_count: gpu.buffer("drawn_count", 1)?,
+            drawn_groups: dispatch::groups(gpu, "drawn_groups", 64)?,
+            depth_keys: gpu.buffer("depth_keys", n)?,
+            depth_values: gpu.buffer("depth_values", n)?,
+            rank_tiles: gpu.buffer("rank_tiles", n)?,
+            rank_first: gpu.buffer("rank_first", n)?,
+            pair_total: gpu.buffer("pair_total", 1)?,
+            pair_count: gpu.buffer("pair_count", 1)?,
+            pair_groups: dispatch::groups(gpu, "pair_groups", 64)?,
+            pair_tile: gpu.buffer("pair_tile", p)?,
+            pair_index: gpu.buffer("pair_index", p)?,
+            pair_slot: gpu.buffer("pair_slot", p)?,
+            ranges: gpu.buffer("ranges", (grid[0] * grid[1]) as usize + 1)?,
+            compact: Compact::new(gpu, slots)?,
+            depth_sort: Sort::new(gpu, slots)?,
+            scan: Scan::new(gpu, slots)?,
+            tile_sort: Sort::new(gpu, pairs)?,
+        })
+    }
+
+    /// Tiles touched by each slot's Gaussian, for the growth statistics.
+    pub fn tiles(&self) -> &Buffer<u32> {
+        &self.tiles
+    }
+
+    /// Lists of a picture of `size`. More pairs than there is room for raise the overflow flag and draw nothing.
+    pub fn record<'a>(
+        &'a self,
+        rec: &mut Recorder<'_>,
+        gaussians: Projected<'_>,
+        size: [u32; 2],
+        limits: &Limits,
+    ) -> Binned<'a> {
+        let Projected { slots, offsets, mean, covariance, depth, opacity, .. } = gaussians;
+        let Self {
+            conic,
+            tiles,
+            drawn,
+            drawn_count,
+            drawn_groups,
+            depth_keys,
+            depth_values,
+            rank_tiles,
+            rank_first,
+            ..
+        } = self;
+        let Self { pair_total, pair_count, pair_groups, pair_tile, pair_index, pair_slot, first_pair, ranges, .. } =
+            self;
+        let grid = self.tiling.grid(size);
+        let tile = self.tiling.side();
+        let groups = &slots.buffer;
+        let buffers = bin_count::Buffers { groups, mean, covariance, depth, opacity, conic, tiles };
+        rec.run(bin_count::Kernel, buffers, bin_count::Push { grid, tile, offsets }, slots);
+
+        // Unused slots of the list's end must not count as touched: the flags' number is the slots in use.
+        self.compact.record(rec, tiles, drawn, drawn_count, Count::Device(limits.slots()));
+        limits.note(rec, drawn_count, Counter::Drawn);
+        dispatch::record(rec, drawn_count, drawn_groups, drawn.len() as u32, 1);
+        let buffers = bin_depth_keys::Buffers { drawn_count, drawn, depth, keys: depth_keys, values: depth_values };
+        rec.run(bin_depth_keys::Kernel, buffers, (), drawn_groups);
+        // Positive floats: the sign bit is zero.
+        let pairs = Pairs { keys: depth_keys, values: depth_values };
+        let order = self.depth_sort.record(rec, pairs, Count::Device(drawn_count), 0..31).values;
+
+        rec.run(bin_rank::Kernel, bin_rank::Buffers { drawn_count, order, tiles, rank_tiles }, (), drawn_groups);
+        self.scan.record(rec, rank_tiles, rank_first, pair_total, Count::Device(drawn_count));
+        limits.record(rec, pair_total, pair_count, self.pairs, Counter::Pairs, 1);
+        let buffers = bin_expand::Buffers {
+            drawn_count,
+            pair_count,
+            order,
+            rank_first,
+            tiles,
+            mean,
+            covariance,
+            conic,
+            opacity,
+            first_pair,
+            pair_tile,
+            pair_index,
+            pair_slot,
+        };
+        rec.run(bin_expand::Kernel, buffers, bin_expand::Push { grid, tile }, drawn_groups);
+        let bits = 32 - (grid[0] * grid[1]).leading_zeros();
+        let pairs = Pairs { keys: pair_tile, values: pair_index };
+        let sorted = self.tile_sort.record(rec, pairs, Count::Device(pair_count), 0..bits);
+
+        rec.zero(ranges);
+        dispatch::record(rec, pair_count, pair_groups, self.pairs, 1);
+        let buffers = bin_ranges::Buffers { pair_count, sorted_tile: sorted.keys, ranges };
+        rec.run(bin_ranges::Kernel, buffers, (), pair_groups);
+        Binned { conic, tiles, pair_count, first_pair, pair_slot, sorted: sorted.values, ranges }
+    }
 }

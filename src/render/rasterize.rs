@@ -237,8 +237,8 @@ backward_twin!(rasterize_backward_narrow_color, 8);
 macro_rules! gather_twin {
     ($module:ident $(, $depth:ident)?) => {
         impl Reference for $module::Kernel {
-            fn reference(host: $module::Host<'_>, (): (), (): ()) {
-                for s in 0..host.slot_count[0] as usize {
+            fn reference(host: $module::Host<'_>, push: $module::Push, (): ()) {
+                for s in 0..(host.groups[3] * push.offsets) as usize {
                     let n = if host.pair_count[0] == 0 { 0 } else { host.tiles[s] as usize };
                     let first = if n == 0 { 0 } else { host.first_pair[s] as usize };
                     let pairs = first..first + n;
@@ -270,10 +270,10 @@ gather_twin!(rasterize_gather_color);
 /// Gaussians in screen space, per slot.
 #[derive(Clone, Copy)]
 pub struct Projected<'a> {
-    /// `[1]` slots in use.
-    pub slot_count: &'a Buffer<u32>,
-    /// Workgroups for them.
+    /// Workgroups of a thread per slot; their fourth word counts the visible anchors.
     pub slots: &'a Groups,
+    /// Slots per visible anchor.
+    pub offsets: u32,
     /// `[slot]` px.
     pub mean: &'a Buffer<[f32; 2]>,
     /// `[slot]` xx, xy, yy in px^2.
@@ -409,7 +409,8 @@ impl Backward {
         picture: &Picture,
         gradient: PictureGradient<'_>,
     ) {
-        let Projected { slot_count, slots, mean, depth, opacity, color, .. } = gaussians;
+        let Projected { slots, offsets, mean, depth, opacity, color, .. } = gaussians;
+        let groups = &slots.buffer;
         let Binned { ranges, sorted, pair_slot, conic, tiles, pair_count, first_pair } = binned;
         let Self {
             pair_mean,
@@ -468,7 +469,7 @@ impl Backward {
                     }
                 }
                 let buffers = rasterize_gather::Buffers {
-                    slot_count,
+                    groups,
                     tiles,
                     pair_count,
                     first_pair,
@@ -484,7 +485,7 @@ impl Backward {
                     pair_depth,
                     grad_depth,
                 };
-                rec.run(rasterize_gather::Kernel, buffers, (), slots);
+                rec.run(rasterize_gather::Kernel, buffers, rasterize_gather::Push { offsets }, slots);
             }
             _ => {
                 match tiling {
@@ -492,7 +493,7 @@ impl Backward {
                     Tiling::Narrow => back!(rasterize_backward_narrow_color),
                 }
                 let buffers = rasterize_gather_color::Buffers {
-                    slot_count,
+                    groups,
                     tiles,
                     pair_count,
                     first_pair,
@@ -506,7 +507,7 @@ impl Backward {
                     grad_opacity,
                     grad_color,
                 };
-                rec.run(rasterize_gather_color::Kernel, buffers, (), slots);
+                rec.run(rasterize_gather_color::Kernel, buffers, rasterize_gather_color::Push { offsets }, slots);
             }
         }
     }
@@ -711,7 +712,7 @@ mod tests {
             let pairs = s.pair_slot.len();
             let mut random = || rng.random_range(-1f32..1.0);
             let case = rasterize_gather::Arrays {
-                slot_count: vec![n as u32],
+                groups: vec![1, 1, 1, n as u32],
                 tiles: s.tiles,
                 pair_count: vec![pairs as u32],
                 first_pair: s.first_pair,
@@ -727,9 +728,15 @@ mod tests {
                 grad_color: vec![[UNWRITTEN; 3]; n],
                 grad_depth: vec![UNWRITTEN; n],
             };
-            testing::assert_twin(rasterize_gather::Kernel, &gpu, case.clone(), (), n);
+            testing::assert_twin(
+                rasterize_gather::Kernel,
+                &gpu,
+                case.clone(),
+                rasterize_gather::Push { offsets: 1 },
+                n,
+            );
             let color = rasterize_gather_color::Arrays {
-                slot_count: case.slot_count,
+                slot_count: case.groups,
                 tiles: case.tiles,
                 pair_count: vec![0],
                 first_pair: case.first_pair,
@@ -743,7 +750,13 @@ mod tests {
                 grad_opacity: case.grad_opacity,
                 grad_color: case.grad_color,
             };
-            testing::assert_twin(rasterize_gather_color::Kernel, &gpu, color, (), n);
+            testing::assert_twin(
+                rasterize_gather_color::Kernel,
+                &gpu,
+                color,
+                rasterize_gather_color::Push { offsets: 1 },
+                n,
+            );
         }
     }
 }

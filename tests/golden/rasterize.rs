@@ -1,1 +1,143 @@
-//! Golden cases of kind `rasterize`.
+//! Golden cases of kind `rasterize`: binning, blending and its gradients, on every tiling the device can run.
+
+use gscream_vk::gpu::{Check, testing};
+use gscream_vk::primitives::dispatch;
+use gscream_vk::primitives::limit::Limits;
+use gscream_vk::render::bin::{Bin, Tiling};
+use gscream_vk::render::rasterize::{self, Backward, Outputs, Picture, PictureGradient, Projected};
+
+use super::support::{Case, cases};
+
+/// Pixels in which a sample's alpha or transmittance lies within float32 rounding of its threshold, and the Gaussians
+/// that touch such a pixel: there the result may legitimately flip.
+///
+/// Rounding: the exponent is a sum of three terms of at most q = 2 ln 255 = 11, the transmittance a product of up to
+/// some hundred factors; 1e-5 relative covers both.
+fn boundary(case: &Case) -> (Vec<bool>, Vec<bool>) {
+    let [width, height] = case.size("size");
+    let (mean, covariance) = (case.vectors::<2>("mean"), case.vectors::<4>("covariance"));
+    let (depth, opacity) = (case.f32("depth"), case.f64("opacity"));
+    let n = depth.len();
+    let mut order: Vec<usize> = (0..n).collect();
+    order.sort_by(|&a, &b| depth[a].total_cmp(&depth[b]));
+    let mut pixels = vec![false; (width * height) as usize];
+    let mut gaussians = vec![false; n];
+    for y in 0..height {
+        for x in 0..width {
+            let mut transmittance = 1.0;
+            let mut touched = vec![];
+            let mut near = false;
+            for &g in &order {
+                let [a, b, _, c] = covariance[g].map(f64::from);
+                let det = a * c - b * b;
+                let (dx, dy) = (f64::from(x) + 0.5 - f64::from(mean[g][0]), f64::from(y) + 0.5 - f64::from(mean[g][1]));
+                let power = -0.5 * (c * dx * dx + a * dy * dy - 2.0 * b * dx * dy) / det;
+                let alpha = (opacity[g] * power.exp()).min(0.99);
+                near |= (alpha * 255.0 - 1.0).abs() < 1e-5;
+                if alpha * 255.0 < 1.0 - 1e-5 {
+                    continue;
+                }
+                touched.push(g);
+                let after = transmittance * (1.0 - alpha);
+                near |= (after / 1e-4 - 1.0).abs() < 1e-5;
+                if after < 1e-4 {
+                    break;
+                }
+                transmittance = after;
+            }
+            if near {
+                pixels[(y * width + x) as usize] = true;
+                touched.into_iter().for_each(|g| gaussians[g] = true);
+            }
+        }
+    }
+    (pixels, gaussians)
+}
+
+/// Compares all but the elements in the band.
+fn compare(case: &Case, tensor: &str, got: &[f32], want: &[f64], band: &[bool], check: Check) {
+    let width = got.len() / band.len();
+    let keep = |i: usize| !band[i / width];
+    let got: Vec<f32> = got.iter().enumerate().filter(|(i, _)| keep(*i)).map(|(_, v)| *v).collect();
+    let want: Vec<f64> = want.iter().enumerate().filter(|(i, _)| keep(*i)).map(|(_, v)| *v).collect();
+    case.compare_with(tensor, &got, &want, check);
+}
+
+#[test]
+fn rasterize() {
+    let gpu = testing::gpu();
+    let tilings: &[Tiling] =
+        if gpu.info().subgroup_size == 8 { &[Tiling::Wide, Tiling::Narrow] } else { &[Tiling::Wide] };
+    for case in cases("rasterize") {
+        for &tiling in tilings {
+            let size = case.size("size");
+            let pixels = (size[0] * size[1]) as usize;
+            let mean = gpu.upload("mean", &case.vectors::<2>("mean")).unwrap();
+            let n = mean.len() as u32;
+            let covariance: Vec<[f32; 3]> =
+                case.vectors::<4>("covariance").into_iter().map(|[a, b, _, c]| [a, b, c]).collect();
+            let covariance = gpu.upload("covariance", &covariance).unwrap();
+            let depth = gpu.upload("depth", &case.f32("depth")).unwrap();
+            let opacity = gpu.upload("opacity", &case.f32("opacity")).unwrap();
+            let color = gpu.upload("color", &case.vectors::<3>("color")).unwrap();
+            let background = case.vectors::<3>("background")[0];
+            let limits = Limits::new(&gpu).unwrap();
+            let count = gpu.upload("count", &[n]).unwrap();
+            gpu.write(limits.slots(), &[n]).unwrap();
+            let slots = dispatch::groups(&gpu, "slots", 64).unwrap();
+            let grid = tiling.grid(size);
+            let pairs = n * grid[0] * grid[1];
+            let bin = Bin::new(&gpu, tiling, n, pairs, size).unwrap();
+            let picture = Picture::new(&gpu, size, pixels, Outputs::ColorDepth).unwrap();
+            let backward = Backward::new(&gpu, n as usize, pairs as usize, Outputs::ColorDepth).unwrap();
+            let grad_rgb = gpu.upload("grad_rgb", &case.vectors::<3>("upstream.rgb")).unwrap();
+            let grad_z = gpu.upload("grad_depth_map", &case.f32("upstream.z")).unwrap();
+            let grad_t = gpu.upload("grad_transmittance", &case.f32("upstream.transmittance")).unwrap();
+
+            let mut rec = gpu.recorder().unwrap();
+            dispatch::record(&mut rec, &count, &slots, n, 1);
+            let projected = Projected {
+                slots: &slots,
+                offsets: 1,
+                mean: &mean,
+                covariance: &covariance,
+                depth: &depth,
+                opacity: &opacity,
+                color: &color,
+            };
+            let binned = bin.record(&mut rec, projected, size, &limits);
+            rasterize::forward(&mut rec, tiling, projected, binned, background, &picture);
+            let gradient = PictureGradient { rgb: &grad_rgb, depth: Some(&grad_z), transmittance: Some(&grad_t) };
+            backward.record(&mut rec, tiling, projected, binned, &picture, gradient);
+            rec.submit().unwrap().wait().unwrap();
+            assert_eq!(gpu.read(limits.overflow()).unwrap(), [0]);
+
+            let (band, touched) = boundary(&case);
+            let banded = band.iter().filter(|b| **b).count();
+            println!("{} {tiling:?}: {banded} of {pixels} pixels in the boundary band", case.name);
+            assert!(banded * 50 <= pixels, "the band is too wide to test anything");
+            // Sums of some hundred terms of at most one, each good to 1e-6 (exponential and exponent).
+            let picture_check = Check { relative: 1e-5, absolute: 1e-5, band: 0.0 };
+            let rgb = gpu.read(&picture.rgb).unwrap();
+            compare(&case, "rgb", rgb.as_flattened(), &case.f64("rgb"), &band, picture_check);
+            let (z, t) = picture.depth.as_ref().expect("asked for");
+            compare(&case, "z", &gpu.read(z).unwrap(), &case.f64("z"), &band, picture_check);
+            compare(&case, "transmittance", &gpu.read(t).unwrap(), &case.f64("transmittance"), &band, picture_check);
+            // Sums over up to 2,000 pixels with cancellation; 1 / (1 - alpha) <= 100 amplifies 1e-7 to 1e-5 of the sum.
+            let check = Check { relative: 2e-4, absolute: 2e-5, band: 0.0 };
+            let read = |b: &[[f32; 2]]| b.as_flattened().to_vec();
+            let grad_mean = read(&gpu.read(&backward.grad_mean).unwrap());
+            compare(&case, "grad.mean", &grad_mean, &case.f64("grad.mean"), &touched, check);
+            let want: Vec<f64> =
+                case.f64("grad.covariance").chunks_exact(4).flat_map(|c| [c[0], c[1] + c[2], c[3]]).collect();
+            let got = gpu.read(&backward.grad_covariance).unwrap();
+            compare(&case, "grad.covariance", got.as_flattened(), &want, &touched, check);
+            let got = gpu.read(&backward.grad_opacity).unwrap();
+            compare(&case, "grad.opacity", &got, &case.f64("grad.opacity"), &touched, check);
+            let got = gpu.read(&backward.grad_color).unwrap();
+            compare(&case, "grad.color", got.as_flattened(), &case.f64("grad.color"), &touched, check);
+            let got = gpu.read(backward.grad_depth.as_ref().expect("asked for")).unwrap();
+            compare(&case, "grad.depth", &got, &case.f64("grad.depth"), &touched, check);
+        }
+    }
+}
