@@ -1,7 +1,7 @@
 //! Indirect dispatch: from a count on the device to workgroups.
 
 use crate::gpu::kernels::primitives::dispatch;
-use crate::gpu::{Buffer, Error, Gpu, Groups, Recorder, Reference};
+use crate::gpu::{Buffer, Error, Gpu, Groups, Recorder, Reference, Threads};
 
 impl Reference for dispatch::Kernel {
     fn reference(host: dispatch::Host<'_>, push: dispatch::Push, (): ()) {
@@ -24,6 +24,51 @@ pub fn record(rec: &mut Recorder<'_>, count: &Buffer<u32>, groups: &Groups, capa
     let limit = rec.gpu().info().max_groups.min(65535);
     let push = dispatch::Push { capacity, factor, group: groups.group, limit };
     rec.run(dispatch::Kernel, dispatch::Buffers { count, groups: &groups.buffer }, push, 1u32);
+}
+
+/// How many items a primitive works on.
+#[derive(Clone, Copy, Debug)]
+pub enum Count<'a> {
+    /// The host knows.
+    Host(u32),
+    /// The first element, known to the device alone; clamped to the primitive's capacity.
+    Device(&'a Buffer<u32>),
+}
+
+/// Dispatch of one workgroup per block of items.
+#[derive(Debug)]
+pub(super) struct Blocks {
+    host: Buffer<u32>,
+    groups: Groups,
+    capacity: u32,
+    items: u32,
+}
+
+impl Blocks {
+    /// Workgroups of `group` threads for blocks of `items`.
+    pub(super) fn new(gpu: &Gpu, capacity: u32, group: u32, items: u32) -> Result<Self, Error> {
+        Ok(Self { host: gpu.buffer("count", 1)?, groups: groups(gpu, "groups", group)?, capacity, items })
+    }
+
+    /// Where kernels read the count (unclamped), and the dispatch.
+    ///
+    /// # Panics
+    /// When a count of the host exceeds the capacity.
+    pub(super) fn record<'a>(&'a self, rec: &mut Recorder<'_>, count: Count<'a>) -> (&'a Buffer<u32>, Threads<'a>) {
+        match count {
+            Count::Host(n) => {
+                assert!(n <= self.capacity, "{n} items where there is room for {}", self.capacity);
+                rec.fill(&self.host, n);
+                (&self.host, Threads::Line(u64::from(n.div_ceil(self.items)) * u64::from(self.groups.group)))
+            }
+            Count::Device(count) => {
+                let limit = rec.gpu().info().max_groups.min(65535);
+                let push = dispatch::Push { capacity: self.capacity, factor: 1, group: self.items, limit };
+                rec.run(dispatch::Kernel, dispatch::Buffers { count, groups: &self.groups.buffer }, push, 1u32);
+                (count, Threads::Counted(&self.groups))
+            }
+        }
+    }
 }
 
 #[cfg(test)]

@@ -1,0 +1,235 @@
+//! Exclusive prefix sums of unsigned integers, modulo 2^32.
+//!
+//! Sums of blocks, their scan by one workgroup, and a second walk over the terms: three passes, two reads and one write
+//! per term. Few terms are scanned by one workgroup alone.
+
+use crate::gpu::kernels::primitives::{scan_spread, scan_sums, scan_sums_nonzero, scan_totals};
+use crate::gpu::{Buffer, Error, Gpu, Recorder, Reference};
+
+use super::dispatch::{Blocks, Count};
+
+/// Terms of a block, one workgroup's.
+pub(super) const BLOCK: u32 = 1024;
+/// Up to this capacity one workgroup does it alone.
+const ALONE: u32 = 4 * BLOCK;
+
+fn block_sums(count: &[u32], capacity: u32, terms: &[u32], sums: &mut [u32], term: impl Fn(u32) -> u32) {
+    let n = count[0].min(capacity) as usize;
+    for (sum, block) in sums.iter_mut().zip(terms[..n].chunks(BLOCK as usize)) {
+        *sum = block.iter().fold(0, |sum: u32, &x| sum.wrapping_add(term(x)));
+    }
+}
+
+impl Reference for scan_sums::Kernel {
+    fn reference(host: scan_sums::Host<'_>, push: scan_sums::Push, (): ()) {
+        block_sums(host.count, push.capacity, host.terms, host.sums, |x| x);
+    }
+}
+
+impl Reference for scan_sums_nonzero::Kernel {
+    fn reference(host: scan_sums_nonzero::Host<'_>, push: scan_sums_nonzero::Push, (): ()) {
+        block_sums(host.count, push.capacity, host.terms, host.sums, |x| u32::from(x != 0));
+    }
+}
+
+impl Reference for scan_totals::Kernel {
+    fn reference(host: scan_totals::Host<'_>, push: scan_totals::Push, (): ()) {
+        let n = host.count[0].min(push.capacity).div_ceil(push.items) as usize;
+        let mut sum = 0u32;
+        for (prefix, &term) in host.prefix.iter_mut().zip(&host.terms[..n]) {
+            *prefix = sum;
+            sum = sum.wrapping_add(term);
+        }
+        host.total[0] = sum;
+    }
+}
+
+impl Reference for scan_spread::Kernel {
+    fn reference(host: scan_spread::Host<'_>, push: scan_spread::Push, (): ()) {
+        let n = host.count[0].min(push.capacity) as usize;
+        let blocks = host.terms[..n].chunks(BLOCK as usize).zip(host.prefix.chunks_mut(BLOCK as usize));
+        for ((terms, prefix), &before) in blocks.zip(host.before) {
+            let mut sum = before;
+            for (prefix, &term) in prefix.iter_mut().zip(terms) {
+                *prefix = sum;
+                sum = sum.wrapping_add(term);
+            }
+        }
+    }
+}
+
+/// Exclusive prefix sums of at most `capacity` terms.
+#[derive(Debug)]
+pub struct Scan {
+    capacity: u32,
+    levels: Option<Levels>,
+    blocks: Blocks,
+}
+
+/// Scratch for more terms than one workgroup takes on.
+#[derive(Debug)]
+struct Levels {
+    sums: Buffer<u32>,
+    before: Buffer<u32>,
+}
+
+impl Scan {
+    /// Scratch for `capacity` terms.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub fn new(gpu: &Gpu, capacity: u32) -> Result<Self, Error> {
+        let blocks = Blocks::new(gpu, capacity, 64, BLOCK)?;
+        let entries = capacity.div_ceil(BLOCK) as usize;
+        let levels = if capacity > ALONE {
+            Some(Levels { sums: gpu.buffer("scan_sums", entries)?, before: gpu.buffer("scan_before", entries)? })
+        } else {
+            None
+        };
+        Ok(Self { capacity, levels, blocks })
+    }
+
+    /// Terms there is room for.
+    pub fn capacity(&self) -> u32 {
+        self.capacity
+    }
+
+    /// `prefix[i] = terms[0] + ... + terms[i-1]` for every i below the count, and `total[0]` the sum of all.
+    ///
+    /// `terms` and `prefix` hold at least `count` elements; elements of `prefix` from the count on are left as they
+    /// are. No two of the buffers may be the same, the count's included.
+    ///
+    /// # Panics
+    /// When a count of the host exceeds the capacity.
+    pub fn record(
+        &self,
+        rec: &mut Recorder<'_>,
+        terms: &Buffer<u32>,
+        prefix: &Buffer<u32>,
+        total: &Buffer<u32>,
+        count: Count<'_>,
+    ) {
+        // Never beyond a buffer, whatever the count on the device says.
+        let capacity = self.capacity.min(terms.len().min(prefix.len()) as u32);
+        let Some(Levels { sums, before }) = &self.levels else {
+            let count = match count {
+                Count::Host(_) => self.blocks.record(rec, count).0,
+                Count::Device(count) => count,
+            };
+            let buffers = scan_totals::Buffers { count, terms, prefix, total };
+            rec.run(scan_totals::Kernel, buffers, scan_totals::Push { capacity, items: 1 }, 64u32);
+            return;
+        };
+        let (count, threads) = self.blocks.record(rec, count);
+        rec.run(scan_sums::Kernel, scan_sums::Buffers { count, terms, sums }, scan_sums::Push { capacity }, threads);
+        let top = scan_totals::Buffers { count, terms: sums, prefix: before, total };
+        rec.run(scan_totals::Kernel, top, scan_totals::Push { capacity, items: BLOCK }, 64u32);
+        let spread = scan_spread::Buffers { count, terms, before, prefix };
+        rec.run(scan_spread::Kernel, spread, scan_spread::Push { capacity }, threads);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::testing;
+    use rand::{RngExt, SeedableRng};
+
+    const SIZES: [usize; 13] = [0, 1, 63, 64, 65, 1000, 1023, 1024, 1025, 2049, 4096, 4097, 100_003];
+    const PATTERN: u32 = 0xdead_beef;
+
+    fn random(n: usize) -> Vec<u32> {
+        let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(n as u64);
+        (0..n).map(|_| if rng.random_bool(0.3) { 0 } else { rng.random() }).collect()
+    }
+
+    #[test]
+    fn kernels_match_their_twins() {
+        let gpu = testing::gpu();
+        for n in SIZES {
+            // The buffers are longer than the count says.
+            let terms = random(n + 70);
+            let count = vec![n as u32];
+            let capacity = n as u32 + 60;
+            let blocks = terms.len().div_ceil(1024);
+            let case = scan_sums::Arrays { count: count.clone(), terms: terms.clone(), sums: vec![PATTERN; blocks] };
+            testing::assert_twin(scan_sums::Kernel, &gpu, case, scan_sums::Push { capacity }, n + 70);
+            let case =
+                scan_sums_nonzero::Arrays { count: count.clone(), terms: terms.clone(), sums: vec![PATTERN; blocks] };
+            testing::assert_twin(scan_sums_nonzero::Kernel, &gpu, case, scan_sums_nonzero::Push { capacity }, n + 70);
+            for items in [1, 7] {
+                let case = scan_totals::Arrays {
+                    count: count.clone(),
+                    terms: terms.clone(),
+                    prefix: vec![PATTERN; terms.len()],
+                    total: vec![PATTERN],
+                };
+                testing::assert_twin(scan_totals::Kernel, &gpu, case, scan_totals::Push { capacity, items }, 64u32);
+            }
+            let case = scan_spread::Arrays {
+                count,
+                prefix: vec![PATTERN; terms.len()],
+                before: random(blocks),
+                terms: terms.clone(),
+            };
+            testing::assert_twin(scan_spread::Kernel, &gpu, case, scan_spread::Push { capacity }, n + 70);
+        }
+    }
+
+    /// Prefix sums by the whole primitive, `room` elements long and pre-filled.
+    fn scanned(gpu: &Gpu, scan: &Scan, terms: &[u32], count: u32, on_device: bool) -> (Vec<u32>, u32) {
+        let input = gpu.upload("terms", terms).unwrap();
+        let prefix = gpu.upload("prefix", &vec![PATTERN; terms.len()]).unwrap();
+        let total = gpu.upload("total", &[PATTERN]).unwrap();
+        let counted = gpu.upload("terms_count", &[count]).unwrap();
+        let mut rec = gpu.recorder().unwrap();
+        let count = if on_device { Count::Device(&counted) } else { Count::Host(count) };
+        scan.record(&mut rec, &input, &prefix, &total, count);
+        rec.submit().unwrap().wait().unwrap();
+        (gpu.read(&prefix).unwrap(), gpu.read(&total).unwrap()[0])
+    }
+
+    #[test]
+    fn sums_what_is_before() {
+        let gpu = testing::gpu();
+        for n in SIZES.into_iter().chain([1_000_000]) {
+            let terms = random(n + 3);
+            for capacity in [n as u32, n as u32 + 3, 1_100_000] {
+                let scan = Scan::new(&gpu, capacity).unwrap();
+                for on_device in [false, true] {
+                    let (prefix, total) = scanned(&gpu, &scan, &terms, n as u32, on_device);
+                    let mut sum = 0u32;
+                    for i in 0..n {
+                        assert_eq!(prefix[i], sum, "prefix {i} of {n}, capacity {capacity}");
+                        sum = sum.wrapping_add(terms[i]);
+                    }
+                    assert_eq!(total, sum, "total of {n}");
+                    assert!(prefix[n..].iter().all(|&p| p == PATTERN), "beyond the count of {n}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_count_beyond_the_capacity_is_clamped() {
+        let gpu = testing::gpu();
+        for capacity in [1000, 5000] {
+            let scan = Scan::new(&gpu, capacity).unwrap();
+            let terms = vec![1; capacity as usize + 100];
+            let (prefix, total) = scanned(&gpu, &scan, &terms, u32::MAX, true);
+            assert_eq!(total, capacity);
+            assert_eq!(prefix[capacity as usize - 1], capacity - 1);
+            assert_eq!(prefix[capacity as usize], PATTERN);
+        }
+    }
+
+    #[test]
+    fn more_blocks_than_one_round_of_the_top() {
+        let gpu = testing::gpu();
+        let n = 3_000_001;
+        let scan = Scan::new(&gpu, n).unwrap();
+        let (prefix, total) = scanned(&gpu, &scan, &vec![1; n as usize], n, true);
+        assert_eq!(total, n);
+        assert!(prefix.iter().enumerate().all(|(i, &p)| p == i as u32));
+    }
+}
