@@ -1,1 +1,3 @@
 //! Cull, decode, project, bin, rasterize: forward and backward of a stage in one file.
+
+pub mod project;
