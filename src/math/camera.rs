@@ -35,7 +35,8 @@ impl Camera {
     /// and 30 % of half the field of view on each side.
     pub fn limits(&self) -> [f32; 4] {
         let axis = |i: usize| {
-            let [size, focal, center] = [f64::from(self.size[i]), f64::from(self.focal[i]), f64::from(self.principal[i])];
+            let [size, focal, center] =
+                [f64::from(self.size[i]), f64::from(self.focal[i]), f64::from(self.principal[i])];
             let margin = 0.3 * size / (2.0 * focal);
             ((-center / focal - margin) as f32, ((size - center) / focal + margin) as f32)
         };
@@ -223,7 +224,13 @@ pub fn rotation_matrix_backward([w, x, y, z]: [f64; 4], g: [[f64; 3]; 3]) -> [f6
 }
 
 /// EWA projection. `bounds` are the clamped coordinates of the point at which the Jacobian is taken.
-pub fn project(lens: &Lens, position: [f64; 3], scale: [f64; 3], rotation: [f64; 4], bounds: [Option<f64>; 2]) -> Splat {
+pub fn project(
+    lens: &Lens,
+    position: [f64; 3],
+    scale: [f64; 3],
+    rotation: [f64; 4],
+    bounds: [Option<f64>; 2],
+) -> Splat {
     let p = lens.to_camera(position);
     let xy = [p[0] / p[2], p[1] / p[2]];
     let pixel = lens.distort(xy);
@@ -260,8 +267,10 @@ pub fn project_backward(
     let t = rows.map(|row| lens.to_world(row));
     let u = t.map(|row| axes(row, &q, scale));
     let [gxx, gxy, gyy] = grad.covariance;
-    let gu: [[f64; 3]; 2] =
-        [std::array::from_fn(|k| 2.0 * gxx * u[0][k] + gxy * u[1][k]), std::array::from_fn(|k| gxy * u[0][k] + 2.0 * gyy * u[1][k])];
+    let gu: [[f64; 3]; 2] = [
+        std::array::from_fn(|k| 2.0 * gxx * u[0][k] + gxy * u[1][k]),
+        std::array::from_fn(|k| gxy * u[0][k] + 2.0 * gyy * u[1][k]),
+    ];
     // M = Q diag(s), u = t M.
     let grad_m: [[f64; 3]; 3] =
         std::array::from_fn(|i| std::array::from_fn(|k| t[0][i] * gu[0][k] + t[1][i] * gu[1][k]));

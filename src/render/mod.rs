@@ -1,3 +1,4 @@
 //! Cull, decode, project, bin, rasterize: forward and backward of a stage in one file.
 
+pub mod decode;
 pub mod project;

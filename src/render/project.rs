@@ -252,7 +252,8 @@ mod tests {
     /// Gaussians around the view, some behind the camera, some beyond the limits; every seventh without opacity.
     fn case(rng: &mut Pcg64, slots: usize, spare: usize) -> project::Arrays {
         let n = slots + spare;
-        let vec3 = |rng: &mut Pcg64, low: f32, high: f32| -> [f32; 3] { std::array::from_fn(|_| uniform(rng, low, high)) };
+        let vec3 =
+            |rng: &mut Pcg64, low: f32, high: f32| -> [f32; 3] { std::array::from_fn(|_| uniform(rng, low, high)) };
         let quaternion = |rng: &mut Pcg64| {
             let q: [f32; 4] = std::array::from_fn(|_| uniform(rng, -1.0, 1.0));
             let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-3);

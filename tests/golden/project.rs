@@ -41,8 +41,9 @@ fn project() {
             covariance: vec![[testing::UNWRITTEN; 3]; n],
             depth: vec![testing::UNWRITTEN; n],
         };
-        // The oracle has no near plane; its points are all in front of the camera.
-        let forward = testing::run_once::<project::Kernel>(&gpu, &arrays, stage::push(&camera, 0.0, 1), n);
+        // The oracle has no near plane (its points are all in front of the camera) and lets the lens fold back.
+        let push = project::Push { max_radius2: f32::INFINITY, ..stage::push(&camera, 0.0, 1) };
+        let forward = testing::run_once::<project::Kernel>(&gpu, &arrays, push, n);
         let check = |binding| <project::Kernel as gscream_vk::gpu::Reference>::check(binding);
         let backward_check = |binding| <project_backward::Kernel as gscream_vk::gpu::Reference>::check(binding);
         case.compare("mean", forward.mean.as_flattened(), check("mean"));
