@@ -1,3 +1,5 @@
 //! Scalar functions that the CPU twins share.
 
+pub mod camera;
+pub mod decoder;
 pub mod tiles;

@@ -2,6 +2,8 @@
 
 pub mod bin;
 pub mod config;
+pub mod decode;
+pub mod project;
 pub mod rasterize;
 
 pub use config::Config;

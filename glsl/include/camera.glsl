@@ -1,0 +1,84 @@
+// A camera and its lens (COLMAP's OPENCV model) on normalised coordinates. World to camera is p_camera = R p + t.
+struct Camera {
+  vec3 rotation0, rotation1, rotation2; // rows of R
+  vec3 translation;
+  vec4 lens;         // fx fy cx cy, px
+  vec4 distortion;   // k1 k2 p1 p2
+  vec4 limits;       // lowest x y, highest x y of the point at which the Jacobian is taken
+  float near;        // smallest depth
+  float max_radius2; // squared radius at which the polynomial folds back
+};
+#define CAMERA(push) Camera(push.rotation0, push.rotation1, push.rotation2, push.translation, push.lens, \
+  push.distortion, push.limits, push.near, push.max_radius2)
+
+bool finite(float v) { return (floatBitsToUint(v) & 0x7f800000u) != 0x7f800000u; }
+
+// `precise`: the discrete decisions below are the same on device and host.
+vec3 to_camera(Camera c, vec3 p) {
+  precise float x = ((c.rotation0.x * p.x + c.rotation0.y * p.y) + c.rotation0.z * p.z) + c.translation.x;
+  precise float y = ((c.rotation1.x * p.x + c.rotation1.y * p.y) + c.rotation1.z * p.z) + c.translation.y;
+  precise float z = ((c.rotation2.x * p.x + c.rotation2.y * p.y) + c.rotation2.z * p.z) + c.translation.z;
+  return vec3(x, y, z);
+}
+
+// In front of the near plane and inside the radius where the lens polynomial still grows. No division by z.
+bool in_front(Camera c, vec3 p) {
+  precise float radius2 = p.x * p.x + p.y * p.y;
+  precise float limit = c.max_radius2 * (p.z * p.z);
+  return p.z > c.near && !(radius2 > limit);
+}
+
+// Per axis: +1 beyond the upper limit, -1 beyond the lower, 0 inside.
+ivec2 beyond(Camera c, vec3 p) {
+  precise vec2 low = c.limits.xy * p.z, high = c.limits.zw * p.z;
+  return ivec2(p.x > high.x ? 1 : p.x < low.x ? -1 : 0, p.y > high.y ? 1 : p.y < low.y ? -1 : 0);
+}
+
+vec2 clamp_to_limits(Camera c, vec2 xy, ivec2 side) {
+  return vec2(side.x > 0 ? c.limits.z : side.x < 0 ? c.limits.x : xy.x,
+              side.y > 0 ? c.limits.w : side.y < 0 ? c.limits.y : xy.y);
+}
+
+vec2 distort(vec4 d, vec2 xy) {
+  float x = xy.x, y = xy.y, r2 = x * x + y * y;
+  float radial = 1.0 + r2 * (d.x + d.y * r2);
+  return vec2(x * radial + 2.0 * d.z * x * y + d.w * (r2 + 2.0 * x * x),
+              y * radial + 2.0 * d.w * x * y + d.z * (r2 + 2.0 * y * y));
+}
+
+// Derivative of distort: xx, xy = yx, yy.
+vec3 distort_jacobian(vec4 d, vec2 xy) {
+  float x = xy.x, y = xy.y, r2 = x * x + y * y;
+  float radial = 1.0 + r2 * (d.x + d.y * r2), slope = 2.0 * (d.x + 2.0 * d.y * r2);
+  return vec3(radial + x * x * slope + 2.0 * d.z * y + 6.0 * d.w * x,
+              x * y * slope + 2.0 * d.z * x + 2.0 * d.w * y,
+              radial + y * y * slope + 2.0 * d.w * x + 6.0 * d.z * y);
+}
+
+// Gradient with respect to xy through distort_jacobian, given the gradient g of its three entries.
+vec2 distort_jacobian_backward(vec4 d, vec2 xy, vec3 g) {
+  float x = xy.x, y = xy.y, slope = 2.0 * (d.x + 2.0 * d.y * (x * x + y * y)), k = 8.0 * d.y;
+  float xxx = x * (3.0 * slope + k * x * x) + 6.0 * d.w;
+  float xxy = y * (slope + k * x * x) + 2.0 * d.z;
+  float xyy = x * (slope + k * y * y) + 2.0 * d.w;
+  float yyy = y * (3.0 * slope + k * y * y) + 6.0 * d.z;
+  return vec2(g.x * xxx + g.y * xxy + g.z * xyy, g.x * xxy + g.y * xyy + g.z * yyy);
+}
+
+// Rows of d(pixel) / d(camera point), without the factor 1/z, at clamped normalised coordinates.
+void perspective(Camera c, vec2 at, vec3 j, out vec3 row0, out vec3 row1) {
+  row0 = c.lens.x * vec3(j.x, j.y, -(j.x * at.x + j.y * at.y));
+  row1 = c.lens.y * vec3(j.y, j.z, -(j.y * at.x + j.z * at.y));
+}
+
+// A row vector in camera coordinates times R: the same in world coordinates.
+vec3 to_world(Camera c, vec3 v) { return c.rotation0 * v.x + c.rotation1 * v.y + c.rotation2 * v.z; }
+vec3 rotate(Camera c, vec3 v) { return vec3(dot(c.rotation0, v), dot(c.rotation1, v), dot(c.rotation2, v)); }
+
+// Columns of the rotation matrix of quaternion (w, x, y, z), as it is: not normalised here.
+mat3 rotation_matrix(vec4 q) {
+  float w = q.x, x = q.y, y = q.z, z = q.w;
+  return mat3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
+              2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x),
+              2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
+}

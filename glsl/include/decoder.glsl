@@ -1,0 +1,36 @@
+// Layouts of the decoder's scratch (include model.glsl before). Everything is read four values at a time, so rows are
+// padded: an input to 40 values (the 37th is 1, for the bias), the outputs of each head to a multiple of 8.
+const uint HEADS = 3u;             // opacity, color, cov
+const uint INPUT_VEC4 = 10u;       // vec4s of a padded input
+const uint HIDDEN_VEC4 = 24u;      // vec4s of the hidden units of the three heads
+const uint ROW_VEC4 = 8u;          // vec4s of one head's hidden units: a row of the second layer
+const uint FIRST_WEIGHTS = HIDDEN * INPUT + HIDDEN; // of one head, biases included
+const uint FIRST_VEC4 = HEADS * HIDDEN * INPUT_VEC4; // packed first layer; the second one follows, then its biases
+const uint BLOCK = 64u;            // anchors of the smallest chunk of a weight gradient
+const uint CHUNKS = 1024u;         // chunks at most
+
+uint padded(uint n) { return (n + 7u) & ~7u; }
+// Outputs per Gaussian: 1, 3, 7; of the heads before: 0, 1, 4.
+uint per_gaussian(uint head) { return (2u << head) - 1u; }
+uint per_gaussian_before(uint head) { return (2u << head) - 2u - head; }
+// First weight of a head in the model's flat array.
+uint head_weights(uint head, uint offsets) {
+  return head * FIRST_WEIGHTS + (HIDDEN + 1u) * per_gaussian_before(head) * offsets;
+}
+// First padded output row of a head; of head 3: the number of rows.
+uint head_row(uint head, uint offsets) {
+  return (head > 0u ? padded(offsets) : 0u) + (head > 1u ? padded(3u * offsets) : 0u) + (head > 2u ? padded(7u * offsets) : 0u);
+}
+// Anchors of one chunk of a weight gradient.
+uint chunk_anchors(uint anchors) { return BLOCK * max(1u, (anchors + BLOCK * CHUNKS - 1u) / (BLOCK * CHUNKS)); }
+
+float dot_add(float sum, vec4 a, vec4 b) { return fma(a.w, b.w, fma(a.z, b.z, fma(a.y, b.y, fma(a.x, b.x, sum)))); }
+vec4 add_scaled(vec4 sum, float a, vec4 b) { return fma(vec4(a), b, sum); }
+
+float sigmoid(float x) { return 1.0 / (1.0 + exp(-x)); } // exp may overflow: 1 / inf = 0
+// Without the overflow of exp(x) in some drivers' tanh, and without cancellation near 0.
+float tanh_safe(float x) {
+  float t = exp(-2.0 * abs(x)), s = x * x;
+  float small = x * (1.0 + s * (-1.0 / 3.0 + s * (2.0 / 15.0 - s * (17.0 / 315.0))));
+  return abs(x) < 0.1 ? small : sign(x) * (1.0 - t) / (1.0 + t);
+}

@@ -1,0 +1,988 @@
+//! Visible anchors into neural Gaussians (Scaffold-GS, section 3.2), and the gradients back to the model.
+//!
+//! Both layers and all their gradients are matrix products in which a thread holds a tile of the result in registers
+//! (8 units of 4 anchors, 8 by 8 weights), so that a load serves several products. Activations are kept from the
+//! forward pass: 40 + 96 values per visible anchor, 11 K padded to heads of 8 more for the backward pass; at K = 10
+//! each of these buffers stays below 128 MiB up to 270,000 visible anchors.
+//!
+//! Weight gradients sum over anchors in a fixed tree: in float32 over chunks of 64 anchors (more only beyond 65,536
+//! visible anchors: at most 1,024 chunks), then over runs of 32 chunks, then over the runs. With n visible anchors the
+//! rounding error is at most `(n / 1024 + 64 + 32 + 32) 2^-24` of the sum of the terms' magnitudes.
+
+use crate::gpu::kernels::render::{
+    decode, decode_backward, decode_backward_feature, decode_backward_first, decode_backward_hidden,
+    decode_backward_second, decode_backward_weights, decode_hidden, decode_input, decode_pack,
+};
+use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
+use crate::math::decoder::{
+    FEATURE, Gaussian, HEADS, HIDDEN, INPUT, Layout, activate, activate_backward, input, outputs_of,
+};
+use crate::primitives::dispatch;
+
+/// Threads of a workgroup of all kernels here.
+const GROUP: u32 = 64;
+/// vec4s of a padded input, of the hidden units.
+const INPUT_VEC4: usize = Layout::PADDED_INPUT / 4;
+const HIDDEN_VEC4: usize = HEADS * HIDDEN / 4;
+/// vec4s of the packed first layer.
+const FIRST_VEC4: usize = HEADS * HIDDEN * INPUT_VEC4;
+/// Anchors of the smallest chunk of a weight gradient, and chunks at most.
+const BLOCK: usize = 64;
+const CHUNKS: usize = 1024;
+
+/// Anchors of one chunk.
+fn chunk_anchors(anchors: usize) -> usize {
+    BLOCK * anchors.div_ceil(BLOCK * CHUNKS).max(1)
+}
+
+/// Smallest number of threads per item with which groups of [`GROUP`] cover `per` threads for every `tile` items
+/// begun, whatever the number of items.
+fn threads_per_item(per: u32, tile: u32) -> u32 {
+    (per.div_ceil(tile)..)
+        .find(|&f| {
+            // With tile * GROUP items more, the left side grows by tile * GROUP * f, the right by GROUP * per: not more.
+            (1..=tile * GROUP).all(|n| (n * f).next_multiple_of(GROUP) >= n.div_ceil(tile) * per)
+        })
+        .expect("one thread per item and tile member is enough")
+}
+
+fn wide<const C: usize>(v: [f32; C]) -> [f64; C] {
+    v.map(f64::from)
+}
+
+fn narrow<const C: usize>(v: [f64; C]) -> [f32; C] {
+    v.map(|v| v as f32)
+}
+
+fn six(flat: &[f32], at: usize) -> [f64; 6] {
+    std::array::from_fn(|i| flat[6 * at + i].into())
+}
+
+/// Float32 sums of `terms` products: half a rounding each, relative to the terms' magnitudes, which stay within a few
+/// times the largest result.
+fn sums(terms: usize) -> Check {
+    let bound = terms as f64 * 6e-8;
+    Check { relative: bound, absolute: bound, band: 0.0 }
+}
+
+impl Reference for decode_pack::Kernel {
+    fn reference(host: decode_pack::Host<'_>, (): (), constants: decode_pack::Constants) {
+        let layout = Layout { offsets: constants.offsets as usize };
+        let packed = host.packed.as_flattened_mut();
+        packed[..4 * layout.packed()].fill(0.0);
+        for unit in 0..HEADS * HIDDEN {
+            for i in 0..=INPUT {
+                packed[unit * Layout::PADDED_INPUT + i] = host.weights[layout.first(unit / HIDDEN, unit % HIDDEN, i)];
+            }
+        }
+        for row in 0..layout.rows() {
+            if let (head, Some(output)) = layout.output_of(row) {
+                for j in 0..HIDDEN {
+                    packed[4 * FIRST_VEC4 + row * HIDDEN + j] = host.weights[layout.second(head, output, j)];
+                }
+                let bias = 4 * FIRST_VEC4 + layout.rows() * HIDDEN + row;
+                packed[bias] = host.weights[layout.second(head, output, HIDDEN)];
+            }
+        }
+    }
+    fn check(_: &'static str) -> Check {
+        Check { relative: 0.0, absolute: 0.0, band: 0.0 }
+    }
+}
+
+impl Reference for decode_input::Kernel {
+    fn reference(host: decode_input::Host<'_>, push: decode_input::Push, (): ()) {
+        for v in 0..host.groups[3] as usize {
+            let anchor = host.visible[v] as usize;
+            let feature = std::array::from_fn(|i| host.feature[FEATURE * anchor + i].into());
+            let x = input(feature, wide(host.position[anchor]), wide(push.center));
+            let to = &mut host.inputs.as_flattened_mut()[v * Layout::PADDED_INPUT..][..Layout::PADDED_INPUT];
+            to.fill(0.0);
+            to[..INPUT].copy_from_slice(&narrow(x));
+            to[INPUT] = 1.0;
+        }
+    }
+}
+
+impl Reference for decode_hidden::Kernel {
+    fn reference(host: decode_hidden::Host<'_>, (): (), _: decode_hidden::Constants) {
+        let (packed, inputs) = (host.packed.as_flattened(), host.inputs.as_flattened());
+        let hidden = host.hidden.as_flattened_mut();
+        for v in 0..host.groups[3] as usize {
+            for unit in 0..HEADS * HIDDEN {
+                let product = |i: usize| {
+                    f64::from(packed[unit * Layout::PADDED_INPUT + i]) * f64::from(inputs[v * Layout::PADDED_INPUT + i])
+                };
+                let sum: f64 = (0..Layout::PADDED_INPUT).map(product).sum();
+                hidden[v * HEADS * HIDDEN + unit] = sum.max(0.0) as f32;
+            }
+        }
+    }
+    fn check(_: &'static str) -> Check {
+        sums(Layout::PADDED_INPUT)
+    }
+}
+
+impl Reference for decode::Kernel {
+    fn reference(host: decode::Host<'_>, (): (), constants: decode::Constants) {
+        let layout = Layout { offsets: constants.offsets as usize };
+        let (packed, hidden) = (host.packed.as_flattened(), host.hidden.as_flattened());
+        let second = 4 * FIRST_VEC4;
+        for v in 0..host.groups[3] as usize {
+            let anchor = host.visible[v] as usize;
+            for k in 0..layout.offsets {
+                let mut raw = [0.0; 11];
+                for (at, (head, output)) in outputs_of(k).enumerate() {
+                    let row = layout.row(head) + output;
+                    let product = |j: usize| {
+                        f64::from(packed[second + row * HIDDEN + j])
+                            * f64::from(hidden[(v * HEADS + head) * HIDDEN + j])
+                    };
+                    let bias = f64::from(packed[second + layout.rows() * HIDDEN + row]);
+                    raw[at] = (0..HIDDEN).map(product).sum::<f64>() + bias;
+                }
+                let slot = v * layout.offsets + k;
+                let offset = wide(host.offset[anchor * layout.offsets + k]);
+                let g = activate(raw, wide(host.anchor_position[anchor]), offset, six(host.log_scaling, anchor));
+                host.position[slot] = narrow(g.position);
+                host.opacity[slot] = g.opacity as f32;
+                host.color[slot] = narrow(g.color);
+                host.scale[slot] = narrow(g.scale);
+                host.rotation[slot] = narrow(g.rotation);
+                host.rotation_norm[slot] = g.norm as f32;
+            }
+        }
+    }
+
+    /// A sum of 33 products, and Vulkan's `exp`, which may be `3 + 2 |x|` units in the last place off: 27 at e^-12.
+    fn check(_: &'static str) -> Check {
+        sums(33 + 27)
+    }
+}
+
+impl Reference for decode_backward::Kernel {
+    fn reference(host: decode_backward::Host<'_>, (): (), constants: decode_backward::Constants) {
+        let layout = Layout { offsets: constants.offsets as usize };
+        let grad_output = host.grad_output.as_flattened_mut();
+        for v in 0..host.groups[3] as usize {
+            let anchor = host.visible[v] as usize;
+            let log_scaling = six(host.log_scaling, anchor);
+            let mut sum = [0.0; 6];
+            grad_output[v * layout.rows()..][..layout.rows()].fill(0.0);
+            for k in 0..layout.offsets {
+                let (slot, at) = (v * layout.offsets + k, anchor * layout.offsets + k);
+                let of = Gaussian {
+                    position: [0.0; 3],
+                    opacity: host.opacity[slot].into(),
+                    color: wide(host.color[slot]),
+                    scale: wide(host.scale[slot]),
+                    rotation: wide(host.rotation[slot]),
+                    norm: host.rotation_norm[slot].into(),
+                };
+                let grad = Gaussian {
+                    position: wide(host.grad_position[slot]),
+                    opacity: host.grad_opacity[slot].into(),
+                    color: wide(host.grad_color[slot]),
+                    scale: wide(host.grad_scale[slot]),
+                    rotation: wide(host.grad_rotation[slot]),
+                    norm: 0.0,
+                };
+                let g = activate_backward(&of, wide(host.offset[at]), log_scaling, &grad);
+                host.grad_offset[at] = narrow(g.offset);
+                for i in 0..6 {
+                    sum[i] += g.log_scaling[i];
+                }
+                for (raw, (head, output)) in g.raw.into_iter().zip(outputs_of(k)) {
+                    grad_output[v * layout.rows() + layout.row(head) + output] = raw as f32;
+                }
+            }
+            for i in 0..6 {
+                host.grad_log_scaling[6 * anchor + i] = sum[i] as f32;
+            }
+        }
+    }
+
+    /// Ten products, Vulkan's `exp` (27 units in the last place at e^-12), and `1 - sigmoid`, `g - q (q . g)`, which
+    /// cancel: relative to the largest.
+    fn check(_: &'static str) -> Check {
+        sums(10 + 27)
+    }
+}
+
+impl Reference for decode_backward_hidden::Kernel {
+    fn reference(host: decode_backward_hidden::Host<'_>, (): (), constants: decode_backward_hidden::Constants) {
+        let layout = Layout { offsets: constants.offsets as usize };
+        let (packed, hidden) = (host.packed.as_flattened(), host.hidden.as_flattened());
+        let (grad_output, grad_hidden) = (host.grad_output.as_flattened(), host.grad_hidden.as_flattened_mut());
+        for v in 0..host.groups[3] as usize {
+            for unit in 0..HEADS * HIDDEN {
+                let head = unit / HIDDEN;
+                let product = |row: usize| {
+                    f64::from(packed[4 * FIRST_VEC4 + row * HIDDEN + unit % HIDDEN])
+                        * f64::from(grad_output[v * layout.rows() + row])
+                };
+                let at = v * HEADS * HIDDEN + unit;
+                let sum: f64 = (layout.row(head)..layout.row(head + 1)).map(product).sum();
+                grad_hidden[at] = if hidden[at] > 0.0 { sum as f32 } else { 0.0 };
+            }
+        }
+    }
+    fn check(_: &'static str) -> Check {
+        sums(72)
+    }
+}
+
+impl Reference for decode_backward_feature::Kernel {
+    fn reference(host: decode_backward_feature::Host<'_>, (): (), (): ()) {
+        let (packed, grad_hidden) = (host.packed.as_flattened(), host.grad_hidden.as_flattened());
+        for v in 0..host.groups[3] as usize {
+            for i in 0..FEATURE {
+                let product = |unit: usize| {
+                    f64::from(packed[unit * Layout::PADDED_INPUT + i])
+                        * f64::from(grad_hidden[v * HEADS * HIDDEN + unit])
+                };
+                let sum: f64 = (0..HEADS * HIDDEN).map(product).sum();
+                host.grad_feature[FEATURE * host.visible[v] as usize + i] = sum as f32;
+            }
+        }
+    }
+    fn check(_: &'static str) -> Check {
+        sums(HEADS * HIDDEN)
+    }
+}
+
+/// Chunks of a weight gradient: the anchors of each.
+fn chunks(anchors: usize) -> impl Iterator<Item = std::ops::Range<usize>> {
+    let chunk = chunk_anchors(anchors);
+    (0..anchors).step_by(chunk).map(move |from| from..(from + chunk).min(anchors))
+}
+
+impl Reference for decode_backward_first::Kernel {
+    fn reference(host: decode_backward_first::Host<'_>, (): (), (): ()) {
+        let (inputs, grad_hidden) = (host.inputs.as_flattened(), host.grad_hidden.as_flattened());
+        let partial = host.partial.as_flattened_mut();
+        for (part, anchors) in chunks(host.groups[3] as usize).enumerate() {
+            for unit in 0..HEADS * HIDDEN {
+                for i in 0..Layout::PADDED_INPUT {
+                    let product = |v: usize| {
+                        f64::from(grad_hidden[v * HEADS * HIDDEN + unit])
+                            * f64::from(inputs[v * Layout::PADDED_INPUT + i])
+                    };
+                    partial[4 * FIRST_VEC4 * part + unit * Layout::PADDED_INPUT + i] =
+                        anchors.clone().map(product).sum::<f64>() as f32;
+                }
+            }
+        }
+    }
+    fn check(_: &'static str) -> Check {
+        sums(2 * BLOCK)
+    }
+}
+
+impl Reference for decode_backward_second::Kernel {
+    fn reference(host: decode_backward_second::Host<'_>, (): (), constants: decode_backward_second::Constants) {
+        let layout = Layout { offsets: constants.offsets as usize };
+        let (hidden, grad_output) = (host.hidden.as_flattened(), host.grad_output.as_flattened());
+        let (partial, rows) = (host.partial.as_flattened_mut(), layout.rows());
+        for (part, anchors) in chunks(host.groups[3] as usize).enumerate() {
+            let partial = &mut partial[part * rows * (HIDDEN + 1)..][..rows * (HIDDEN + 1)];
+            for row in 0..rows {
+                let (head, _) = layout.output_of(row);
+                let grad = |v: usize| f64::from(grad_output[v * rows + row]);
+                for j in 0..HIDDEN {
+                    let product = |v: usize| grad(v) * f64::from(hidden[(v * HEADS + head) * HIDDEN + j]);
+                    partial[row * HIDDEN + j] = anchors.clone().map(product).sum::<f64>() as f32;
+                }
+                partial[rows * HIDDEN + row] = anchors.clone().map(grad).sum::<f64>() as f32;
+            }
+        }
+    }
+    fn check(_: &'static str) -> Check {
+        sums(2 * BLOCK)
+    }
+}
+
+impl Reference for decode_backward_weights::Kernel {
+    fn reference(host: decode_backward_weights::Host<'_>, (): (), constants: decode_backward_weights::Constants) {
+        let layout = Layout { offsets: constants.offsets as usize };
+        let rows = layout.rows();
+        let parts = chunks(host.groups[3] as usize).count();
+        let sum = |from: &[[f32; 4]], stride: usize, at: usize| {
+            (0..parts).map(|part| f64::from(from.as_flattened()[4 * stride * part + at])).sum::<f64>() as f32
+        };
+        for head in 0..HEADS {
+            for unit in 0..HIDDEN {
+                for i in 0..=INPUT {
+                    let at = (head * HIDDEN + unit) * Layout::PADDED_INPUT + i;
+                    host.grad_weights[layout.first(head, unit, i)] = sum(host.first, FIRST_VEC4, at);
+                }
+            }
+            for output in 0..layout.outputs(head) {
+                let row = layout.row(head) + output;
+                for j in 0..=HIDDEN {
+                    let at = if j < HIDDEN { row * HIDDEN + j } else { rows * HIDDEN + row };
+                    host.grad_weights[layout.second(head, output, j)] = sum(host.second, rows * (HIDDEN + 1) / 4, at);
+                }
+            }
+        }
+    }
+    fn check(_: &'static str) -> Check {
+        sums(BLOCK)
+    }
+}
+
+/// The part of the model that is decoded.
+#[derive(Clone, Copy)]
+pub struct Anchors<'a> {
+    /// World, \[N\].
+    pub position: &'a Buffer<[f32; 3]>,
+    /// \[N*32\], after the attention if there is any.
+    pub feature: &'a Buffer<f32>,
+    /// \[N*K\], in units of the anchor's scaling.
+    pub offset: &'a Buffer<[f32; 3]>,
+    /// \[N*6\], of the offsets 3, of the Gaussians 3.
+    pub log_scaling: &'a Buffer<f32>,
+    /// \[W\] of the three decoders.
+    pub weights: &'a Buffer<f32>,
+    /// Anchors to decode, ascending, \[V\].
+    pub visible: &'a Buffer<u32>,
+}
+
+/// Gradients of [`Decode`]'s outputs, \[slot\].
+#[derive(Clone, Copy)]
+pub struct GaussianGradients<'a> {
+    /// World.
+    pub position: &'a Buffer<[f32; 3]>,
+    /// Of the opacity.
+    pub opacity: &'a Buffer<f32>,
+    /// Of the color.
+    pub color: &'a Buffer<[f32; 3]>,
+    /// Of the standard deviations.
+    pub scale: &'a Buffer<[f32; 3]>,
+    /// Of the normalised quaternion.
+    pub rotation: &'a Buffer<[f32; 4]>,
+}
+
+/// Where the model's gradients go.
+#[derive(Clone, Copy)]
+pub struct AnchorGradients<'a> {
+    /// \[N*32\]; rows of visible anchors are written, the others left alone.
+    pub feature: &'a Buffer<f32>,
+    /// \[N*K\], likewise.
+    pub offset: &'a Buffer<[f32; 3]>,
+    /// \[N*6\], likewise.
+    pub log_scaling: &'a Buffer<f32>,
+    /// \[W\], every one is written.
+    pub weights: &'a Buffer<f32>,
+}
+
+/// The forward stage. Slot `s = v K + k` is Gaussian `k` of visible anchor `v`.
+#[derive(Debug)]
+pub struct Decode {
+    /// World, \[slot\].
+    pub position: Buffer<[f32; 3]>,
+    /// -1 to 1; the Gaussian exists where > 0, \[slot\].
+    pub opacity: Buffer<f32>,
+    /// 0 to 1, \[slot\].
+    pub color: Buffer<[f32; 3]>,
+    /// Standard deviations, world, \[slot\].
+    pub scale: Buffer<[f32; 3]>,
+    /// Unit quaternions w x y z, \[slot\].
+    pub rotation: Buffer<[f32; 4]>,
+    rotation_norm: Buffer<f32>,
+    packed: Buffer<[f32; 4]>,
+    inputs: Buffer<[f32; 4]>,
+    hidden: Buffer<[f32; 4]>,
+    per_anchor: Counted,
+    per_tile: Counted,
+    per_offset: Counted,
+    layout: Layout,
+    capacity: u32,
+}
+
+/// Workgroups for so many threads per visible anchor.
+#[derive(Debug)]
+struct Counted {
+    groups: Groups,
+    factor: u32,
+}
+
+impl Counted {
+    fn new(gpu: &Gpu, name: &'static str, factor: u32) -> Result<Self, Error> {
+        Ok(Self { groups: dispatch::groups(gpu, name, GROUP)?, factor })
+    }
+
+    fn record(&self, rec: &mut Recorder<'_>, count: &Buffer<u32>, capacity: u32) {
+        dispatch::record(rec, count, &self.groups, capacity, self.factor);
+    }
+}
+
+impl Decode {
+    /// Buffers for `capacity` visible anchors of `offsets` Gaussians each.
+    ///
+    /// # Errors
+    /// When the device has no memory for them.
+    pub fn new(gpu: &Gpu, capacity: u32, offsets: u32) -> Result<Self, Error> {
+        let (anchors, layout) = (capacity as usize, Layout { offsets: offsets as usize });
+        let slots = anchors * layout.offsets;
+        Ok(Self {
+            position: gpu.buffer("position", slots)?,
+            opacity: gpu.buffer("opacity", slots)?,
+            color: gpu.buffer("color", slots)?,
+            scale: gpu.buffer("scale", slots)?,
+            rotation: gpu.buffer("rotation", slots)?,
+            rotation_norm: gpu.buffer("rotation_norm", slots)?,
+            packed: gpu.buffer("packed", layout.packed())?,
+            inputs: gpu.buffer("inputs", anchors * INPUT_VEC4)?,
+            hidden: gpu.buffer("hidden", anchors * HIDDEN_VEC4)?,
+            per_anchor: Counted::new(gpu, "decode groups", 1)?,
+            per_tile: Counted::new(gpu, "decode tile groups", threads_per_item(12, 4))?,
+            per_offset: Counted::new(gpu, "decode offset groups", threads_per_item(offsets, 4))?,
+            layout,
+            capacity,
+        })
+    }
+
+    /// Records the decoding of the first `visible_count` anchors of the visible list for a camera centre (world).
+    /// More than the capacity are not decoded.
+    pub fn record(&self, rec: &mut Recorder<'_>, anchors: Anchors<'_>, visible_count: &Buffer<u32>, center: [f32; 3]) {
+        for counted in [&self.per_anchor, &self.per_tile, &self.per_offset] {
+            counted.record(rec, visible_count, self.capacity);
+        }
+        let offsets = self.layout.offsets as u32;
+        let pack = decode_pack::Buffers { weights: anchors.weights, packed: &self.packed };
+        rec.run_with(decode_pack::Kernel, decode_pack::Constants { offsets }, pack, (), self.layout.packed());
+        let groups = &self.per_anchor.groups;
+        let buffers = decode_input::Buffers {
+            groups: &groups.buffer,
+            visible: anchors.visible,
+            position: anchors.position,
+            feature: anchors.feature,
+            inputs: &self.inputs,
+        };
+        rec.run(decode_input::Kernel, buffers, decode_input::Push { center }, groups);
+        let groups = &self.per_tile.groups;
+        let buffers = decode_hidden::Buffers {
+            groups: &groups.buffer,
+            packed: &self.packed,
+            inputs: &self.inputs,
+            hidden: &self.hidden,
+        };
+        rec.run_with(decode_hidden::Kernel, decode_hidden::Constants { offsets }, buffers, (), groups);
+        let groups = &self.per_offset.groups;
+        let buffers = decode::Buffers {
+            groups: &groups.buffer,
+            visible: anchors.visible,
+            anchor_position: anchors.position,
+            offset: anchors.offset,
+            log_scaling: anchors.log_scaling,
+            packed: &self.packed,
+            hidden: &self.hidden,
+            position: &self.position,
+            opacity: &self.opacity,
+            color: &self.color,
+            scale: &self.scale,
+            rotation: &self.rotation,
+            rotation_norm: &self.rotation_norm,
+        };
+        rec.run_with(decode::Kernel, decode::Constants { offsets }, buffers, (), groups);
+    }
+}
+
+/// The backward stage: scratch for the gradients inside the decoder.
+#[derive(Debug)]
+pub struct DecodeBackward {
+    grad_output: Buffer<[f32; 4]>,
+    grad_hidden: Buffer<[f32; 4]>,
+    first: Buffer<[f32; 4]>,
+    second: Buffer<[f32; 4]>,
+}
+
+impl DecodeBackward {
+    /// Scratch for the backward pass of `forward`.
+    ///
+    /// # Errors
+    /// When the device has no memory for it.
+    pub fn new(gpu: &Gpu, forward: &Decode) -> Result<Self, Error> {
+        let (anchors, rows) = (forward.capacity as usize, forward.layout.rows());
+        let parts = anchors.div_ceil(BLOCK).min(CHUNKS);
+        Ok(Self {
+            grad_output: gpu.buffer("grad_output", anchors * rows / 4)?,
+            grad_hidden: gpu.buffer("grad_hidden", anchors * HIDDEN_VEC4)?,
+            first: gpu.buffer("first", parts * FIRST_VEC4)?,
+            second: gpu.buffer("second", parts * rows * (HIDDEN + 1) / 4)?,
+        })
+    }
+
+    /// Records the gradients, after [`Decode::record`] with the same arguments.
+    pub fn record(
+        &self,
+        rec: &mut Recorder<'_>,
+        forward: &Decode,
+        anchors: Anchors<'_>,
+        grad: GaussianGradients<'_>,
+        to: AnchorGradients<'_>,
+    ) {
+        let offsets = forward.layout.offsets as u32;
+        let groups = &forward.per_anchor.groups;
+        let buffers = decode_backward::Buffers {
+            groups: &groups.buffer,
+            visible: anchors.visible,
+            offset: anchors.offset,
+            log_scaling: anchors.log_scaling,
+            opacity: &forward.opacity,
+            color: &forward.color,
+            scale: &forward.scale,
+            rotation: &forward.rotation,
+            rotation_norm: &forward.rotation_norm,
+            grad_position: grad.position,
+            grad_opacity: grad.opacity,
+            grad_color: grad.color,
+            grad_scale: grad.scale,
+            grad_rotation: grad.rotation,
+            grad_offset: to.offset,
+            grad_log_scaling: to.log_scaling,
+            grad_output: &self.grad_output,
+        };
+        rec.run_with(decode_backward::Kernel, decode_backward::Constants { offsets }, buffers, (), groups);
+        let groups = &forward.per_tile.groups;
+        let buffers = decode_backward_hidden::Buffers {
+            groups: &groups.buffer,
+            packed: &forward.packed,
+            hidden: &forward.hidden,
+            grad_output: &self.grad_output,
+            grad_hidden: &self.grad_hidden,
+        };
+        let constants = decode_backward_hidden::Constants { offsets };
+        rec.run_with(decode_backward_hidden::Kernel, constants, buffers, (), groups);
+        let groups = &forward.per_anchor.groups;
+        let buffers = decode_backward_feature::Buffers {
+            groups: &groups.buffer,
+            visible: anchors.visible,
+            packed: &forward.packed,
+            grad_hidden: &self.grad_hidden,
+            grad_feature: to.feature,
+        };
+        rec.run(decode_backward_feature::Kernel, buffers, (), groups);
+        let buffers = decode_backward_first::Buffers {
+            groups: &groups.buffer,
+            inputs: &forward.inputs,
+            grad_hidden: &self.grad_hidden,
+            partial: &self.first,
+        };
+        rec.run(decode_backward_first::Kernel, buffers, (), groups);
+        let buffers = decode_backward_second::Buffers {
+            groups: &groups.buffer,
+            hidden: &forward.hidden,
+            grad_output: &self.grad_output,
+            partial: &self.second,
+        };
+        let constants = decode_backward_second::Constants { offsets };
+        rec.run_with(decode_backward_second::Kernel, constants, buffers, (), groups);
+        let buffers = decode_backward_weights::Buffers {
+            groups: &groups.buffer,
+            first: &self.first,
+            second: &self.second,
+            grad_weights: to.weights,
+        };
+        let constants = decode_backward_weights::Constants { offsets };
+        rec.run_with(decode_backward_weights::Kernel, constants, buffers, (), forward.layout.weights());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{RngExt, SeedableRng};
+    use rand_pcg::Pcg64;
+
+    use super::*;
+    use crate::gpu::{Difference, Options, Timings, testing};
+    use crate::math::decoder;
+
+    struct Model {
+        offsets: usize,
+        position: Vec<[f32; 3]>,
+        feature: Vec<f32>,
+        offset: Vec<[f32; 3]>,
+        log_scaling: Vec<f32>,
+        weights: Vec<f32>,
+        visible: Vec<u32>,
+        center: [f32; 3],
+    }
+
+    fn random<const C: usize>(rng: &mut Pcg64, n: usize, low: f32, high: f32) -> Vec<[f32; C]> {
+        (0..n).map(|_| std::array::from_fn(|_| low + (high - low) * rng.random::<f32>())).collect()
+    }
+
+    fn flat(rng: &mut Pcg64, n: usize, low: f32, high: f32) -> Vec<f32> {
+        random::<1>(rng, n, low, high).into_flattened()
+    }
+
+    /// So many visible anchors among half as many more: every third is not.
+    fn model(rng: &mut Pcg64, visible: usize, offsets: usize) -> Model {
+        let ids: Vec<u32> = (0..).filter(|i| i % 3 != 1).take(visible).collect();
+        let anchors = ids.last().map_or(0, |&i| i as usize) + 2;
+        Model {
+            offsets,
+            position: random(rng, anchors, -1.0, 1.0),
+            feature: flat(rng, anchors * FEATURE, -1.0, 1.0),
+            offset: random(rng, anchors * offsets, -1.0, 1.0),
+            log_scaling: flat(rng, 6 * anchors, -6.0, 0.5),
+            weights: flat(rng, Layout { offsets }.weights(), -0.3, 0.3),
+            visible: ids,
+            center: [0.2, -0.3, -3.0],
+        }
+    }
+
+    impl Model {
+        fn counted(&self) -> Vec<u32> {
+            vec![1, 1, 1, self.visible.len() as u32]
+        }
+        fn layout(&self) -> Layout {
+            Layout { offsets: self.offsets }
+        }
+    }
+
+    fn unwritten<const C: usize>(n: usize) -> Vec<[f32; C]> {
+        vec![[testing::UNWRITTEN; C]; n]
+    }
+
+    /// Runs a kernel against its twin and returns what it wrote. More threads than needed: the kernel has to stop.
+    fn twin<K: Reference>(
+        kernel: K,
+        gpu: &Gpu,
+        constants: K::Constants,
+        case: K::Arrays,
+        push: K::Push,
+        n: usize,
+    ) -> K::Arrays
+    where
+        K::Constants: Clone,
+    {
+        testing::assert_twin_with(kernel, gpu, constants, case.clone(), push, n + 70);
+        let mut words = K::words(case);
+        K::reference(K::host(&mut words), push, constants);
+        K::arrays(&words)
+    }
+
+    /// Every kernel against its twin, each fed with the twins before it.
+    #[test]
+    fn kernels_match_their_twins() {
+        let gpu = testing::gpu();
+        let mut rng = Pcg64::seed_from_u64(1);
+        for (count, offsets) in [(0, 10), (1, 10), (63, 10), (64, 10), (65, 10), (1000, 10), (65, 5), (3, 1), (130, 20)]
+        {
+            let m = model(&mut rng, count, offsets);
+            let (layout, slots, k) = (m.layout(), count * offsets, offsets as u32);
+            let case = decode_pack::Arrays { weights: m.weights.clone(), packed: unwritten(layout.packed() + 3) };
+            let constants = decode_pack::Constants { offsets: k };
+            let packed = twin(decode_pack::Kernel, &gpu, constants, case, (), layout.packed()).packed;
+            let case = decode_input::Arrays {
+                groups: m.counted(),
+                visible: m.visible.clone(),
+                position: m.position.clone(),
+                feature: m.feature.clone(),
+                inputs: unwritten(count * INPUT_VEC4 + 3),
+            };
+            let push = decode_input::Push { center: m.center };
+            let inputs = twin(decode_input::Kernel, &gpu, (), case, push, count).inputs;
+            let case = decode_hidden::Arrays {
+                groups: m.counted(),
+                packed: packed.clone(),
+                inputs: inputs.clone(),
+                hidden: unwritten(count * HIDDEN_VEC4 + 3),
+            };
+            let constants = decode_hidden::Constants { offsets: k };
+            let hidden = twin(decode_hidden::Kernel, &gpu, constants, case, (), count.div_ceil(4) * 12).hidden;
+            let case = decode::Arrays {
+                groups: m.counted(),
+                visible: m.visible.clone(),
+                anchor_position: m.position.clone(),
+                offset: m.offset.clone(),
+                log_scaling: m.log_scaling.clone(),
+                packed: packed.clone(),
+                hidden: hidden.clone(),
+                position: unwritten(slots + 3),
+                opacity: vec![testing::UNWRITTEN; slots + 3],
+                color: unwritten(slots + 3),
+                scale: unwritten(slots + 3),
+                rotation: unwritten(slots + 3),
+                rotation_norm: vec![testing::UNWRITTEN; slots + 3],
+            };
+            let constants = decode::Constants { offsets: k };
+            let forward = twin(decode::Kernel, &gpu, constants, case, (), count.div_ceil(4) * offsets);
+
+            let case = decode_backward::Arrays {
+                groups: m.counted(),
+                visible: m.visible.clone(),
+                offset: m.offset.clone(),
+                log_scaling: m.log_scaling.clone(),
+                opacity: forward.opacity,
+                color: forward.color,
+                scale: forward.scale,
+                rotation: forward.rotation,
+                rotation_norm: forward.rotation_norm,
+                grad_position: random(&mut rng, slots, -1.0, 1.0),
+                grad_opacity: flat(&mut rng, slots, -1.0, 1.0),
+                grad_color: random(&mut rng, slots, -1.0, 1.0),
+                grad_scale: random(&mut rng, slots, -1.0, 1.0),
+                grad_rotation: random(&mut rng, slots, -1.0, 1.0),
+                grad_offset: unwritten(m.offset.len()),
+                grad_log_scaling: vec![testing::UNWRITTEN; m.log_scaling.len()],
+                grad_output: unwritten(count * layout.rows() / 4 + 3),
+            };
+            let constants = decode_backward::Constants { offsets: k };
+            let grad_output = twin(decode_backward::Kernel, &gpu, constants, case, (), count).grad_output;
+            let case = decode_backward_hidden::Arrays {
+                groups: m.counted(),
+                packed: packed.clone(),
+                hidden: hidden.clone(),
+                grad_output: grad_output.clone(),
+                grad_hidden: unwritten(count * HIDDEN_VEC4 + 3),
+            };
+            let constants = decode_backward_hidden::Constants { offsets: k };
+            let threads = count.div_ceil(4) * 12;
+            let grad_hidden = twin(decode_backward_hidden::Kernel, &gpu, constants, case, (), threads).grad_hidden;
+            let case = decode_backward_feature::Arrays {
+                groups: m.counted(),
+                visible: m.visible.clone(),
+                packed: packed.clone(),
+                grad_hidden: grad_hidden.clone(),
+                grad_feature: vec![testing::UNWRITTEN; m.feature.len()],
+            };
+            twin(decode_backward_feature::Kernel, &gpu, (), case, (), count.div_ceil(4) * 4);
+            let parts = count.div_ceil(BLOCK);
+            let case = decode_backward_first::Arrays {
+                groups: m.counted(),
+                inputs: inputs.clone(),
+                grad_hidden: grad_hidden.clone(),
+                partial: unwritten(parts * FIRST_VEC4 + 3),
+            };
+            let first = twin(decode_backward_first::Kernel, &gpu, (), case, (), parts * 64).partial;
+            let case = decode_backward_second::Arrays {
+                groups: m.counted(),
+                hidden: hidden.clone(),
+                grad_output: grad_output.clone(),
+                partial: unwritten(parts * layout.rows() * (HIDDEN + 1) / 4 + 3),
+            };
+            let constants = decode_backward_second::Constants { offsets: k };
+            let second = twin(decode_backward_second::Kernel, &gpu, constants, case, (), parts * 64).partial;
+            let case = decode_backward_weights::Arrays {
+                groups: m.counted(),
+                first,
+                second,
+                grad_weights: vec![testing::UNWRITTEN; layout.weights() + 3],
+            };
+            let constants = decode_backward_weights::Constants { offsets: k };
+            twin(decode_backward_weights::Kernel, &gpu, constants, case, (), layout.weights());
+        }
+    }
+
+    struct Results {
+        outputs: Vec<(&'static str, Vec<f32>)>,
+        gradients: Vec<(&'static str, Vec<f32>)>,
+        upstream: Vec<Gaussian>,
+    }
+
+    /// Both stages on the device. Gradient buffers start at `before`.
+    fn run(
+        gpu: &Gpu,
+        m: &Model,
+        rng: &mut Pcg64,
+        capacity: u32,
+        before: f32,
+        timings: Option<&mut Timings>,
+    ) -> Results {
+        let fine = "the device has memory for a test";
+        let position = gpu.upload("anchor", &m.position).expect(fine);
+        let feature = gpu.upload("feature", &m.feature).expect(fine);
+        let offset = gpu.upload("offset", &m.offset).expect(fine);
+        let log_scaling = gpu.upload("log_scaling", &m.log_scaling).expect(fine);
+        let weights = gpu.upload("weights", &m.weights).expect(fine);
+        let visible = gpu.upload("visible", &m.visible).expect(fine);
+        let count = gpu.upload("visible_count", &[m.visible.len() as u32]).expect(fine);
+        let slots = capacity as usize * m.offsets;
+        let g3: [Vec<[f32; 3]>; 3] = std::array::from_fn(|_| random(rng, slots, -1.0, 1.0));
+        let (g1, g4) = (flat(rng, slots, -1.0, 1.0), random::<4>(rng, slots, -1.0, 1.0));
+        let [gp, gc, gs] = std::array::from_fn(|i| gpu.upload("upstream", &g3[i]).expect(fine));
+        let go = gpu.upload("upstream opacity", &g1).expect(fine);
+        let gr = gpu.upload("upstream rotation", &g4).expect(fine);
+        let to_feature = gpu.upload("grad_feature", &vec![before; m.feature.len()]).expect(fine);
+        let to_offset = gpu.upload("grad_offset", &vec![[before; 3]; m.offset.len()]).expect(fine);
+        let to_scaling = gpu.upload("grad_log_scaling", &vec![before; m.log_scaling.len()]).expect(fine);
+        let to_weights = gpu.upload("grad_weights", &vec![before; m.weights.len()]).expect(fine);
+        let forward = Decode::new(gpu, capacity, m.offsets as u32).expect(fine);
+        let backward = DecodeBackward::new(gpu, &forward).expect(fine);
+        let anchors = Anchors {
+            position: &position,
+            feature: &feature,
+            offset: &offset,
+            log_scaling: &log_scaling,
+            weights: &weights,
+            visible: &visible,
+        };
+        let grad = GaussianGradients { position: &gp, opacity: &go, color: &gc, scale: &gs, rotation: &gr };
+        let to = AnchorGradients {
+            feature: &to_feature,
+            offset: &to_offset,
+            log_scaling: &to_scaling,
+            weights: &to_weights,
+        };
+        let step = || {
+            let mut rec = gpu.recorder().expect(fine);
+            forward.record(&mut rec, anchors, &count, m.center);
+            backward.record(&mut rec, &forward, anchors, grad, to);
+            rec.submit().and_then(crate::gpu::Submission::wait).expect("the device runs it")
+        };
+        step();
+        if let Some(timings) = timings {
+            (0..5).for_each(|_| timings.add(&step()));
+        }
+        let read3 = |b: &Buffer<[f32; 3]>| gpu.read(b).expect(fine).into_flattened();
+        let read = |b: &Buffer<f32>| gpu.read(b).expect(fine);
+        let upstream = (0..slots).map(|s| Gaussian {
+            position: wide(g3[0][s]),
+            opacity: g1[s].into(),
+            color: wide(g3[1][s]),
+            scale: wide(g3[2][s]),
+            rotation: wide(g4[s]),
+            norm: 0.0,
+        });
+        Results {
+            outputs: vec![
+                ("position", read3(&forward.position)),
+                ("opacity", read(&forward.opacity)),
+                ("color", read3(&forward.color)),
+                ("scale", read3(&forward.scale)),
+                ("rotation", gpu.read(&forward.rotation).expect(fine).into_flattened()),
+            ],
+            gradients: vec![
+                ("offset", read3(&to_offset)),
+                ("log_scaling", read(&to_scaling)),
+                ("feature", read(&to_feature)),
+                ("weights", read(&to_weights)),
+            ],
+            upstream: upstream.collect(),
+        }
+    }
+
+    /// The stages (counts on the device, packing, tiles, sums over chunks) against the float64 decoder anchor by anchor.
+    #[test]
+    fn stages_match_the_decoder() {
+        let gpu = testing::gpu();
+        let mut rng = Pcg64::seed_from_u64(2);
+        for (count, offsets) in [(0usize, 10), (1, 10), (85, 10), (500, 10), (77, 7)] {
+            let m = model(&mut rng, count, offsets);
+            let got = run(&gpu, &m, &mut rng, count as u32 + 5, 7.0, None);
+            let layout = m.layout();
+            let weights: Vec<f64> = m.weights.iter().map(|&w| w.into()).collect();
+            let before = |n: usize| vec![7.0; n];
+            let mut grad_weights = vec![0.0; weights.len()];
+            let (mut offset, mut scaling, mut feature) =
+                (before(3 * m.offset.len()), before(m.log_scaling.len()), before(m.feature.len()));
+            let mut outputs: [Vec<f64>; 5] = Default::default();
+            for (v, &anchor) in m.visible.iter().enumerate() {
+                let a = anchor as usize;
+                let row: [f64; FEATURE] = std::array::from_fn(|i| m.feature[FEATURE * a + i].into());
+                let (at, ls) = (wide(m.position[a]), six(&m.log_scaling, a));
+                let x = input(row, at, wide(m.center));
+                let o: Vec<[f64; 3]> = m.offset[a * offsets..][..offsets].iter().map(|o| wide(*o)).collect();
+                for g in decoder::decode(layout, &weights, &x, at, &o, ls) {
+                    outputs[0].extend(g.position);
+                    outputs[1].push(g.opacity);
+                    outputs[2].extend(g.color);
+                    outputs[3].extend(g.scale);
+                    outputs[4].extend(g.rotation);
+                }
+                let upstream = &got.upstream[v * offsets..][..offsets];
+                let g = decoder::decode_backward(layout, &weights, &x, at, &o, ls, upstream, &mut grad_weights);
+                offset[3 * a * offsets..][..3 * offsets].copy_from_slice(g.offset.as_flattened());
+                scaling[6 * a..][..6].copy_from_slice(&g.log_scaling);
+                feature[FEATURE * a..][..FEATURE].copy_from_slice(&g.feature);
+            }
+            // A chain of three sums of 40, 33 and 72 products, and as many again over anchors.
+            let compare = |name: &str, got: &[f32], want: &[f64]| {
+                let got: Vec<f64> = got.iter().map(|&v| v.into()).collect();
+                let difference = Difference::of("decode", name, &got[..want.len()], want, sums(300));
+                assert!(difference.ok(), "{count} anchors: {difference}");
+                assert!(difference.cosine > 1.0 - 1e-9, "{difference}");
+            };
+            for ((name, got), want) in got.outputs.iter().zip(&outputs) {
+                compare(name, got, want);
+            }
+            for ((name, got), want) in got.gradients.iter().zip([offset, scaling, feature, grad_weights]) {
+                compare(name, got, &want);
+            }
+        }
+    }
+
+    /// More visible anchors than the capacity: nothing is written beyond the buffers, the rest is as without overflow.
+    #[test]
+    fn a_full_stage_stays_within_its_buffers() {
+        let gpu = testing::gpu();
+        let m = model(&mut Pcg64::seed_from_u64(3), 100, 10);
+        let full = run(&gpu, &m, &mut Pcg64::seed_from_u64(4), 70, 0.0, None);
+        let room = run(&gpu, &m, &mut Pcg64::seed_from_u64(4), 100, 0.0, None);
+        for ((_, a), (_, b)) in full.outputs.iter().zip(&room.outputs) {
+            assert_eq!(a[..], b[..a.len()]);
+        }
+    }
+
+    /// Same inputs, same bytes.
+    #[test]
+    fn gradients_are_deterministic() {
+        let gpu = testing::gpu();
+        let m = model(&mut Pcg64::seed_from_u64(5), 700, 10);
+        let [a, b] = [0, 1].map(|_| run(&gpu, &m, &mut Pcg64::seed_from_u64(6), 700, 0.0, None));
+        assert_eq!(a.gradients, b.gradients);
+    }
+
+    /// A camera on an anchor: no direction, distance 0, nothing that is not finite.
+    #[test]
+    fn a_camera_on_an_anchor_sees_no_direction() {
+        let gpu = testing::gpu();
+        let mut m = model(&mut Pcg64::seed_from_u64(7), 2, 10);
+        m.position[m.visible[1] as usize] = m.center;
+        let results = run(&gpu, &m, &mut Pcg64::seed_from_u64(8), 2, 0.0, None);
+        assert!(results.outputs.iter().chain(&results.gradients).all(|(_, v)| v.iter().all(|x| x.is_finite())));
+        let x = input([0.5; FEATURE], [1.0; 3], [1.0; 3]);
+        assert_eq!(x[32..], [0.0; 4]);
+    }
+
+    #[test]
+    fn groups_cover_every_tile() {
+        assert_eq!([threads_per_item(1, 1), threads_per_item(4, 4)], [1, 1]);
+        for (per, tile) in [(12, 4), (10, 4), (5, 4), (1, 4), (20, 4), (33, 4)] {
+            let f = threads_per_item(per, tile);
+            assert!(f <= per.div_ceil(tile) + 1, "{f} threads for {per} per {tile}");
+            for n in 0..5000u32 {
+                assert!((n * f).next_multiple_of(GROUP) >= n.div_ceil(tile) * per);
+            }
+        }
+    }
+
+    /// Chunks stay at 64 anchors up to 65,536 and at most 1,024 afterwards; none is empty, none is missed.
+    #[test]
+    fn chunks_partition_the_anchors() {
+        for n in [0, 1, 64, 65, 65_536, 65_537, 250_000] {
+            let all: Vec<_> = chunks(n).collect();
+            assert!(all.len() <= CHUNKS && all.iter().map(ExactSizeIterator::len).sum::<usize>() == n);
+            assert!(n > 65_536 || all.iter().all(|c| c.len() <= BLOCK));
+        }
+    }
+
+    /// Prints milliseconds per pass when `GSCREAM_TIMINGS` is set; always checks that every pass was timed.
+    #[test]
+    fn passes_are_timed() {
+        let device = std::env::var("GSCREAM_DEVICE").ok();
+        let gpu = Gpu::open(&Options { device, timestamps: true, ..Options::default() }).expect("a device");
+        let wanted = std::env::var_os("GSCREAM_TIMINGS").is_some();
+        for count in if wanted { vec![2000, 20_000] } else { vec![10] } {
+            let m = model(&mut Pcg64::seed_from_u64(9), count, 10);
+            let mut timings = Timings::default();
+            run(&gpu, &m, &mut Pcg64::seed_from_u64(10), count as u32, 0.0, Some(&mut timings));
+            println!("{count} visible anchors\n{}", timings.table());
+            assert!(timings.per_submission().iter().any(|(name, ..)| *name == "render/decode_backward_weights"));
+        }
+    }
+}
