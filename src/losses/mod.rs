@@ -1,1 +1,4 @@
 //! Photometric, depth alignment, depth, depth gradient.
+
+pub mod photometric;
+mod sum;
