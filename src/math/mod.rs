@@ -2,4 +2,5 @@
 
 pub mod camera;
 pub mod decoder;
+pub mod ssim;
 pub mod tiles;

@@ -1,0 +1,501 @@
+//! L1 and SSIM between the render and the photograph, weighted per pixel (3D Gaussian splatting's loss with GScream's
+//! weights): `1 / (3 W H) sum_p weight(p) sum_c [(1 - l) |C - I| + l (1 - SSIM)]`.
+//!
+//! SSIM's window is separable: moments along rows, then columns; the derivatives by the moments walk back the same way.
+
+use crate::gpu::kernels::losses::{
+    photometric_adjoint as adjoint, photometric_columns as columns, photometric_columns_weighted as columns_weighted,
+    photometric_gradient as gradient, photometric_gradient_weighted as gradient_weighted, photometric_rows as rows,
+};
+use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
+use crate::math::ssim;
+
+use super::sum;
+
+/// Pixels that a thread makes along the blur's direction; RUN in the kernels.
+const RUN: usize = 8;
+
+impl Reference for rows::Kernel {
+    fn reference(host: rows::Host<'_>, push: rows::Push, (): ()) {
+        let [width, height] = push.size.map(|v| v as usize);
+        for y in 0..height {
+            for x in 0..width {
+                for c in 0..3 {
+                    let a = |x: usize| f64::from(host.rendered[y * width + x][c]);
+                    let b = |x: usize| f64::from(host.target[y * width + x][c]);
+                    let blur = |value: &dyn Fn(usize) -> f64| ssim::blur(x, width, value);
+                    let (ma, mb) = (blur(&a), blur(&b));
+                    let variances = blur(&|x| a(x) * a(x) + b(x) * b(x)) - ma * ma - mb * mb;
+                    let covariance = blur(&|x| a(x) * b(x)) - ma * mb;
+                    host.moments[(y * width + x) * 3 + c] = [ma, mb, variances, covariance].map(|v| v as f32);
+                }
+            }
+        }
+    }
+
+    fn check(_binding: &'static str) -> Check {
+        // At most 18 roundings of 6e-8 each of terms no larger than the squared contrast of the run's surroundings.
+        Check { relative: 1e-5, absolute: 2e-6, band: 0.0 }
+    }
+}
+
+fn columns_reference(
+    moments: &[[f32; 4]],
+    grad_moments: &mut [[f32; 3]],
+    partial: &mut [f32],
+    weight: Option<&[f32]>,
+    push: columns::Push,
+) {
+    let [width, height] = push.size.map(|v| v as usize);
+    let line = 3 * width;
+    let mut losses = vec![0.0; groups(push.size)];
+    for y in 0..height {
+        for x in 0..line {
+            let at = |y: usize, i: usize| f64::from(moments[y * line + x][i]);
+            let blur = |value: &dyn Fn(usize) -> f64| ssim::blur(y, height, value);
+            let (a, b) = (blur(&|y| at(y, 0)), blur(&|y| at(y, 1)));
+            // Law of total variance.
+            let variances = blur(&|y| at(y, 2) + at(y, 0) * at(y, 0) + at(y, 1) * at(y, 1)) - a * a - b * b;
+            let covariance = blur(&|y| at(y, 3) + at(y, 0) * at(y, 1)) - a * b;
+            let (value, by) = ssim::derivatives([a, b, variances.max(0.0), covariance]);
+            let scale = f64::from(push.factor) * weight.map_or(1.0, |w| f64::from(w[(y * line + x) / 3]));
+            grad_moments[y * line + x] = by.map(|d| (-scale * d) as f32);
+            losses[(y / RUN * line + x) / 64] += scale * (1.0 - value);
+        }
+    }
+    for (partial, loss) in partial.iter_mut().zip(losses) {
+        *partial = loss as f32;
+    }
+}
+
+fn columns_check(binding: &str) -> Check {
+    match binding {
+        // 1 - SSIM is rounded at 6e-8 of one; the tensor's largest partial sum has terms of that size.
+        "partial" => Check { relative: 1e-5, absolute: 1e-5, band: 0.0 },
+        // Variance and covariance have an error of 12 roundings of the window's squared distance from the run's middle
+        // value, against C2 = 9e-4 in the denominator: at most 12 * 6e-8 / 9e-4 = 8e-4 beside the strongest edge,
+        // far less where the contrast is the window's own. The derivatives are quotients of these, their sums cancel.
+        _ => Check { relative: 1e-4, absolute: 1e-4, band: 0.0 },
+    }
+}
+
+impl Reference for columns::Kernel {
+    fn reference(host: columns::Host<'_>, push: columns::Push, (): ()) {
+        columns_reference(host.moments, host.grad_moments, host.partial, None, push);
+    }
+    fn check(binding: &'static str) -> Check {
+        columns_check(binding)
+    }
+}
+
+impl Reference for columns_weighted::Kernel {
+    fn reference(host: columns_weighted::Host<'_>, push: columns_weighted::Push, (): ()) {
+        let push = bytemuck::cast(push);
+        columns_reference(host.moments, host.grad_moments, host.partial, Some(host.weight), push);
+    }
+    fn check(binding: &'static str) -> Check {
+        columns_check(binding)
+    }
+}
+
+impl Reference for adjoint::Kernel {
+    fn reference(host: adjoint::Host<'_>, push: adjoint::Push, (): ()) {
+        let [width, height] = push.size.map(|v| v as usize);
+        for (i, out) in host.grad_rows.iter_mut().enumerate().take(3 * width * height) {
+            let (row, x, c) = (i / (3 * width) * width, i / 3 % width, i % 3);
+            *out = std::array::from_fn(|k| {
+                ssim::blur(x, width, |x: usize| f64::from(host.grad_moments[(row + x) * 3 + c][k])) as f32
+            });
+        }
+    }
+
+    fn check(_binding: &'static str) -> Check {
+        // 11 roundings of terms that may cancel.
+        Check { relative: 1e-5, absolute: 2e-6, band: 0.0 }
+    }
+}
+
+struct Pictures<'a> {
+    grad_rows: &'a [[f32; 3]],
+    rendered: &'a [[f32; 3]],
+    target: &'a [[f32; 3]],
+    weight: Option<&'a [f32]>,
+}
+
+fn gradient_reference(from: &Pictures<'_>, grad_rendered: &mut [[f32; 3]], partial: &mut [f32], push: gradient::Push) {
+    let [width, height] = push.size.map(|v| v as usize);
+    let line = 3 * width;
+    let mut losses = vec![0.0; groups(push.size)];
+    for y in 0..height {
+        for x in 0..line {
+            let (pixel, c) = (y * width + x / 3, x % 3);
+            let (a, b) = (f64::from(from.rendered[pixel][c]), f64::from(from.target[pixel][c]));
+            let s: [f64; 3] =
+                std::array::from_fn(|k| ssim::blur(y, height, |y: usize| f64::from(from.grad_rows[y * line + x][k])));
+            let scale = f64::from(push.factor) * from.weight.map_or(1.0, |w| f64::from(w[pixel]));
+            losses[(y / RUN * line + x) / 64] += scale * (a - b).abs();
+            let sign = if a == b { 0.0 } else { (a - b).signum() };
+            let value = s[0] + 2.0 * (a - 0.5) * s[1] + (b - 0.5) * s[2] + scale * sign;
+            grad_rendered[pixel][c] = value as f32;
+        }
+    }
+    for (partial, loss) in partial[push.first as usize..].iter_mut().zip(losses) {
+        *partial = loss as f32;
+    }
+}
+
+fn gradient_check(binding: &str) -> Check {
+    match binding {
+        "partial" => Check::default(),
+        // The three blurred terms are up to 1 / C2 times the result and cancel in flat regions: 14 roundings of them.
+        _ => Check { relative: 1e-5, absolute: 1e-5, band: 0.0 },
+    }
+}
+
+impl Reference for gradient::Kernel {
+    fn reference(host: gradient::Host<'_>, push: gradient::Push, (): ()) {
+        let from = Pictures { grad_rows: host.grad_rows, rendered: host.rendered, target: host.target, weight: None };
+        gradient_reference(&from, host.grad_rendered, host.partial, push);
+    }
+    fn check(binding: &'static str) -> Check {
+        gradient_check(binding)
+    }
+}
+
+impl Reference for gradient_weighted::Kernel {
+    fn reference(host: gradient_weighted::Host<'_>, push: gradient_weighted::Push, (): ()) {
+        let weight = Some(host.weight);
+        let from = Pictures { grad_rows: host.grad_rows, rendered: host.rendered, target: host.target, weight };
+        gradient_reference(&from, host.grad_rendered, host.partial, bytemuck::cast(push));
+    }
+    fn check(binding: &'static str) -> Check {
+        gradient_check(binding)
+    }
+}
+
+/// Threads of the kernels that walk along columns.
+fn column_threads([width, height]: [u32; 2]) -> u32 {
+    3 * width * height.div_ceil(RUN as u32)
+}
+
+/// Threads of the kernels that walk along rows.
+fn row_threads([width, height]: [u32; 2]) -> u32 {
+    3 * width.div_ceil(RUN as u32) * height
+}
+
+/// Workgroups of the kernels that walk along columns: partial sums of each part of the loss.
+fn groups(size: [u32; 2]) -> usize {
+    column_threads(size).div_ceil(64) as usize
+}
+
+/// The photometric loss and its gradient by the rendered picture.
+#[derive(Debug)]
+pub struct Photometric {
+    size: [u32; 2],
+    ssim_weight: f32,
+    moments: Buffer<[f32; 4]>,
+    grad_moments: Buffer<[f32; 3]>,
+    grad_rows: Buffer<[f32; 3]>,
+    grad_rendered: Buffer<[f32; 3]>,
+    partial: Buffer<f32>,
+}
+
+impl Photometric {
+    /// For pictures of `size` = width, height. `ssim_weight` is the share of 1 - SSIM, the rest is L1.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub fn new(gpu: &Gpu, size: [u32; 2], ssim_weight: f32) -> Result<Self, Error> {
+        let pixels = size[0] as usize * size[1] as usize;
+        Ok(Self {
+            size,
+            ssim_weight,
+            moments: gpu.buffer("ssim_moments", 3 * pixels)?,
+            grad_moments: gpu.buffer("grad_ssim_moments", 3 * pixels)?,
+            grad_rows: gpu.buffer("grad_ssim_rows", 3 * pixels)?,
+            grad_rendered: gpu.buffer("grad_rgb", pixels)?,
+            partial: gpu.buffer("photometric_partial", 2 * groups(size))?,
+        })
+    }
+
+    /// Records the loss of `rendered` against `target` (both \[pixel\] rgb, with a `weight` per pixel if there is one)
+    /// into `losses[slot]` and returns its gradient by `rendered` \[pixel\].
+    ///
+    /// Without a difference the gradient of L1 is zero.
+    pub fn forward_backward(
+        &self,
+        rec: &mut Recorder<'_>,
+        rendered: &Buffer<[f32; 3]>,
+        target: &Buffer<[f32; 3]>,
+        weight: Option<&Buffer<f32>>,
+        losses: &Buffer<f32>,
+        slot: u32,
+    ) -> &Buffer<[f32; 3]> {
+        let Self { size, moments, grad_moments, grad_rows, grad_rendered, partial, .. } = self;
+        let size = *size;
+        let per_value = 1.0 / (3.0 * f64::from(size[0]) * f64::from(size[1]));
+        let share = f64::from(self.ssim_weight);
+        let (of_ssim, of_l1) = ((share * per_value) as f32, ((1.0 - share) * per_value) as f32);
+        let (across, down) = (row_threads(size), column_threads(size));
+        let first = groups(size) as u32;
+        rec.run(rows::Kernel, rows::Buffers { rendered, target, moments }, rows::Push { size }, across);
+        match weight {
+            None => {
+                let push = columns::Push { size, factor: of_ssim };
+                rec.run(columns::Kernel, columns::Buffers { moments, grad_moments, partial }, push, down);
+            }
+            Some(weight) => {
+                let push = columns_weighted::Push { size, factor: of_ssim };
+                let buffers = columns_weighted::Buffers { moments, grad_moments, partial, weight };
+                rec.run(columns_weighted::Kernel, buffers, push, down);
+            }
+        }
+        rec.run(adjoint::Kernel, adjoint::Buffers { grad_moments, grad_rows }, adjoint::Push { size }, across);
+        match weight {
+            None => {
+                let push = gradient::Push { size, factor: of_l1, first };
+                let buffers = gradient::Buffers { grad_rows, rendered, target, grad_rendered, partial };
+                rec.run(gradient::Kernel, buffers, push, down);
+            }
+            Some(weight) => {
+                let push = gradient_weighted::Push { size, factor: of_l1, first };
+                let buffers =
+                    gradient_weighted::Buffers { grad_rows, rendered, target, grad_rendered, partial, weight };
+                rec.run(gradient_weighted::Kernel, buffers, push, down);
+            }
+        }
+        sum::record(rec, partial, 2 * first, 1, losses, slot);
+        grad_rendered
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::testing::{self, UNWRITTEN};
+    use rand::{RngExt, SeedableRng};
+
+    const SIZES: [[u32; 2]; 6] = [[1, 1], [1, 17], [17, 1], [63, 2], [53, 37], [252, 142]];
+
+    /// Pairs of pictures: unlike noise, noise close to its target, one brightness, the same picture twice, hard edges.
+    fn pictures(size: [u32; 2]) -> Vec<[Vec<[f32; 3]>; 2]> {
+        let mut rng = rand_pcg::Pcg32::seed_from_u64(u64::from(size[0] * 1000 + size[1]));
+        let pixels = (size[0] * size[1]) as usize;
+        let mut noise = || -> Vec<[f32; 3]> { (0..pixels).map(|_| std::array::from_fn(|_| rng.random())).collect() };
+        let (a, b, c) = (noise(), noise(), noise());
+        let near: Vec<[f32; 3]> =
+            a.iter().zip(&b).map(|(a, b)| std::array::from_fn(|i| a[i] + 0.02 * (b[i] - 0.5))).collect();
+        let edges = (0..size[0] * size[1])
+            .map(|p| {
+                std::array::from_fn(
+                    |i| if (p % size[0] / 9 + p / size[0] / (7 + i as u32)) % 2 == 0 { 1.0 } else { 0.0 },
+                )
+            })
+            .collect();
+        let bright = vec![[0.9, 1.0, 0.8]; pixels];
+        vec![
+            [a.clone(), b],
+            [a.clone(), near],
+            [bright.clone(), vec![[0.9, 0.98, 0.2]; pixels]],
+            [bright, c.clone()],
+            [a.clone(), a],
+            [edges, c],
+        ]
+    }
+
+    fn weights(size: [u32; 2]) -> Vec<f32> {
+        (0..size[0] * size[1]).map(|p| [1.0, 20.0, 0.0][(p / 5 % 3) as usize]).collect()
+    }
+
+    #[test]
+    fn kernels_match_their_twins() {
+        let gpu = testing::gpu();
+        for size in SIZES {
+            let n = 3 * (size[0] * size[1]) as usize;
+            let first = groups(size) as u32;
+            for [rendered, target] in pictures(size) {
+                let case = rows::Arrays {
+                    rendered: rendered.clone(),
+                    target: target.clone(),
+                    moments: vec![[UNWRITTEN; 4]; n + 2],
+                };
+                testing::assert_twin(rows::Kernel, &gpu, case.clone(), rows::Push { size }, row_threads(size));
+                let moments =
+                    testing::run_once::<rows::Kernel>(&gpu, &case, rows::Push { size }, row_threads(size)).moments;
+                let case = columns::Arrays {
+                    moments: moments.clone(),
+                    grad_moments: vec![[UNWRITTEN; 3]; n],
+                    partial: vec![UNWRITTEN; 2 * groups(size)],
+                };
+                let push = columns::Push { size, factor: 0.3 };
+                let down = column_threads(size);
+                testing::assert_twin(columns::Kernel, &gpu, case.clone(), push, down);
+                let grad_moments = testing::run_once::<columns::Kernel>(&gpu, &case, push, down).grad_moments;
+                let case = columns_weighted::Arrays {
+                    moments,
+                    grad_moments: case.grad_moments,
+                    partial: case.partial,
+                    weight: weights(size),
+                };
+                let push = columns_weighted::Push { size, factor: 0.3 };
+                testing::assert_twin(columns_weighted::Kernel, &gpu, case, push, down);
+                let case = adjoint::Arrays { grad_moments, grad_rows: vec![[UNWRITTEN; 3]; n] };
+                testing::assert_twin(adjoint::Kernel, &gpu, case.clone(), adjoint::Push { size }, row_threads(size));
+                let grad_rows =
+                    testing::run_once::<adjoint::Kernel>(&gpu, &case, adjoint::Push { size }, row_threads(size))
+                        .grad_rows;
+                let case = gradient::Arrays {
+                    grad_rows,
+                    rendered,
+                    target,
+                    grad_rendered: vec![[UNWRITTEN; 3]; n / 3],
+                    partial: vec![UNWRITTEN; 2 * groups(size)],
+                };
+                testing::assert_twin(
+                    gradient::Kernel,
+                    &gpu,
+                    case.clone(),
+                    gradient::Push { size, factor: 0.7, first },
+                    down,
+                );
+                let gradient::Arrays { grad_rows, rendered, target, grad_rendered, partial } = case;
+                let weight = weights(size);
+                let case = gradient_weighted::Arrays { grad_rows, rendered, target, grad_rendered, partial, weight };
+                let push = gradient_weighted::Push { size, factor: 0.7, first };
+                testing::assert_twin(gradient_weighted::Kernel, &gpu, case, push, down);
+            }
+        }
+    }
+
+    /// The loss from its definition.
+    fn loss(rendered: &[[f64; 3]], target: &[[f64; 3]], weight: &[f32], size: [usize; 2]) -> f64 {
+        let plane = |v: &[[f64; 3]], c: usize| -> Vec<f64> { v.iter().map(|v| v[c]).collect() };
+        let mut sum = 0.0;
+        for c in 0..3 {
+            let (a, b) = (plane(rendered, c), plane(target, c));
+            let ssim = ssim::map(&a, &b, size[0], size[1]);
+            sum += (0..a.len())
+                .map(|p| f64::from(weight[p]) * (0.8 * (a[p] - b[p]).abs() + 0.2 * (1.0 - ssim[p])))
+                .sum::<f64>();
+        }
+        sum / (3 * weight.len()) as f64
+    }
+
+    fn run(
+        gpu: &Gpu,
+        size: [u32; 2],
+        rendered: &[[f32; 3]],
+        target: &[[f32; 3]],
+        weight: Option<&[f32]>,
+    ) -> (f32, Vec<f32>) {
+        let stage = Photometric::new(gpu, size, 0.2).expect("buffers");
+        let rendered = gpu.upload("rgb", rendered).expect("upload");
+        let target = gpu.upload("target", target).expect("upload");
+        let weight = weight.map(|w| gpu.upload("weight", w).expect("upload"));
+        let losses = gpu.upload("losses", &[UNWRITTEN; 3]).expect("upload");
+        let mut rec = gpu.checked().expect("recorder");
+        let grad = stage.forward_backward(&mut rec, &rendered, &target, weight.as_ref(), &losses, 1);
+        let submission = rec.submit().expect("submit");
+        for difference in &submission.differences {
+            assert!(difference.ok(), "{difference}");
+        }
+        submission.wait().expect("wait");
+        let terms = gpu.read(&losses).expect("read");
+        assert!(terms[0].is_nan() && terms[2].is_nan(), "other slots are not touched");
+        (terms[1], gpu.read(grad).expect("read").into_flattened())
+    }
+
+    #[test]
+    fn gradient_is_the_slope_of_the_definition() {
+        let gpu = testing::gpu();
+        let size = [19, 14];
+        let weight = weights(size);
+        for [rendered, target] in &pictures(size)[..2] {
+            let (value, grad) = run(&gpu, size, rendered, target, Some(&weight));
+            let double = |v: &[[f32; 3]]| -> Vec<[f64; 3]> { v.iter().map(|v| v.map(f64::from)).collect() };
+            let (mut a, b) = (double(rendered), double(target));
+            let sizes = size.map(|v| v as usize);
+            let want = loss(&a, &b, &weight, sizes);
+            assert!((f64::from(value) - want).abs() < 3e-6 * want, "{value} instead of {want}");
+            let scale = grad.iter().fold(0.0_f32, |m, g| m.max(g.abs()));
+            for p in (0..a.len()).step_by(7) {
+                for c in 0..3 {
+                    let (old, step) = (a[p][c], 1e-5);
+                    if (old - b[p][c]).abs() < 2.0 * step {
+                        continue;
+                    }
+                    a[p][c] = old + step;
+                    let above = loss(&a, &b, &weight, sizes);
+                    a[p][c] = old - step;
+                    let below = loss(&a, &b, &weight, sizes);
+                    a[p][c] = old;
+                    let (slope, got) = ((above - below) / (2.0 * step), grad[3 * p + c]);
+                    // The third derivative of SSIM is of order C2^-1.5 of the weight: 1e-5^2 / 6 * 4e4 = 6e-7 of it.
+                    assert!(
+                        (slope - f64::from(got)).abs() < 2e-5 * f64::from(scale),
+                        "[{p}][{c}] {got}, slope {slope}"
+                    );
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_same_picture_has_no_loss_and_hardly_a_gradient() {
+        let gpu = testing::gpu();
+        let size = [53, 37];
+        let values = 3.0 * 53.0 * 37.0;
+        for pictures in pictures(size) {
+            for picture in pictures {
+                let (value, grad) = run(&gpu, size, &picture, &picture, None);
+                assert!(value.abs() < 1e-6, "{value}");
+                // Terms of 2 / C2 cancel: at most 32 roundings of 0.2 * 2 / 9e-4 / (3 W H).
+                let limit = 32.0 * 6e-8 * 0.2 * 2.0 / 9e-4 / values;
+                assert!(
+                    grad.iter().all(|g| g.abs() < limit),
+                    "{:?} above {limit}",
+                    grad.iter().fold(0.0_f32, |m, g| m.max(g.abs()))
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn no_weight_no_gradient() {
+        let gpu = testing::gpu();
+        let size = [53, 37];
+        for [a, b] in pictures(size) {
+            let (value, grad) = run(&gpu, size, &a, &b, Some(&vec![0.0; a.len()]));
+            assert!(value == 0.0 && grad.iter().all(|&g| g == 0.0));
+        }
+    }
+
+    #[test]
+    fn a_weight_of_one_is_no_weight() {
+        let gpu = testing::gpu();
+        let size = [53, 37];
+        for [a, b] in pictures(size) {
+            assert_eq!(run(&gpu, size, &a, &b, Some(&vec![1.0; a.len()])), run(&gpu, size, &a, &b, None));
+        }
+    }
+
+    #[test]
+    fn zz_time() {
+        let gpu = testing::gpu_with(crate::gpu::Options { timestamps: true, ..Default::default() });
+        for size in [[252, 142], [1008, 567]] {
+            let [a, b] = pictures(size).remove(0);
+            let stage = Photometric::new(&gpu, size, 0.2).expect("buffers");
+            let rendered = gpu.upload("rgb", &a).expect("upload");
+            let target = gpu.upload("target", &b).expect("upload");
+            let weight = gpu.upload("weight", &weights(size)).expect("upload");
+            let losses = gpu.upload("losses", &[UNWRITTEN; 3]).expect("upload");
+            let mut timings = crate::gpu::Timings::default();
+            for _ in 0..10 {
+                let mut rec = gpu.recorder().expect("recorder");
+                stage.forward_backward(&mut rec, &rendered, &target, Some(&weight), &losses, 1);
+                timings.add(&rec.submit().expect("submit").wait().expect("wait"));
+            }
+            println!("{size:?}\n{}", timings.table());
+        }
+    }
+}
