@@ -1,1 +1,3 @@
 //! Scalar functions that the CPU twins share.
+
+pub mod adam;

@@ -1,1 +1,4 @@
 //! Adam and its schedules.
+
+pub mod adam;
+pub mod schedule;
