@@ -1,11 +1,10 @@
 //! Adam over flat float arrays.
 //!
 //! The second moment `v` is kept as its square root `r`: `r' = hypot(sqrt(beta2) r, sqrt(1 - beta2) |g|)`, where the
-//! hypotenuse is formed from the ratio of its sides. With `v` itself, `g * g` is zero in float32 below |g| = 1e-23 and
-//! loses digits below 1e-19, so that the update `m / (sqrt(v) + 1e-15)` of a gradient of 1e-22 would be ten million
-//! times too large... bounded only by epsilon; above 1e19 it overflows and the parameter would stop for ever. In this
-//! form an update differs from the float64 one by float32 roundings (relative 1e-6) for every gradient from 1e-37 to
-//! 1e37; smaller ones are drowned by epsilon (an update below `rate * 1e-21`), larger ones may overflow.
+//! hypotenuse is formed from the ratio of its sides. Float32 flushes `(1 - beta2) g^2` below |g| = 3e-18, which is 0.3 %
+//! of epsilon, and overflows above 5e20, whereupon the parameter would never move again. In this form an update differs
+//! from the float64 one by float32 roundings (relative 1e-6) for every gradient from 1e-36 to 1e37; below, epsilon drowns
+//! what is lost (an update of at most `rate * 1e-20`), above, sums may overflow.
 
 use crate::gpu::kernels::optimizer::adam;
 use crate::gpu::{Buffer, Check, Recorder, Reference};
@@ -48,12 +47,14 @@ impl Config {
     }
 }
 
-const ELEMENTS: u32 = 8;
+/// Vectors per thread, threads of a group: the kernel's.
+const VECTORS: u32 = 4;
 const GROUP: u32 = 64;
 
-/// Threads for `n` elements.
-fn threads(n: u32) -> u32 {
-    n.div_ceil(GROUP * ELEMENTS) * GROUP
+/// Threads for the vectors that the range touches.
+fn threads(offset: u32, n: u32) -> u32 {
+    let vectors = (offset + n).div_ceil(4) - offset / 4;
+    if n == 0 { 0 } else { vectors.div_ceil(GROUP * VECTORS) * GROUP }
 }
 
 impl Reference for adam::Kernel {
@@ -71,14 +72,11 @@ impl Reference for adam::Kernel {
             correction: push.correction.into(),
             root_correction: push.root_correction.into(),
         };
+        let [value, first, root] = [host.value, host.first, host.root].map(|v| v.as_flattened_mut());
         for i in push.offset as usize..(push.offset + push.n) as usize {
-            let old = math::adam::State {
-                value: host.value[i].into(),
-                first: host.first[i].into(),
-                root: host.root[i].into(),
-            };
-            let new = math::adam::step(old, host.gradient[i].into(), &factors);
-            (host.value[i], host.first[i], host.root[i]) = (new.value as f32, new.first as f32, new.root as f32);
+            let old = math::adam::State { value: value[i].into(), first: first[i].into(), root: root[i].into() };
+            let new = math::adam::step(old, host.gradient.as_flattened()[i].into(), &factors);
+            (value[i], first[i], root[i]) = (new.value as f32, new.first as f32, new.root as f32);
         }
     }
 
@@ -119,8 +117,9 @@ pub fn record(
     for tensor in [value, gradient, first, root] {
         assert!(end <= tensor.len(), "elements {offset} .. {end} of {tensor:?}");
     }
-    let buffers = adam::Buffers { overflow, gradient, value, first, root };
-    rec.run(adam::Kernel, buffers, config.push(step, rate, offset, n), threads(n));
+    let [value, gradient, first, root] = [value, gradient, first, root].map(Buffer::view::<[f32; 4]>);
+    let buffers = adam::Buffers { overflow, gradient: &gradient, value: &value, first: &first, root: &root };
+    rec.run(adam::Kernel, buffers, config.push(step, rate, offset, n), threads(offset, n));
 }
 
 #[cfg(test)]
@@ -131,9 +130,12 @@ mod tests {
     use super::*;
     use crate::gpu::{Options, testing};
 
+    /// `n` elements in whole vectors.
     fn case(n: usize, seed: u64) -> adam::Arrays {
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
-        let mut values = |low: f32, high: f32| (0..n).map(|_| rng.random_range(low..high)).collect::<Vec<f32>>();
+        let mut values = |low: f32, high: f32| {
+            (0..n.div_ceil(4)).map(|_| std::array::from_fn(|_| rng.random_range(low..high))).collect()
+        };
         adam::Arrays {
             overflow: vec![0],
             value: values(-2.0, 2.0),
@@ -146,10 +148,10 @@ mod tests {
     #[test]
     fn matches_its_twin() {
         let gpu = testing::gpu();
-        for n in [0, 1, 63, 64, 65, 511, 512, 513, 1000, 10_007] {
-            for (step, offset) in [(1, 0), (7, 0), (30_000, 0), (2, n / 3)] {
-                let push = Config::default().push(step, 0.0075, offset as u32, (n - offset) as u32 / 2);
-                testing::assert_twin(adam::Kernel, &gpu, case(n, 5), push, threads(push.n));
+        for n in [0, 1, 63, 64, 65, 1023, 1024, 1025, 10_007] {
+            for (step, offset, count) in [(1, 0, n), (7, n / 3, n / 2), (30_000, n / 2, n - n / 2), (2, n / 4, 0)] {
+                let push = Config::default().push(step, 0.0075, offset, count);
+                testing::assert_twin(adam::Kernel, &gpu, case(n as usize, 5), push, threads(offset, count));
             }
         }
     }
@@ -160,7 +162,7 @@ mod tests {
         let mut before = case(100, 9);
         before.overflow[0] = 3;
         let push = Config::default().push(1, 0.1, 0, 100);
-        let after = testing::run_once::<adam::Kernel>(&gpu, &before, push, threads(100));
+        let after = testing::run_once::<adam::Kernel>(&gpu, &before, push, threads(0, 100));
         assert_eq!((after.value, after.first, after.root), (before.value, before.first, before.root));
     }
 
@@ -168,19 +170,22 @@ mod tests {
     #[test]
     fn extreme_gradients_stay_finite_and_right() {
         let gpu = testing::gpu();
-        let magnitudes = [0.0, 1e-38, 1e-37, 1e-30, 1e-23, 1e-19, 1e-15, 1e-9, 1.0, 1e9, 1e19, 1e30, 1e37];
+        let magnitudes: [f32; 14] =
+            [0.0, 1e-38, 1e-36, 1e-30, 1e-23, 1e-21, 1e-18, 1e-15, 1e-9, 1.0, 1e9, 1e19, 1e30, 1e37];
         let n = 2 * magnitudes.len();
+        let gradient: Vec<f32> = magnitudes.iter().flat_map(|&m| [m, -m]).collect();
+        let zeros = vec![[0.0; 4]; n / 4];
         let mut arrays = adam::Arrays {
             overflow: vec![0],
-            gradient: magnitudes.iter().flat_map(|&m| [m, -m]).collect(),
-            value: vec![0.0; n],
-            first: vec![0.0; n],
-            root: vec![0.0; n],
+            gradient: bytemuck::cast_vec(gradient.clone()),
+            value: zeros.clone(),
+            first: zeros.clone(),
+            root: zeros,
         };
         let mut exact = vec![math::adam::State::default(); n];
         for step in 1..=20 {
             let push = Config::default().push(step, 1.0, 0, n as u32);
-            arrays = testing::run_once::<adam::Kernel>(&gpu, &arrays, push, threads(push.n));
+            arrays = testing::run_once::<adam::Kernel>(&gpu, &arrays, push, threads(0, push.n));
             let (b1, b2): (f64, f64) = (0.9, 0.999);
             let factors = math::adam::Factors {
                 rate: 1.0,
@@ -193,15 +198,11 @@ mod tests {
                 root_correction: (1.0 / (1.0 - b2.powi(step as i32))).sqrt(),
             };
             for (i, state) in exact.iter_mut().enumerate() {
-                *state = math::adam::step(*state, arrays.gradient[i].into(), &factors);
-                let (got, want) = (f64::from(arrays.value[i]), state.value);
-                // At most `step` updates of at most 1e-21 where the moments leave float32, 1e-6 of each elsewhere.
-                let bound = 1e-6 * want.abs() + f64::from(step) * 1e-21;
-                assert!(
-                    (got - want).abs() <= bound,
-                    "gradient {:e}, step {step}: {got:e}, {want:e}",
-                    arrays.gradient[i]
-                );
+                *state = math::adam::step(*state, gradient[i].into(), &factors);
+                let (got, want) = (f64::from(arrays.value.as_flattened()[i]), state.value);
+                // At most `step` updates of at most 1e-20 where the moments leave float32, 1e-6 of each elsewhere.
+                let bound = 1e-6 * want.abs() + f64::from(step) * 1e-20;
+                assert!((got - want).abs() <= bound, "gradient {:e}, step {step}: {got:e}, {want:e}", gradient[i]);
             }
         }
     }
@@ -213,7 +214,7 @@ mod tests {
         let n = 3_400_000;
         let mut arrays = case(n, 1);
         let buffers = [&arrays.value, &arrays.gradient, &arrays.first, &arrays.root]
-            .map(|a| gpu.upload("adam", a).expect("memory for the test"));
+            .map(|a| gpu.upload("adam", a.as_flattened()).expect("memory for the test"));
         let [value, gradient, first, root] = &buffers;
         let overflow = gpu.upload("overflow", &[0u32]).expect("memory for the test");
         let tensors = Tensors { value, gradient, first, root };
@@ -232,10 +233,10 @@ mod tests {
             adam::Kernel::reference(adam::Host { overflow, gradient, value, first, root }, push, ());
         }
         for (buffer, want) in [(value, &arrays.value), (first, &arrays.first), (root, &arrays.root)] {
-            let [got, want] = [gpu.read(buffer).expect("readable"), want.clone()]
-                .map(|v| v.into_iter().map(f64::from).collect::<Vec<_>>());
-            let difference =
-                crate::gpu::Difference::of("adam", buffer.name(), &got, &want, adam::Kernel::check("value"));
+            let widen = |v: &[f32]| v.iter().copied().map(f64::from).collect::<Vec<_>>();
+            let (got, want) = (widen(&gpu.read(buffer).expect("readable")), widen(want.as_flattened()));
+            let check = adam::Kernel::check("value");
+            let difference = crate::gpu::Difference::of("adam", buffer.name(), &got, &want, check);
             assert!(difference.ok(), "{difference}");
         }
     }
