@@ -11,9 +11,10 @@ use super::device::{Gpu, Inner};
 use super::error::{Error, Named};
 use super::hazards::Id;
 
-/// A typed array on the device. Freed when dropped, after the work in flight has ended.
+/// A typed array on the device. Freed when it and its views are dropped, after the work in flight has ended.
 pub struct Buffer<T> {
-    memory: Memory,
+    memory: Arc<Memory>,
+    bytes: u64,
     len: usize,
     element: PhantomData<fn() -> T>,
 }
@@ -52,7 +53,15 @@ impl<T: bytemuck::Pod> Buffer<T> {
     }
     /// Bytes of device memory.
     pub fn bytes(&self) -> u64 {
-        self.memory.bytes
+        self.bytes
+    }
+    /// The same memory as an array of `U`, for instance vectors as their components. Elements of up to 16 bytes may end
+    /// in the padding behind the last element of `T`.
+    pub fn view<U: bytemuck::Pod>(&self) -> Buffer<U> {
+        let len = (self.len * size_of::<T>()).div_ceil(size_of::<U>());
+        let bytes = ((len * size_of::<U>()) as u64).max(4);
+        assert!(bytes <= self.memory.bytes, "{}: no {len} elements of {} bytes", self.name(), size_of::<U>());
+        Buffer { memory: self.memory.clone(), bytes, len, element: PhantomData }
     }
     /// The name given at creation.
     pub fn name(&self) -> &'static str {
@@ -60,19 +69,21 @@ impl<T: bytemuck::Pod> Buffer<T> {
     }
     /// The buffer without its type.
     pub fn slot(&self) -> Slot {
-        Slot { raw: self.memory.raw, bytes: self.memory.bytes, name: self.memory.name }
+        Slot { raw: self.memory.raw, bytes: self.bytes, name: self.memory.name }
     }
     /// Host view of memory the host can see: of [`Gpu::readback`] buffers only.
     pub(super) fn mapped(&self) -> Option<&[u8]> {
         self.memory.allocation.as_ref().and_then(Allocation::mapped_slice)
     }
     /// The parts, without the Arc of the device; the caller frees them with [`Inner::discard`].
-    pub(super) fn into_parts(mut self) -> (vk::Buffer, Allocation) {
-        let allocation = self.memory.allocation.take().expect("a buffer owns its memory until it is dropped");
-        (self.memory.raw, allocation)
+    pub(super) fn into_parts(self) -> (vk::Buffer, Allocation) {
+        let mut memory = Arc::into_inner(self.memory).expect("a buffer without views");
+        let allocation = memory.allocation.take().expect("a buffer owns its memory until it is dropped");
+        (memory.raw, allocation)
     }
     fn mapped_mut(&mut self) -> Option<&mut [u8]> {
-        self.memory.allocation.as_mut().and_then(Allocation::mapped_slice_mut)
+        let memory = Arc::get_mut(&mut self.memory)?;
+        memory.allocation.as_mut().and_then(Allocation::mapped_slice_mut)
     }
 }
 
@@ -180,7 +191,9 @@ impl Gpu {
             | vk::BufferUsageFlags::TRANSFER_SRC
             | vk::BufferUsageFlags::TRANSFER_DST
             | vk::BufferUsageFlags::INDIRECT_BUFFER;
-        let info = vk::BufferCreateInfo::default().size(bytes).usage(usage);
+        // Padded, so that a view as 16-byte vectors reaches the last element.
+        let padded = bytes.next_multiple_of(16);
+        let info = vk::BufferCreateInfo::default().size(padded).usage(usage);
         // SAFETY: the device outlives the buffer (the buffer holds an Arc of it), and the memory is bound before use.
         let (raw, requirements) = unsafe {
             let raw = inner.device.create_buffer(&info, None).named("creating a buffer")?;
@@ -205,8 +218,8 @@ impl Gpu {
         unsafe { inner.device.bind_buffer_memory(raw, allocation.memory(), allocation.offset()) }
             .named("binding a buffer's memory")?;
         inner.name_object(raw, name);
-        let memory = Memory { raw, bytes, name, allocation: Some(allocation), gpu: inner.clone() };
-        Ok(Buffer { memory, len, element: PhantomData })
+        let memory = Memory { raw, bytes: padded, name, allocation: Some(allocation), gpu: inner.clone() };
+        Ok(Buffer { memory: Arc::new(memory), bytes, len, element: PhantomData })
     }
 }
 

@@ -1,5 +1,6 @@
 //! Scalar functions that the CPU twins share.
 
+pub mod adam;
 pub mod camera;
 pub mod decoder;
 pub mod ssim;

@@ -1,5 +1,7 @@
 //! Adam and its schedules.
 
+pub mod adam;
 pub mod config;
+pub mod schedule;
 
 pub use config::Config;
