@@ -1,7 +1,9 @@
 #version 460
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_GOOGLE_include_directive : require
-// Gradients of `project`. A coordinate at which the Jacobian's point was clamped has no gradient through the covariance.
+// variant color: COLOR_ONLY
+//
+// Gradients of `project`; `color` for losses that do not look at depth. A coordinate at which the Jacobian's point was clamped has no gradient through the covariance.
 layout(local_size_x = 64) in;
 #include "thread.glsl"
 #include "camera.glsl"
@@ -12,10 +14,12 @@ layout(binding = 3, scalar) readonly buffer Rotation { vec4 rotation[]; };      
 layout(binding = 4, scalar) readonly buffer Depth { float depth[]; };                       // [slot] of `project`: 0 where there is no Gaussian
 layout(binding = 5, scalar) readonly buffer GradMean { vec2 grad_mean[]; };                 // [slot] per px
 layout(binding = 6, scalar) readonly buffer GradCovariance { vec3 grad_covariance[]; };     // [slot] of xx, xy (both entries together), yy
-layout(binding = 7, scalar) readonly buffer GradDepth { float grad_depth[]; };              // [slot]
-layout(binding = 8, scalar) writeonly buffer GradPosition { vec3 grad_position[]; };        // [slot] 0 where there is no Gaussian
-layout(binding = 9, scalar) writeonly buffer GradScale { vec3 grad_scale[]; };              // [slot] likewise
-layout(binding = 10, scalar) writeonly buffer GradRotation { vec4 grad_rotation[]; };       // [slot] of the quaternion as given, likewise
+layout(binding = 7, scalar) writeonly buffer GradPosition { vec3 grad_position[]; };        // [slot] 0 where there is no Gaussian
+layout(binding = 8, scalar) writeonly buffer GradScale { vec3 grad_scale[]; };              // [slot] likewise
+layout(binding = 9, scalar) writeonly buffer GradRotation { vec4 grad_rotation[]; };       // [slot] of the quaternion as given, likewise
+#ifndef COLOR_ONLY
+layout(binding = 10, scalar) readonly buffer GradDepth { float grad_depth[]; };              // [slot]
+#endif
 layout(push_constant, scalar) uniform Push {
   vec3 rotation0;    // first row of R, world to camera
   vec3 rotation1;    // second row
@@ -71,7 +75,10 @@ void main() {
   vec3 e0 = j0 * (camera.lens.x * inverse_z), e1 = j1 * (camera.lens.y * inverse_z);
   vec3 gd = vec3(e0.x - e0.z * at.x, (e0.y - e0.z * at.y) + (e1.x - e1.z * at.x), e1.y - e1.z * at.y);
   vec2 g_at = -vec2(e0.z * d.x + e1.z * d.y, e0.z * d.y + e1.z * d.z) + distort_jacobian_backward(camera.distortion, at, gd);
-  float gz = grad_depth[slot] - (dot(j0, row0) + dot(j1, row1)) * inverse_z;
+  float gz = -(dot(j0, row0) + dot(j1, row1)) * inverse_z;
+#ifndef COLOR_ONLY
+  gz += grad_depth[slot];
+#endif
 
   vec3 m = distort_jacobian(camera.distortion, xy);
   vec2 gm = grad_mean[slot] * camera.lens.xy;

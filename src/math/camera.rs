@@ -6,31 +6,9 @@
 /// Added to the diagonal of a projected covariance, px^2: the low-pass of 3D Gaussian Splatting.
 pub const DILATION: f64 = 0.3;
 
-/// A photograph's camera.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Camera {
-    /// World to camera, rows.
-    pub rotation: [[f32; 3]; 3],
-    /// World to camera.
-    pub translation: [f32; 3],
-    /// px.
-    pub focal: [f32; 2],
-    /// px; the centre of the first pixel is (0.5, 0.5).
-    pub principal: [f32; 2],
-    /// k1 k2 p1 p2 of COLMAP's OPENCV model.
-    pub distortion: [f32; 4],
-    /// Width, height in px.
-    pub size: [u32; 2],
-}
+pub use crate::scene::Camera;
 
 impl Camera {
-    /// Camera centre in the world, `-R^T t`.
-    pub fn center(&self) -> [f32; 3] {
-        let r = self.rotation.map(|row| row.map(f64::from));
-        let t = self.translation.map(f64::from);
-        std::array::from_fn(|i| -(r[0][i] * t[0] + r[1][i] * t[1] + r[2][i] * t[2]) as f32)
-    }
-
     /// Lowest x, y and highest x, y (normalised, undistorted) of the point at which the Jacobian is taken: the image
     /// and 30 % of half the field of view on each side.
     pub fn limits(&self) -> [f32; 4] {

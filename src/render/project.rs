@@ -4,7 +4,7 @@
 //! near plane, where its centre lies beyond the radius at which the lens polynomial folds back
 //! ([`Camera::max_radius2`]), or where the result is not finite.
 
-use crate::gpu::kernels::render::{project, project_backward};
+use crate::gpu::kernels::render::{project, project_backward, project_backward_color};
 use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
 use crate::math::camera::{Camera, Lens, Splat};
 use crate::math::camera::{project as project_one, project_backward as project_one_backward};
@@ -97,30 +97,40 @@ impl Reference for project::Kernel {
     }
 }
 
-impl Reference for project_backward::Kernel {
-    fn reference(host: project_backward::Host<'_>, push: project_backward::Push, (): ()) {
-        let lens: Lens = lens!(push);
-        for s in 0..(host.groups[3] * push.offsets) as usize {
-            let mut grad = crate::math::camera::GaussianGradient::default();
-            if host.depth[s] > 0.0 {
-                let bounds = lens.bounds(lens.to_camera_f32(host.position[s]));
-                let [position, scale, covariance] =
-                    [host.position[s], host.scale[s], host.grad_covariance[s]].map(|v| v.map(f64::from));
-                let upstream =
-                    Splat { mean: host.grad_mean[s].map(f64::from), covariance, depth: host.grad_depth[s].into() };
-                let rotation = host.rotation[s].map(f64::from);
-                grad = project_one_backward(&lens, position, scale, rotation, bounds, upstream);
+macro_rules! backward_twin {
+    ($module:ident $(, $grad_depth:ident)?) => {
+        impl Reference for $module::Kernel {
+            fn reference(host: $module::Host<'_>, push: $module::Push, (): ()) {
+                let lens: Lens = lens!(push);
+                for s in 0..(host.groups[3] * push.offsets) as usize {
+                    let mut grad = crate::math::camera::GaussianGradient::default();
+                    if host.depth[s] > 0.0 {
+                        let bounds = lens.bounds(lens.to_camera_f32(host.position[s]));
+                        let [position, scale, covariance] =
+                            [host.position[s], host.scale[s], host.grad_covariance[s]].map(|v| v.map(f64::from));
+                        let upstream = Splat {
+                            mean: host.grad_mean[s].map(f64::from),
+                            covariance,
+                            $(depth: host.$grad_depth[s].into(),)?
+                            ..Splat::default()
+                        };
+                        let rotation = host.rotation[s].map(f64::from);
+                        grad = project_one_backward(&lens, position, scale, rotation, bounds, upstream);
+                    }
+                    host.grad_position[s] = grad.position.map(|v| v as f32);
+                    host.grad_scale[s] = grad.scale.map(|v| v as f32);
+                    host.grad_rotation[s] = grad.rotation.map(|v| v as f32);
+                }
             }
-            host.grad_position[s] = grad.position.map(|v| v as f32);
-            host.grad_scale[s] = grad.scale.map(|v| v as f32);
-            host.grad_rotation[s] = grad.rotation.map(|v| v as f32);
-        }
-    }
 
-    fn check(binding: &'static str) -> Check {
-        check(if binding == "grad_position" { 4.0 } else { 3.0 })
-    }
+            fn check(binding: &'static str) -> Check {
+                check(if binding == "grad_position" { 4.0 } else { 3.0 })
+            }
+        }
+    };
 }
+backward_twin!(project_backward, grad_depth);
+backward_twin!(project_backward_color);
 
 /// What [`Project::record`] reads: one element per slot.
 #[derive(Clone, Copy)]
@@ -142,8 +152,8 @@ pub struct SplatGradients<'a> {
     pub mean: &'a Buffer<[f32; 2]>,
     /// xx, xy (both entries together), yy; per px^2.
     pub covariance: &'a Buffer<[f32; 3]>,
-    /// Per scene unit.
-    pub depth: &'a Buffer<f32>,
+    /// Per scene unit; without losses that look at depth there is none.
+    pub depth: Option<&'a Buffer<f32>>,
 }
 
 /// The stage: its outputs for `capacity` slots.
@@ -208,20 +218,29 @@ impl Project {
         camera: &Camera,
         near: f32,
     ) {
-        let buffers = project_backward::Buffers {
-            groups: &groups.buffer,
-            position: of.position,
-            scale: of.scale,
-            rotation: of.rotation,
-            depth: &self.depth,
-            grad_mean: grad.mean,
-            grad_covariance: grad.covariance,
-            grad_depth: grad.depth,
-            grad_position: &self.grad_position,
-            grad_scale: &self.grad_scale,
-            grad_rotation: &self.grad_rotation,
-        };
-        rec.run(project_backward::Kernel, buffers, push_backward(camera, near, self.offsets), groups);
+        macro_rules! back {
+            ($module:ident $(, $grad_depth:ident)?) => {{
+                let buffers = $module::Buffers {
+                    groups: &groups.buffer,
+                    position: of.position,
+                    scale: of.scale,
+                    rotation: of.rotation,
+                    depth: &self.depth,
+                    grad_mean: grad.mean,
+                    grad_covariance: grad.covariance,
+                    grad_position: &self.grad_position,
+                    grad_scale: &self.grad_scale,
+                    grad_rotation: &self.grad_rotation,
+                    $($grad_depth,)?
+                };
+                let push = camera_push!($module::Push, camera, near, offsets: self.offsets);
+                rec.run($module::Kernel, buffers, push, groups);
+            }};
+        }
+        match grad.depth {
+            Some(grad_depth) => back!(project_backward, grad_depth),
+            None => back!(project_backward_color),
+        }
     }
 }
 

@@ -736,7 +736,7 @@ mod tests {
                 n,
             );
             let color = rasterize_gather_color::Arrays {
-                slot_count: case.groups,
+                groups: case.groups,
                 tiles: case.tiles,
                 pair_count: vec![0],
                 first_pair: case.first_pair,
