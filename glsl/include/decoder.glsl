@@ -6,6 +6,7 @@ const uint HIDDEN_VEC4 = 24u;      // vec4s of the hidden units of the three hea
 const uint ROW_VEC4 = 8u;          // vec4s of one head's hidden units: a row of the second layer
 const uint FIRST_WEIGHTS = HIDDEN * INPUT + HIDDEN; // of one head, biases included
 const uint FIRST_VEC4 = HEADS * HIDDEN * INPUT_VEC4; // packed first layer; the second one follows, then its biases
+const uint TILE = 8u;              // anchors of a thread: each load of a weight serves so many products
 const uint BLOCK = 64u;            // anchors of the smallest chunk of a weight gradient
 const uint CHUNKS = 1024u;         // chunks at most
 
@@ -20,6 +21,25 @@ uint head_weights(uint head, uint offsets) {
 // First padded output row of a head; of head 3: the number of rows.
 uint head_row(uint head, uint offsets) {
   return (head > 0u ? padded(offsets) : 0u) + (head > 1u ? padded(3u * offsets) : 0u) + (head > 2u ? padded(7u * offsets) : 0u);
+}
+// vec4s of all packed weights: first layer with its biases, second layer, its biases.
+uint packed_weights(uint offsets) { return FIRST_VEC4 + head_row(3u, offsets) * (ROW_VEC4 * 4u + 1u) / 4u; }
+const uint PADDING = ~0u;
+// The model's weight at component c of packed vec4 i; PADDING where there is none.
+uint weight_at(uint i, uint c, uint offsets) {
+  if (i < FIRST_VEC4) {
+    uint unit = i / INPUT_VEC4, column = 4u * (i % INPUT_VEC4) + c, from = head_weights(unit / HIDDEN, offsets);
+    unit %= HIDDEN;
+    return column > INPUT ? PADDING : from + (column < INPUT ? unit * INPUT + column : HIDDEN * INPUT + unit);
+  }
+  i -= FIRST_VEC4;
+  uint rows = head_row(3u, offsets);
+  bool matrix = i < rows * ROW_VEC4;
+  uint row = matrix ? i / ROW_VEC4 : 4u * (i - rows * ROW_VEC4) + c;
+  uint head = row < head_row(1u, offsets) ? 0u : row < head_row(2u, offsets) ? 1u : 2u;
+  uint outputs = per_gaussian(head) * offsets, from = head_weights(head, offsets) + FIRST_WEIGHTS;
+  row -= head_row(head, offsets);
+  return row >= outputs ? PADDING : from + (matrix ? row * HIDDEN + 4u * (i % ROW_VEC4) + c : outputs * HIDDEN + row);
 }
 // Anchors of one chunk of a weight gradient.
 uint chunk_anchors(uint anchors) { return BLOCK * max(1u, (anchors + BLOCK * CHUNKS - 1u) / (BLOCK * CHUNKS)); }

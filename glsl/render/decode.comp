@@ -2,7 +2,7 @@
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// Neural Gaussians of the visible anchors (Scaffold-GS): second layer and activations. A thread computes one Gaussian of 4 anchors.
+// Neural Gaussians of the visible anchors (Scaffold-GS): second layer and activations. A thread computes one Gaussian of TILE anchors.
 layout(local_size_x = 64) in;
 layout(constant_id = 0) const uint OFFSETS = 10u; // Gaussians per anchor
 #include "thread.glsl"
@@ -27,34 +27,34 @@ float bias(uint row) {
 }
 void main() {
   uint t = thread_index(), n = groups[3];
-  uint k = t % OFFSETS, v = 4u * (t / OFFSETS);
+  uint k = t % OFFSETS, v = TILE * (t / OFFSETS);
   if (v >= n) return;
   uint color_row = head_row(1u, OFFSETS) + 3u * k, cov_row = head_row(2u, OFFSETS) + 7u * k;
-  float o[4], c[12], q[28];
-  [[unroll]] for (uint a = 0u; a < 4u; ++a) {
+  float o[TILE], c[3u * TILE], q[7u * TILE];
+  [[unroll]] for (uint a = 0u; a < TILE; ++a) {
     o[a] = bias(k);
     [[unroll]] for (uint i = 0u; i < 3u; ++i) c[3u * a + i] = bias(color_row + i);
     [[unroll]] for (uint i = 0u; i < 7u; ++i) q[7u * a + i] = bias(cov_row + i);
   }
-  uint from[4];
-  [[unroll]] for (uint a = 0u; a < 4u; ++a) from[a] = min(v + a, n - 1u) * HIDDEN_VEC4;
+  uint from[TILE];
+  [[unroll]] for (uint a = 0u; a < TILE; ++a) from[a] = min(v + a, n - 1u) * HIDDEN_VEC4;
   for (uint j = 0u; j < ROW_VEC4; ++j) {
-    vec4 h[4];
-    [[unroll]] for (uint a = 0u; a < 4u; ++a) h[a] = hidden[from[a] + j];
+    vec4 h[TILE];
+    [[unroll]] for (uint a = 0u; a < TILE; ++a) h[a] = hidden[from[a] + j];
     vec4 w = packed[FIRST_VEC4 + k * ROW_VEC4 + j];
-    [[unroll]] for (uint a = 0u; a < 4u; ++a) o[a] = dot_add(o[a], h[a], w);
-    [[unroll]] for (uint a = 0u; a < 4u; ++a) h[a] = hidden[from[a] + ROW_VEC4 + j];
+    [[unroll]] for (uint a = 0u; a < TILE; ++a) o[a] = dot_add(o[a], h[a], w);
+    [[unroll]] for (uint a = 0u; a < TILE; ++a) h[a] = hidden[from[a] + ROW_VEC4 + j];
     [[unroll]] for (uint i = 0u; i < 3u; ++i) {
       w = packed[FIRST_VEC4 + (color_row + i) * ROW_VEC4 + j];
-      [[unroll]] for (uint a = 0u; a < 4u; ++a) c[3u * a + i] = dot_add(c[3u * a + i], h[a], w);
+      [[unroll]] for (uint a = 0u; a < TILE; ++a) c[3u * a + i] = dot_add(c[3u * a + i], h[a], w);
     }
-    [[unroll]] for (uint a = 0u; a < 4u; ++a) h[a] = hidden[from[a] + 2u * ROW_VEC4 + j];
+    [[unroll]] for (uint a = 0u; a < TILE; ++a) h[a] = hidden[from[a] + 2u * ROW_VEC4 + j];
     [[unroll]] for (uint i = 0u; i < 7u; ++i) {
       w = packed[FIRST_VEC4 + (cov_row + i) * ROW_VEC4 + j];
-      [[unroll]] for (uint a = 0u; a < 4u; ++a) q[7u * a + i] = dot_add(q[7u * a + i], h[a], w);
+      [[unroll]] for (uint a = 0u; a < TILE; ++a) q[7u * a + i] = dot_add(q[7u * a + i], h[a], w);
     }
   }
-  [[unroll]] for (uint a = 0u; a < 4u; ++a) {
+  [[unroll]] for (uint a = 0u; a < TILE; ++a) {
     if (v + a >= n) return;
     uint slot = (v + a) * OFFSETS + k, anchor = visible[v + a], l = 6u * anchor;
     vec3 spread = exp(vec3(log_scaling[l], log_scaling[l + 1u], log_scaling[l + 2u]));

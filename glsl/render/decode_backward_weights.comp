@@ -13,34 +13,22 @@ layout(binding = 1, scalar) readonly buffer First { vec4 first[]; };            
 layout(binding = 2, scalar) readonly buffer Second { vec4 second[]; };              // of decode_backward_second
 layout(binding = 3, scalar) writeonly buffer GradWeights { float grad_weights[]; }; // [W] every one is written
 void main() {
-  uint w = thread_index();
-  if (w >= head_weights(3u, OFFSETS)) return;
-  uint head = w < head_weights(1u, OFFSETS) ? 0u : w < head_weights(2u, OFFSETS) ? 1u : 2u;
-  uint at = w - head_weights(head, OFFSETS), rows = head_row(3u, OFFSETS), outputs = per_gaussian(head) * OFFSETS;
-  bool in_first = at < FIRST_WEIGHTS;
-  uint element, stride;
-  if (in_first) {
-    bool matrix = at < HIDDEN * INPUT;
-    uint unit = matrix ? at / INPUT : at - HIDDEN * INPUT, column = matrix ? at % INPUT : INPUT;
-    element = (head * HIDDEN + unit) * 4u * INPUT_VEC4 + column;
-    stride = FIRST_VEC4;
-  } else {
-    at -= FIRST_WEIGHTS;
-    bool matrix = at < outputs * HIDDEN;
-    uint row = head_row(head, OFFSETS) + (matrix ? at / HIDDEN : at - outputs * HIDDEN);
-    element = matrix ? row * HIDDEN + at % HIDDEN : rows * HIDDEN + row;
-    stride = rows * ROW_VEC4 + rows / 4u;
-  }
+  uint i = thread_index();
+  if (i >= packed_weights(OFFSETS)) return;
   uint n = groups[3], chunk = chunk_anchors(n), chunks = (n + chunk - 1u) / chunk;
-  uint at4 = element / 4u, component = element % 4u;
-  float total = 0.0;
+  bool in_first = i < FIRST_VEC4;
+  uint at = in_first ? i : i - FIRST_VEC4, stride = in_first ? FIRST_VEC4 : packed_weights(OFFSETS) - FIRST_VEC4;
+  vec4 total = vec4(0.0);
   for (uint begin = 0u; begin < chunks; begin += 32u) {
-    float run = 0.0;
+    vec4 run = vec4(0.0);
     for (uint c = begin; c < min(begin + 32u, chunks); ++c) {
-      if (in_first) run += first[c * stride + at4][component];
-      else run += second[c * stride + at4][component];
+      if (in_first) run += first[c * stride + at];
+      else run += second[c * stride + at];
     }
     total += run;
   }
-  grad_weights[w] = total;
+  for (uint c = 0u; c < 4u; ++c) {
+    uint w = weight_at(i, c, OFFSETS);
+    if (w != PADDING) grad_weights[w] = total[c];
+  }
 }

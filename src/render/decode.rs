@@ -1,7 +1,7 @@
 //! Visible anchors into neural Gaussians (Scaffold-GS, section 3.2), and the gradients back to the model.
 //!
 //! Both layers and all their gradients are matrix products in which a thread holds a tile of the result in registers
-//! (8 units of 4 anchors, 8 by 8 weights), so that a load serves several products. Activations are kept from the
+//! (8 units of 8 anchors, 8 by 8 weights), so that a load serves several products. Activations are kept from the
 //! forward pass: 40 + 96 values per visible anchor, 11 K padded to heads of 8 more for the backward pass; at K = 10
 //! each of these buffers stays below 128 MiB up to 270,000 visible anchors.
 //!
@@ -21,6 +21,8 @@ use crate::primitives::dispatch;
 
 /// Threads of a workgroup of all kernels here.
 const GROUP: u32 = 64;
+/// Anchors of a thread in the kernels that multiply with the weights, where a weight's row has 12 or K threads.
+const TILE: u32 = 8;
 /// vec4s of a padded input, of the hidden units.
 const INPUT_VEC4: usize = Layout::PADDED_INPUT / 4;
 const HIDDEN_VEC4: usize = HEADS * HIDDEN / 4;
@@ -395,7 +397,6 @@ pub struct Decode {
     hidden: Buffer<[f32; 4]>,
     per_anchor: Counted,
     per_tile: Counted,
-    per_offset: Counted,
     layout: Layout,
     capacity: u32,
 }
@@ -436,8 +437,7 @@ impl Decode {
             inputs: gpu.buffer("inputs", anchors * INPUT_VEC4)?,
             hidden: gpu.buffer("hidden", anchors * HIDDEN_VEC4)?,
             per_anchor: Counted::new(gpu, "decode groups", 1)?,
-            per_tile: Counted::new(gpu, "decode tile groups", threads_per_item(12, 4))?,
-            per_offset: Counted::new(gpu, "decode offset groups", threads_per_item(offsets, 4))?,
+            per_tile: Counted::new(gpu, "decode tile groups", threads_per_item(offsets.max(12), TILE))?,
             layout,
             capacity,
         })
@@ -446,7 +446,7 @@ impl Decode {
     /// Records the decoding of the first `visible_count` anchors of the visible list for a camera centre (world).
     /// More than the capacity are not decoded.
     pub fn record(&self, rec: &mut Recorder<'_>, anchors: Anchors<'_>, visible_count: &Buffer<u32>, center: [f32; 3]) {
-        for counted in [&self.per_anchor, &self.per_tile, &self.per_offset] {
+        for counted in [&self.per_anchor, &self.per_tile] {
             counted.record(rec, visible_count, self.capacity);
         }
         let offsets = self.layout.offsets as u32;
@@ -469,7 +469,6 @@ impl Decode {
             hidden: &self.hidden,
         };
         rec.run_with(decode_hidden::Kernel, decode_hidden::Constants { offsets }, buffers, (), groups);
-        let groups = &self.per_offset.groups;
         let buffers = decode::Buffers {
             groups: &groups.buffer,
             visible: anchors.visible,
@@ -586,7 +585,7 @@ impl DecodeBackward {
             grad_weights: to.weights,
         };
         let constants = decode_backward_weights::Constants { offsets };
-        rec.run_with(decode_backward_weights::Kernel, constants, buffers, (), forward.layout.weights());
+        rec.run_with(decode_backward_weights::Kernel, constants, buffers, (), forward.layout.packed());
     }
 }
 
@@ -693,7 +692,7 @@ mod tests {
                 hidden: unwritten(count * HIDDEN_VEC4 + 3),
             };
             let constants = decode_hidden::Constants { offsets: k };
-            let hidden = twin(decode_hidden::Kernel, &gpu, constants, case, (), count.div_ceil(4) * 12).hidden;
+            let hidden = twin(decode_hidden::Kernel, &gpu, constants, case, (), count.div_ceil(8) * 12).hidden;
             let case = decode::Arrays {
                 groups: m.counted(),
                 visible: m.visible.clone(),
@@ -710,7 +709,7 @@ mod tests {
                 rotation_norm: vec![testing::UNWRITTEN; slots + 3],
             };
             let constants = decode::Constants { offsets: k };
-            let forward = twin(decode::Kernel, &gpu, constants, case, (), count.div_ceil(4) * offsets);
+            let forward = twin(decode::Kernel, &gpu, constants, case, (), count.div_ceil(8) * offsets);
 
             let case = decode_backward::Arrays {
                 groups: m.counted(),
@@ -741,7 +740,7 @@ mod tests {
                 grad_hidden: unwritten(count * HIDDEN_VEC4 + 3),
             };
             let constants = decode_backward_hidden::Constants { offsets: k };
-            let threads = count.div_ceil(4) * 12;
+            let threads = count.div_ceil(8) * 12;
             let grad_hidden = twin(decode_backward_hidden::Kernel, &gpu, constants, case, (), threads).grad_hidden;
             let case = decode_backward_feature::Arrays {
                 groups: m.counted(),
@@ -774,7 +773,7 @@ mod tests {
                 grad_weights: vec![testing::UNWRITTEN; layout.weights() + 3],
             };
             let constants = decode_backward_weights::Constants { offsets: k };
-            twin(decode_backward_weights::Kernel, &gpu, constants, case, (), layout.weights());
+            twin(decode_backward_weights::Kernel, &gpu, constants, case, (), layout.packed());
         }
     }
 
@@ -952,9 +951,9 @@ mod tests {
     #[test]
     fn groups_cover_every_tile() {
         assert_eq!([threads_per_item(1, 1), threads_per_item(4, 4)], [1, 1]);
-        for (per, tile) in [(12, 4), (10, 4), (5, 4), (1, 4), (20, 4), (33, 4)] {
+        for (per, tile) in [(12, 8), (10, 8), (5, 8), (1, 8), (20, 8), (33, 8), (12, 4)] {
             let f = threads_per_item(per, tile);
-            assert!(f <= per.div_ceil(tile) + 1, "{f} threads for {per} per {tile}");
+            assert!(f <= per.div_ceil(tile) * 2, "{f} threads for {per} per {tile}");
             for n in 0..5000u32 {
                 assert!((n * f).next_multiple_of(GROUP) >= n.div_ceil(tile) * per);
             }
