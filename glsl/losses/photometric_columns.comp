@@ -7,11 +7,11 @@
 #include "ssim.glsl"
 // variant weighted: WEIGHTED
 // SSIM's moments along columns, SSIM, its part of the loss, and the loss's derivatives by the window's mean of the
-// rendered values, their second moment and the mixed second moment.
+// rendered values, the sum of both second moments about 1/2, and the second moment of the difference.
 const int RUN = 8;
 layout(local_size_x = 64) in;
 layout(binding = 0, scalar) readonly buffer Moments { vec4 moments[]; };   // [pixel * 3] of `photometric_rows`
-layout(binding = 1, scalar) writeonly buffer GradMoments { vec3 grad_moments[]; }; // [pixel * 3] by the mean, the second moment, the mixed second moment, about 1/2
+layout(binding = 1, scalar) writeonly buffer GradMoments { vec3 grad_moments[]; }; // [pixel * 3] of the loss by these three
 layout(binding = 2, scalar) writeonly buffer Partial { float partial[]; }; // [group] this part of the loss
 #ifdef WEIGHTED
 layout(binding = 3, scalar) readonly buffer Weight { float weight[]; }; // [pixel] weight of the pixel
@@ -35,9 +35,10 @@ void main() {
       int y = start + i;
       vec4 m = vec4(0.0);
       if (y >= 0 && y < height) m = moments[uint(y) * line + x];
-      // Law of total variance: of the rows' variances and means.
+      // Law of total variance: the rows' variances, and their means'.
       vec2 d = m.xy - shift;
-      vec4 term = vec4(d, m.z + dot(d, d), m.w + d.x * d.y);
+      float b = d.x - d.y;
+      vec4 term = vec4(d, m.z + d.x * d.x + b * b, m.w + d.y * d.y);
       [[unroll]] for (int o = 0; o < RUN; ++o) {
         int k = i - o + RADIUS;
         if (k >= 0 && k <= 2 * RADIUS) sums[o] += WINDOW[k] * term;
@@ -47,25 +48,27 @@ void main() {
       if (start + o < height) {
         vec4 s = sums[o];
         uint at = uint(start + o) * line + x;
-        vec2 mean = shift + s.xy;
-        float variances = max(s.z - dot(s.xy, s.xy), 0.0);
-        float covariance = s.w - s.x * s.y;
-        // Both denominators are at least C1 and C2.
-        float inverse1 = 1.0 / (dot(mean, mean) + C1);
-        float inverse2 = 1.0 / (variances + C2);
-        float means = (2.0 * mean.x * mean.y + C1) * inverse1;
-        float structure = (2.0 * covariance + C2) * inverse2;
-        float ssim = means * structure;
-        float by_second = -ssim * inverse2;
-        float by_mixed = 2.0 * means * inverse2;
-        float by_mean = 2.0 * inverse1 * (mean.y * structure - mean.x * ssim);
-        vec3 by = vec3(by_mean - 2.0 * (mean.x - 0.5) * by_second - (mean.y - 0.5) * by_mixed, by_second, by_mixed);
+        float b = s.x - s.y;
+        vec2 variances = max(s.zw - vec2(s.x * s.x + b * b, s.y * s.y), 0.0);
+        float mean = shift.x + s.x;
+        float difference = shift.y + s.y;
+        b = mean - difference;
+        // With u, v = the means' and the structure's distance from one, SSIM = (1 - u)(1 - v): nothing cancels where
+        // the pictures agree. Both denominators are at least C1 and C2.
+        float inverse1 = 1.0 / (mean * mean + b * b + C1);
+        float inverse2 = 1.0 / (variances.x + C2);
+        float u = difference * difference * inverse1;
+        float v = variances.y * inverse2;
+        float by_sum = (1.0 - u) * v * inverse2;
+        float by_difference = (u - 1.0) * inverse2;
+        float by_mean = 2.0 * inverse1 * (1.0 - v) * (mean * u - difference);
+        vec3 by = vec3(by_mean - 2.0 * ((mean - 0.5) * by_sum + difference * by_difference), by_sum, by_difference);
         float scale = push.factor;
 #ifdef WEIGHTED
         scale *= weight[at / 3u];
 #endif
         grad_moments[at] = -scale * by;
-        loss += scale * (1.0 - ssim);
+        loss += scale * (u + v - u * v);
       }
     }
   }

@@ -23,41 +23,47 @@ layout(push_constant, scalar) uniform Push {
   uint first;   // where this part of the loss begins in `partial`
 } push;
 void main() {
-  uint line = push.size.x * 3u;
-  uint t = thread_index();
-  uint x = t % line;
-  int start = int(t / line) * RUN;
+  uint x = thread_index() % push.size.x;
+  int start = int(thread_index() / push.size.x) * RUN;
   int height = int(push.size.y);
   float loss = 0.0;
   if (start < height) {
-    vec3 sums[RUN];
-    [[unroll]] for (int o = 0; o < RUN; ++o) sums[o] = vec3(0.0);
-    [[unroll]] for (int i = -RADIUS; i < RUN + RADIUS; ++i) {
-      int y = start + i;
-      vec3 g = vec3(0.0);
-      if (y >= 0 && y < height) g = grad_rows[uint(y) * line + x];
+    // One channel after the other: its 24 sums stay near, and rgb is read and written whole.
+    vec3 second[RUN], mixed[RUN], grad[RUN];
+    [[unroll]] for (int c = 0; c < 3; ++c) {
+      vec3 sums[RUN];
+      [[unroll]] for (int o = 0; o < RUN; ++o) sums[o] = vec3(0.0);
+      [[unroll]] for (int i = -RADIUS; i < RUN + RADIUS; ++i) {
+        int y = start + i;
+        vec3 g = vec3(0.0);
+        if (y >= 0 && y < height) g = grad_rows[(uint(y) * push.size.x + x) * 3u + c];
+        [[unroll]] for (int o = 0; o < RUN; ++o) {
+          int k = i - o + RADIUS;
+          if (k >= 0 && k <= 2 * RADIUS) sums[o] += WINDOW[k] * g;
+        }
+      }
       [[unroll]] for (int o = 0; o < RUN; ++o) {
-        int k = i - o + RADIUS;
-        if (k >= 0 && k <= 2 * RADIUS) sums[o] += WINDOW[k] * g;
+        grad[o][c] = sums[o].x;
+        second[o][c] = sums[o].y;
+        mixed[o][c] = sums[o].z;
       }
     }
-    uint channel = x % 3u;
     [[unroll]] for (int o = 0; o < RUN; ++o) {
       if (start + o < height) {
-        uint pixel = uint(start + o) * push.size.x + x / 3u;
-        float a = rendered[pixel][channel];
-        float b = target[pixel][channel];
+        uint pixel = uint(start + o) * push.size.x + x;
+        vec3 a = rendered[pixel];
+        vec3 difference = a - target[pixel];
         float scale = push.factor;
 #ifdef WEIGHTED
         scale *= weight[pixel];
 #endif
-        loss += scale * abs(a - b);
-        vec3 s = sums[o];
-        grad_rendered[pixel][channel] = s.x + 2.0 * (a - 0.5) * s.y + (b - 0.5) * s.z + scale * sign(a - b);
+        loss += scale * (abs(difference.r) + abs(difference.g) + abs(difference.b));
+        grad_rendered[pixel] =
+            grad[o] + 2.0 * ((a - 0.5) * second[o] + difference * mixed[o]) + scale * sign(difference);
       }
     }
   }
   float total = group_sum(vec4(loss, 0.0, 0.0, 0.0)).x;
-  uint groups = (line * ((push.size.y + RUN - 1u) / RUN) + 63u) / 64u;
+  uint groups = (push.size.x * ((push.size.y + RUN - 1u) / RUN) + 63u) / 64u;
   if (gl_LocalInvocationID.x == 0u && group_index() < groups) partial[push.first + group_index()] = total;
 }

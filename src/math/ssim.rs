@@ -30,21 +30,24 @@ pub fn blur(centre: usize, len: usize, mut at: impl FnMut(usize) -> f64) -> f64 
     sum
 }
 
-/// Moments of a window: mean of a, mean of b, sum of both variances, covariance.
+/// Moments of a window of a and b: mean of a, mean of a - b, sum of the variances of a and b, variance of a - b.
 pub type Moments = [f64; 4];
 
-/// SSIM of a window, and its derivatives by the window's mean of a, by its second moment of a and by its mixed second
-/// moment, all moments about 1/2: at a pixel of weight g in the window,
-/// `d ssim / d a = g (by_mean + 2 (a - 1/2) by_second + (b - 1/2) by_mixed)`.
-pub fn derivatives([a, b, variances, covariance]: Moments) -> (f64, [f64; 3]) {
-    let (inverse1, inverse2) = (1.0 / (a * a + b * b + C1), 1.0 / (variances + C2));
-    let means = (2.0 * a * b + C1) * inverse1;
-    let structure = (2.0 * covariance + C2) * inverse2;
-    let ssim = means * structure;
-    let by_second = -ssim * inverse2;
-    let by_mixed = 2.0 * means * inverse2;
-    let by_mean = 2.0 * inverse1 * (b * structure - a * ssim);
-    (ssim, [by_mean - 2.0 * (a - 0.5) * by_second - (b - 0.5) * by_mixed, by_second, by_mixed])
+/// 1 - SSIM of a window, and SSIM's derivatives by the window's mean of a, by the sum of both second moments about 1/2
+/// and by the second moment of the difference: at a pixel of weight g in the window,
+/// `d ssim / d a = g (by_mean + 2 (a - 1/2) by_sum + 2 (a - b) by_difference)`.
+///
+/// With the distances of the two quotients from one, `u = mean(a - b)^2 / (mean(a)^2 + mean(b)^2 + C1)` and
+/// `v = var(a - b) / (var(a) + var(b) + C2)`, SSIM is `(1 - u)(1 - v)`: nothing cancels where a and b agree.
+pub fn derivatives([mean, difference, sum, variance]: Moments) -> (f64, [f64; 3]) {
+    let b = mean - difference;
+    let (inverse1, inverse2) = (1.0 / (mean * mean + b * b + C1), 1.0 / (sum + C2));
+    let (u, v) = (difference * difference * inverse1, variance * inverse2);
+    let by_sum = (1.0 - u) * v * inverse2;
+    let by_difference = (u - 1.0) * inverse2;
+    let by_mean = 2.0 * inverse1 * (1.0 - v) * (mean * u - difference);
+    let about_half = by_mean - 2.0 * ((mean - 0.5) * by_sum + difference * by_difference);
+    (u + v - u * v, [about_half, by_sum, by_difference])
 }
 
 /// SSIM of every pixel of two single-channel pictures, straight from the definition.
@@ -58,8 +61,9 @@ pub fn map(a: &[f64], b: &[f64], width: usize, height: usize) -> Vec<f64> {
     let (squares, mixed) = (blurred(&|p| a[p] * a[p] + b[p] * b[p]), blurred(&|p| a[p] * b[p]));
     (0..width * height)
         .map(|p| {
-            let variances = squares[p] - ma[p] * ma[p] - mb[p] * mb[p];
-            derivatives([ma[p], mb[p], variances, mixed[p] - ma[p] * mb[p]]).0
+            let (a, b) = (ma[p], mb[p]);
+            let means = (2.0 * a * b + C1) / (a * a + b * b + C1);
+            means * (2.0 * (mixed[p] - a * b) + C2) / (squares[p] - a * a - b * b + C2)
         })
         .collect()
 }
