@@ -1,5 +1,6 @@
 //! What is learnt: anchors, decoder, attention; files on disk.
 
+pub mod anchors;
 pub mod config;
 pub mod files;
 pub mod init;
