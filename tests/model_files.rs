@@ -301,3 +301,14 @@ fn half_a_million_anchors_are_saved_and_loaded_in_seconds() {
     assert!(bits(&loaded) == bits(&anchors));
     assert!(start.elapsed().as_secs() < 60);
 }
+
+#[test]
+fn the_device_order_round_trips() {
+    for attention in [false, true] {
+        let weights = init::weights(3, 7, attention);
+        let flat = weights.decoders();
+        assert_eq!(flat.len(), gscream_vk::math::decoder::Layout { offsets: 7 }.weights());
+        let attention = attention.then(|| weights.attention());
+        assert_eq!(Weights::from_device(7, &flat, attention.as_deref()), weights);
+    }
+}

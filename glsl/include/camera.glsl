@@ -11,6 +11,8 @@ struct Camera {
 #define CAMERA(push) Camera(push.rotation0, push.rotation1, push.rotation2, push.translation, push.lens, \
   push.distortion, push.limits, push.near, push.max_radius2)
 
+const float DILATION = 0.3; // px^2, the low-pass of 3DGS
+
 bool finite(float v) { return (floatBitsToUint(v) & 0x7f800000u) != 0x7f800000u; }
 
 // `precise`: the discrete decisions below are the same on device and host.
@@ -81,4 +83,10 @@ mat3 rotation_matrix(vec4 q) {
   return mat3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
               2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x),
               2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
+}
+
+// Three standard deviations of the longer axis of a covariance xx xy yy.
+float three_sigma(vec3 v) {
+  float half_difference = 0.5 * (v.x - v.z);
+  return 3.0 * sqrt(0.5 * (v.x + v.z) + sqrt(half_difference * half_difference + v.y * v.y));
 }

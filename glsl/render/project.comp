@@ -25,7 +25,6 @@ layout(push_constant, scalar) uniform Push {
   float max_radius2; // its squared normalised radius is at most this: there the lens polynomial folds back
   uint offsets;      // slots per visible anchor
 } push;
-const float DILATION = 0.3; // px^2, the low-pass of 3DGS
 void main() {
   uint slot = thread_index();
   if (slot >= groups[3] * push.offsets) return;

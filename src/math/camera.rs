@@ -149,7 +149,7 @@ impl Lens {
     }
 
     /// A row vector in camera coordinates times R.
-    fn to_world(&self, v: [f64; 3]) -> [f64; 3] {
+    fn world_row(&self, v: [f64; 3]) -> [f64; 3] {
         std::array::from_fn(|i| (0..3).map(|k| v[k] * self.rotation[k][i]).sum())
     }
 }
@@ -214,12 +214,17 @@ pub fn project(
     let pixel = lens.distort(xy);
     let at = [bounds[0].unwrap_or(xy[0]), bounds[1].unwrap_or(xy[1])];
     let q = rotation_matrix(rotation);
-    let u = lens.jacobian(at, p[2]).map(|row| axes(lens.to_world(row), &q, scale));
+    let u = lens.jacobian(at, p[2]).map(|row| axes(lens.world_row(row), &q, scale));
     Splat {
         mean: std::array::from_fn(|i| pixel[i] * lens.focal[i] + lens.principal[i]),
         covariance: [dot(u[0], u[0]) + DILATION, dot(u[0], u[1]), dot(u[1], u[1]) + DILATION],
         depth: p[2],
     }
+}
+
+/// Three standard deviations of the longer axis of a covariance xx xy yy.
+pub fn three_sigma([xx, xy, yy]: [f64; 3]) -> f64 {
+    3.0 * (0.5 * (xx + yy) + (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt()).sqrt()
 }
 
 /// `t Q diag(s)`.
@@ -242,7 +247,7 @@ pub fn project_backward(
     let at = [bounds[0].unwrap_or(xy[0]), bounds[1].unwrap_or(xy[1])];
     let q = rotation_matrix(rotation);
     let rows = lens.jacobian(at, z);
-    let t = rows.map(|row| lens.to_world(row));
+    let t = rows.map(|row| lens.world_row(row));
     let u = t.map(|row| axes(row, &q, scale));
     let [gxx, gxy, gyy] = grad.covariance;
     let gu: [[f64; 3]; 2] = [
@@ -282,7 +287,7 @@ pub fn project_backward(
     }
     let grad_p = [grad_xy[0] / z, grad_xy[1] / z, grad_z - (grad_xy[0] * xy[0] + grad_xy[1] * xy[1]) / z];
     GaussianGradient {
-        position: lens.to_world(grad_p),
+        position: lens.world_row(grad_p),
         scale: grad_scale,
         rotation: rotation_matrix_backward(rotation, grad_q),
     }

@@ -77,7 +77,69 @@ impl Weights {
     pub fn has_attention(&self) -> bool {
         self.tensors.contains_key("to_qk.weight")
     }
+
+    /// The three decoders as the device keeps them: opacity, color, cov, each tensor behind the other.
+    ///
+    /// # Panics
+    /// When a tensor is missing: [`load`] and `init::weights` leave none out.
+    pub fn decoders(&self) -> Vec<f32> {
+        self.flat(decoder_order().iter().map(String::as_str))
+    }
+
+    /// The attention's projections as the device keeps them.
+    ///
+    /// # Panics
+    /// Without attention: see [`Weights::has_attention`].
+    pub fn attention(&self) -> Vec<f32> {
+        self.flat(ATTENTION_ORDER)
+    }
+
+    fn flat<'a>(&self, names: impl IntoIterator<Item = &'a str>) -> Vec<f32> {
+        names.into_iter().flat_map(|name| self.tensors[name].data.iter().copied()).collect()
+    }
+
+    /// From the arrays of the device.
+    ///
+    /// # Panics
+    /// When a length does not fit K = `offsets_per_anchor`.
+    pub fn from_device(offsets_per_anchor: usize, decoders: &[f32], attention: Option<&[f32]>) -> Self {
+        let shapes: BTreeMap<String, Vec<usize>> =
+            weight_shapes(offsets_per_anchor, attention.is_some()).into_iter().collect();
+        let mut tensors = BTreeMap::new();
+        let mut take = |names: Vec<String>, mut from: &[f32]| {
+            for name in names {
+                let shape = shapes[&name].clone();
+                let (data, rest) = from.split_at(shape.iter().product());
+                from = rest;
+                tensors.insert(name, Tensor { shape, data: data.to_vec() });
+            }
+            assert!(from.is_empty(), "{} weights too many", from.len());
+        };
+        take(decoder_order(), decoders);
+        if let Some(attention) = attention {
+            take(ATTENTION_ORDER.map(str::to_owned).to_vec(), attention);
+        }
+        Self { tensors }
+    }
 }
+
+/// The decoders' tensors as they lie one behind the other on the device.
+fn decoder_order() -> Vec<String> {
+    let tensors = ["0.weight", "0.bias", "2.weight", "2.bias"];
+    ["opacity", "color", "cov"].iter().flat_map(|head| tensors.map(|t| format!("mlp_{head}.{t}"))).collect()
+}
+
+/// The attention's tensors as they lie one behind the other on the device.
+const ATTENTION_ORDER: [&str; 8] = [
+    "to_qk.weight",
+    "context_to_qk.weight",
+    "to_v.weight",
+    "context_to_v.weight",
+    "to_out.weight",
+    "to_out.bias",
+    "context_to_out.weight",
+    "context_to_out.bias",
+];
 
 /// Names and shapes of all tensors for K Gaussians per anchor: the decoders, then the attention if asked for.
 pub fn weight_shapes(offsets_per_anchor: usize, attention: bool) -> Vec<(String, Vec<usize>)> {

@@ -191,16 +191,12 @@ impl Reference for decode_backward::Kernel {
                 };
                 let g = activate_backward(&of, wide(host.offset[at]), log_scaling, &grad);
                 host.grad_offset[at] = narrow(g.offset);
-                for i in 0..6 {
-                    sum[i] += g.log_scaling[i];
-                }
+                sum.iter_mut().zip(g.log_scaling).for_each(|(s, g)| *s += g);
                 for (raw, (head, output)) in g.raw.into_iter().zip(outputs_of(k)) {
                     grad_output[v * layout.rows() + layout.row(head) + output] = raw as f32;
                 }
             }
-            for i in 0..6 {
-                host.grad_log_scaling[6 * anchor + i] = sum[i] as f32;
-            }
+            host.grad_log_scaling[6 * anchor..][..6].copy_from_slice(&narrow(sum));
         }
     }
 

@@ -1,0 +1,204 @@
+//! One picture from a finished model, for files and figures.
+
+use super::bin::{Bin, Tiling};
+use super::decode::{self, Decode};
+use super::project::{Gaussians, Project};
+use super::rasterize::{self, Outputs, Picture, Projected};
+use super::visible::Visible;
+use crate::gpu::{Buffer, Error, Gpu, Recorder};
+use crate::model::anchors::Anchors;
+use crate::model::files;
+use crate::primitives::limit::{COUNTERS, Counter, Limits};
+use crate::scene::Camera;
+
+/// How much the forward stages have room for.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Capacity {
+    /// Anchors.
+    pub anchors: u32,
+    /// Anchors in one view.
+    pub visible: u32,
+    /// (Gaussian, tile) pairs in one view.
+    pub pairs: u32,
+}
+
+impl Capacity {
+    /// A first guess for so many anchors; overflow corrects it.
+    pub fn guess(anchors: u32) -> Self {
+        Self { anchors, visible: (anchors / 4).clamp(1024, anchors.max(1024)), pairs: 1 << 17 }
+    }
+
+    /// Room for what was counted, and half as much again.
+    pub fn fit(self, counters: [u32; COUNTERS]) -> Self {
+        let fit = |have: u32, wanted: u32| if wanted > have { wanted.saturating_add(wanted / 2) } else { have };
+        Self {
+            anchors: self.anchors,
+            visible: fit(self.visible, counters[Counter::Visible as usize]),
+            pairs: fit(self.pairs, counters[Counter::Pairs as usize]),
+        }
+    }
+}
+
+/// The forward stages, from anchors to a picture.
+pub struct Forward {
+    /// What is in view.
+    pub visible: Visible,
+    /// Neural Gaussians.
+    pub decode: Decode,
+    /// Gaussians on the picture.
+    pub project: Project,
+    /// Tiles' lists.
+    pub bin: Bin,
+    tiling: Tiling,
+    offsets: u32,
+}
+
+impl Forward {
+    /// Stages for pictures of at most `size`.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub fn new(gpu: &Gpu, capacity: Capacity, offsets: u32, tiling: Tiling, size: [u32; 2]) -> Result<Self, Error> {
+        Ok(Self {
+            visible: Visible::new(gpu, capacity.anchors, offsets, capacity.visible)?,
+            decode: Decode::new(gpu, capacity.visible, offsets)?,
+            project: Project::new(gpu, capacity.visible, offsets)?,
+            bin: Bin::new(gpu, tiling, capacity.visible * offsets, capacity.pairs, size)?,
+            tiling,
+            offsets,
+        })
+    }
+
+    /// Shape of the tiles.
+    pub fn tiling(&self) -> Tiling {
+        self.tiling
+    }
+
+    /// The decoded Gaussians as the projection reads them.
+    pub fn gaussians(&self) -> Gaussians<'_> {
+        let Decode { position, scale, rotation, opacity, .. } = &self.decode;
+        Gaussians { position, scale, rotation, opacity }
+    }
+
+    /// The projected Gaussians as the rasteriser reads them.
+    pub fn projected(&self) -> Projected<'_> {
+        Projected {
+            slots: &self.visible.slots,
+            offsets: self.offsets,
+            mean: &self.project.mean,
+            covariance: &self.project.covariance,
+            depth: &self.project.depth,
+            opacity: &self.decode.opacity,
+            color: &self.decode.color,
+        }
+    }
+}
+
+/// A finished picture on the host.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Rendered {
+    /// Width and height in pixels.
+    pub size: [u32; 2],
+    /// `[pixel]` as stored, 0 to 1 in gamut.
+    pub rgb: Vec<[f32; 3]>,
+    /// `[pixel]` sum of z alpha T, scene units.
+    pub depth: Vec<f32>,
+    /// `[pixel]` what is left of the background.
+    pub transmittance: Vec<f32>,
+}
+
+/// Renders views of a model.
+pub struct Renderer {
+    gpu: Gpu,
+    anchors: Anchors,
+    weights: Buffer<f32>,
+    near: f32,
+    background: [f32; 3],
+    limits: Limits,
+    capacity: Capacity,
+    stages: Option<(Forward, Picture)>,
+}
+
+impl Renderer {
+    /// A renderer of this model.
+    ///
+    /// # Errors
+    /// When the device has no room for it.
+    pub fn new(
+        gpu: &Gpu,
+        anchors: &files::Anchors,
+        weights: &files::Weights,
+        config: &super::Config,
+        background: [f32; 3],
+    ) -> Result<Self, Error> {
+        let weights = gpu.upload("weights", &weights.decoders())?;
+        let anchors = Anchors::upload(gpu, anchors, 0)?;
+        Ok(Self {
+            gpu: gpu.clone(),
+            near: config.near as f32,
+            background,
+            limits: Limits::new(gpu)?,
+            capacity: Capacity::guess(anchors.count),
+            anchors,
+            weights,
+            stages: None,
+        })
+    }
+
+    /// Renders one view; buffers grow as it needs.
+    ///
+    /// # Errors
+    /// When the device has no room for it, or is lost.
+    pub fn render(&mut self, camera: &Camera) -> Result<Rendered, Error> {
+        loop {
+            let (forward, picture) = match self.stages.take() {
+                Some((forward, picture)) if picture.size == camera.size => (forward, picture),
+                _ => {
+                    let tiling = Tiling::of(self.gpu.info().subgroup_size);
+                    let pixels = camera.size[0] as usize * camera.size[1] as usize;
+                    (
+                        Forward::new(&self.gpu, self.capacity, self.anchors.offsets, tiling, camera.size)?,
+                        Picture::new(&self.gpu, camera.size, pixels, Outputs::ColorDepth)?,
+                    )
+                }
+            };
+            let mut rec = self.gpu.recorder()?;
+            self.record(&mut rec, &forward, &picture, camera);
+            rec.submit()?.wait()?;
+            if self.gpu.read(self.limits.overflow())?[0] == 0 {
+                let (depth, transmittance) = picture.depth.as_ref().expect("the picture was made with depth");
+                let rendered = Rendered {
+                    size: camera.size,
+                    rgb: self.gpu.read(&picture.rgb)?,
+                    depth: self.gpu.read(depth)?,
+                    transmittance: self.gpu.read(transmittance)?,
+                };
+                self.stages = Some((forward, picture));
+                return Ok(rendered);
+            }
+            let counters = self.gpu.read(self.limits.counters())?;
+            self.capacity = self.capacity.fit(std::array::from_fn(|i| counters[i]));
+            let mut rec = self.gpu.recorder()?;
+            self.limits.lower(&mut rec);
+            rec.submit()?.wait()?;
+        }
+    }
+
+    fn record(&self, rec: &mut Recorder<'_>, forward: &Forward, picture: &Picture, camera: &Camera) {
+        let Self { anchors, limits, near, .. } = self;
+        forward.visible.record(rec, anchors, camera, *near, limits);
+        let offset = anchors.offset.value.view();
+        let model = decode::Anchors {
+            position: &anchors.position,
+            feature: &anchors.feature.value,
+            offset: &offset,
+            log_scaling: &anchors.log_scaling.value,
+            weights: &self.weights,
+            visible: &forward.visible.list,
+        };
+        forward.decode.record(rec, model, &forward.visible.count, camera.center());
+        forward.project.record(rec, &forward.visible.slots, forward.gaussians(), camera, *near);
+        let binned = forward.bin.record(rec, forward.projected(), camera.size, limits);
+        rasterize::forward(rec, forward.tiling, forward.projected(), binned, self.background, picture);
+    }
+}
