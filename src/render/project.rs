@@ -135,7 +135,7 @@ pub struct Gaussians<'a> {
     pub opacity: &'a Buffer<f32>,
 }
 
-/// What [`Project::record_backward`] reads besides: one element per slot.
+/// What [`ProjectBackward::record`] reads besides: one element per slot.
 #[derive(Clone, Copy)]
 pub struct SplatGradients<'a> {
     /// Per px.
@@ -146,7 +146,7 @@ pub struct SplatGradients<'a> {
     pub depth: &'a Buffer<f32>,
 }
 
-/// The stage: its outputs for `capacity` slots.
+/// The forward stage: its outputs.
 #[derive(Debug)]
 pub struct Project {
     /// px, \[slot\].
@@ -155,13 +155,18 @@ pub struct Project {
     pub covariance: Buffer<[f32; 3]>,
     /// Camera z; 0 where there is no Gaussian, \[slot\].
     pub depth: Buffer<f32>,
+    offsets: u32,
+}
+
+/// The backward stage: its outputs for as many slots.
+#[derive(Debug)]
+pub struct ProjectBackward {
     /// \[slot\].
     pub grad_position: Buffer<[f32; 3]>,
     /// \[slot\].
     pub grad_scale: Buffer<[f32; 3]>,
     /// Of the quaternion as given, \[slot\].
     pub grad_rotation: Buffer<[f32; 4]>,
-    offsets: u32,
 }
 
 impl Project {
@@ -175,9 +180,6 @@ impl Project {
             mean: gpu.buffer("mean", slots)?,
             covariance: gpu.buffer("covariance", slots)?,
             depth: gpu.buffer("depth", slots)?,
-            grad_position: gpu.buffer("grad_position", slots)?,
-            grad_scale: gpu.buffer("grad_scale", slots)?,
-            grad_rotation: gpu.buffer("grad_rotation", slots)?,
             offsets,
         })
     }
@@ -197,11 +199,28 @@ impl Project {
         };
         rec.run(project::Kernel, buffers, push(camera, near, self.offsets), groups);
     }
+}
 
-    /// Records its gradients, after [`Project::record`] with the same arguments.
-    pub fn record_backward(
+impl ProjectBackward {
+    /// Buffers for the gradients of `forward`'s slots.
+    ///
+    /// # Errors
+    /// When the device has no memory for them.
+    pub fn new(gpu: &Gpu, forward: &Project) -> Result<Self, Error> {
+        let slots = forward.depth.len();
+        Ok(Self {
+            grad_position: gpu.buffer("grad_position", slots)?,
+            grad_scale: gpu.buffer("grad_scale", slots)?,
+            grad_rotation: gpu.buffer("grad_rotation", slots)?,
+        })
+    }
+
+    /// Records the gradients, after [`Project::record`] with the same `groups`, Gaussians and camera.
+    #[allow(clippy::too_many_arguments, reason = "the forward call's arguments, its stage and the gradients")]
+    pub fn record(
         &self,
         rec: &mut Recorder<'_>,
+        forward: &Project,
         groups: &Groups,
         of: Gaussians<'_>,
         grad: SplatGradients<'_>,
@@ -213,7 +232,7 @@ impl Project {
             position: of.position,
             scale: of.scale,
             rotation: of.rotation,
-            depth: &self.depth,
+            depth: &forward.depth,
             grad_mean: grad.mean,
             grad_covariance: grad.covariance,
             grad_depth: grad.depth,
@@ -221,7 +240,7 @@ impl Project {
             grad_scale: &self.grad_scale,
             grad_rotation: &self.grad_rotation,
         };
-        rec.run(project_backward::Kernel, buffers, push_backward(camera, near, self.offsets), groups);
+        rec.run(project_backward::Kernel, buffers, push_backward(camera, near, forward.offsets), groups);
     }
 }
 
@@ -232,6 +251,7 @@ mod tests {
 
     use super::*;
     use crate::gpu::testing;
+    use crate::primitives::dispatch;
 
     fn uniform(rng: &mut Pcg64, low: f32, high: f32) -> f32 {
         low + (high - low) * rng.random::<f32>()
@@ -416,5 +436,48 @@ mod tests {
             }
         }
         assert!(clamped > 20, "{clamped} clamped: the case tests too little");
+    }
+
+    /// The stages with the count on the device give what the kernels give.
+    #[test]
+    fn stages_run_on_a_count_on_the_device() {
+        let gpu = testing::gpu();
+        let mut rng = Pcg64::seed_from_u64(5);
+        let (anchors, offsets) = (77, 10);
+        let camera = camera(LENSES[1]);
+        let mut arrays = case(&mut rng, anchors * offsets, 0);
+        arrays.groups[3] = anchors as u32;
+        let push = push(&camera, NEAR, offsets as u32);
+        let want = testing::run_once::<project::Kernel>(&gpu, &arrays, push, anchors * offsets);
+        let upstream = backward_case(&mut rng, &want);
+        let push = push_backward(&camera, NEAR, offsets as u32);
+        let want_backward = testing::run_once::<project_backward::Kernel>(&gpu, &upstream, push, anchors * offsets);
+
+        let fine = "the device runs a test";
+        let forward = Project::new(&gpu, anchors as u32 + 9, offsets as u32).expect(fine);
+        let backward = ProjectBackward::new(&gpu, &forward).expect(fine);
+        let count = gpu.upload("visible_count", &[anchors as u32]).expect(fine);
+        let groups = dispatch::groups(&gpu, "groups", 64).expect(fine);
+        let position = gpu.upload("position", &arrays.position).expect(fine);
+        let scale = gpu.upload("scale", &arrays.scale).expect(fine);
+        let rotation = gpu.upload("rotation", &arrays.rotation).expect(fine);
+        let opacity = gpu.upload("opacity", &arrays.opacity).expect(fine);
+        let mean = gpu.upload("grad_mean", &upstream.grad_mean).expect(fine);
+        let covariance = gpu.upload("grad_covariance", &upstream.grad_covariance).expect(fine);
+        let depth = gpu.upload("grad_depth", &upstream.grad_depth).expect(fine);
+        let of = Gaussians { position: &position, scale: &scale, rotation: &rotation, opacity: &opacity };
+        let grad = SplatGradients { mean: &mean, covariance: &covariance, depth: &depth };
+        let mut rec = gpu.recorder().expect(fine);
+        dispatch::record(&mut rec, &count, &groups, anchors as u32 + 9, offsets as u32);
+        forward.record(&mut rec, &groups, of, &camera, NEAR);
+        backward.record(&mut rec, &forward, &groups, of, grad, &camera, NEAR);
+        rec.submit().expect(fine).wait().expect(fine);
+        let slots = anchors * offsets;
+        assert_eq!(gpu.read_range(&forward.mean, slots).expect(fine), want.mean);
+        assert_eq!(gpu.read_range(&forward.covariance, slots).expect(fine), want.covariance);
+        assert_eq!(gpu.read_range(&forward.depth, slots).expect(fine), want.depth);
+        assert_eq!(gpu.read_range(&backward.grad_position, slots).expect(fine), want_backward.grad_position);
+        assert_eq!(gpu.read_range(&backward.grad_scale, slots).expect(fine), want_backward.grad_scale);
+        assert_eq!(gpu.read_range(&backward.grad_rotation, slots).expect(fine), want_backward.grad_rotation);
     }
 }
