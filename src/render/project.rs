@@ -250,7 +250,7 @@ mod tests {
     use rand_pcg::Pcg64;
 
     use super::*;
-    use crate::gpu::testing;
+    use crate::gpu::{Kernel, testing};
     use crate::primitives::dispatch;
 
     fn uniform(rng: &mut Pcg64, low: f32, high: f32) -> f32 {
@@ -329,6 +329,55 @@ mod tests {
                 testing::assert_twin(project_backward::Kernel, &gpu, case, push_backward(&camera, NEAR, 1), slots + 2);
             }
         }
+    }
+
+    /// Each Gaussian by its own size: a needle of a thousandth of a pixel beside one of thousands of pixels.
+    #[test]
+    fn small_gaussians_are_as_exact_as_large_ones() {
+        let gpu = testing::gpu();
+        let mut rng = Pcg64::seed_from_u64(6);
+        let camera = camera(LENSES[1]);
+        let case = case(&mut rng, 4000, 0);
+        let got = testing::run_once::<project::Kernel>(&gpu, &case, push(&camera, NEAR, 1), 4000u32);
+        let upstream = backward_case(&mut rng, &got);
+        let back =
+            testing::run_once::<project_backward::Kernel>(&gpu, &upstream, push_backward(&camera, NEAR, 1), 4000u32);
+        let (mut want, mut want_back) =
+            (project::Kernel::words(case), project_backward::Kernel::words(upstream.clone()));
+        project::Kernel::reference(project::Kernel::host(&mut want), push(&camera, NEAR, 1), ());
+        let host = project_backward::Kernel::host(&mut want_back);
+        project_backward::Kernel::reference(host, push_backward(&camera, NEAR, 1), ());
+        let (want, want_back) = (project::Kernel::arrays(&want), project_backward::Kernel::arrays(&want_back));
+        // Relative to the terms before they cancel: |t|^2 s^2 with t = J R and the Gaussian's longest s. The camera's
+        // focal lengths are at most 92, the rays' slopes lengthen a row of J by less than 1.6.
+        let slots: Vec<(f64, f64, f64)> = (0..4000)
+            .map(|s| {
+                let longest = upstream.scale[s].into_iter().fold(0.0f32, f32::max);
+                let z = f64::from(got.depth[s]);
+                (if z > 0.0 { 92.0 * 1.6 / z } else { 0.0 }, longest.into(), z)
+            })
+            .collect();
+        let assert_close = |name: &str, got: &[f32], want: &[f32], width: usize, powers: f64, sizes: Vec<f64>| {
+            for (s, (got, want)) in got.chunks_exact(width).zip(want.chunks_exact(width)).enumerate() {
+                for (g, w) in got.iter().zip(want) {
+                    let error = (f64::from(*g) - f64::from(*w)).abs();
+                    let limit = powers * PER_POWER_OF_DEPTH / 8.0 * sizes[s];
+                    assert!(error <= limit, "{name} of slot {s}: {got:?}, not {want:?} within {limit:e}");
+                }
+            }
+        };
+        // A row of the upstream gradient has two entries of at most 1, and both rows meet: 4 |t|^2 s^2.
+        let sizes = |f: fn((f64, f64, f64)) -> f64| slots.iter().map(|&s| f(s)).collect();
+        let size = sizes(|(t, s, _)| t * t * s * s + 0.3);
+        assert_close("covariance", got.covariance.as_flattened(), want.covariance.as_flattened(), 3, 2.0, size);
+        let size = sizes(|(t, s, _)| 4.0 * t * t * s);
+        assert_close("grad_scale", back.grad_scale.as_flattened(), want_back.grad_scale.as_flattened(), 3, 3.0, size);
+        let size = sizes(|(t, s, _)| 4.0 * t * t * s * s);
+        let (a, b) = (back.grad_rotation.as_flattened(), want_back.grad_rotation.as_flattened());
+        assert_close("grad_rotation", a, b, 4, 3.0, size);
+        let size = sizes(|(t, s, z)| if z > 0.0 { 4.0 * t * t * s * s / z + 2.0 * t + 1.0 } else { 0.0 });
+        let (a, b) = (back.grad_position.as_flattened(), want_back.grad_position.as_flattened());
+        assert_close("grad_position", a, b, 3, 4.0, size);
     }
 
     #[test]
