@@ -39,19 +39,23 @@ void main() {
   uint from[TILE];
   [[unroll]] for (uint a = 0u; a < TILE; ++a) from[a] = min(v + a, n - 1u) * HIDDEN_VEC4;
   for (uint j = 0u; j < ROW_VEC4; ++j) {
-    vec4 h[TILE];
-    [[unroll]] for (uint a = 0u; a < TILE; ++a) h[a] = hidden[from[a] + j];
     vec4 w = packed[FIRST_VEC4 + k * ROW_VEC4 + j];
-    [[unroll]] for (uint a = 0u; a < TILE; ++a) o[a] = dot_add(o[a], h[a], w);
-    [[unroll]] for (uint a = 0u; a < TILE; ++a) h[a] = hidden[from[a] + ROW_VEC4 + j];
-    [[unroll]] for (uint i = 0u; i < 3u; ++i) {
-      w = packed[FIRST_VEC4 + (color_row + i) * ROW_VEC4 + j];
-      [[unroll]] for (uint a = 0u; a < TILE; ++a) c[3u * a + i] = dot_add(c[3u * a + i], h[a], w);
+    [[unroll]] for (uint a = 0u; a < TILE; ++a) o[a] = dot_add(o[a], hidden[from[a] + j], w);
+  }
+  for (uint j = 0u; j < ROW_VEC4; ++j) {
+    vec4 w[3];
+    [[unroll]] for (uint i = 0u; i < 3u; ++i) w[i] = packed[FIRST_VEC4 + (color_row + i) * ROW_VEC4 + j];
+    [[unroll]] for (uint a = 0u; a < TILE; ++a) {
+      vec4 h = hidden[from[a] + ROW_VEC4 + j];
+      [[unroll]] for (uint i = 0u; i < 3u; ++i) c[3u * a + i] = dot_add(c[3u * a + i], h, w[i]);
     }
-    [[unroll]] for (uint a = 0u; a < TILE; ++a) h[a] = hidden[from[a] + 2u * ROW_VEC4 + j];
-    [[unroll]] for (uint i = 0u; i < 7u; ++i) {
-      w = packed[FIRST_VEC4 + (cov_row + i) * ROW_VEC4 + j];
-      [[unroll]] for (uint a = 0u; a < TILE; ++a) q[7u * a + i] = dot_add(q[7u * a + i], h[a], w);
+  }
+  for (uint j = 0u; j < ROW_VEC4; ++j) {
+    vec4 w[7];
+    [[unroll]] for (uint i = 0u; i < 7u; ++i) w[i] = packed[FIRST_VEC4 + (cov_row + i) * ROW_VEC4 + j];
+    [[unroll]] for (uint a = 0u; a < TILE; ++a) {
+      vec4 h = hidden[from[a] + 2u * ROW_VEC4 + j];
+      [[unroll]] for (uint i = 0u; i < 7u; ++i) q[7u * a + i] = dot_add(q[7u * a + i], h, w[i]);
     }
   }
   [[unroll]] for (uint a = 0u; a < TILE; ++a) {

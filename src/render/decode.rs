@@ -773,6 +773,37 @@ mod tests {
         }
     }
 
+    /// Beyond 65,536 anchors a chunk has more than 64.
+    #[test]
+    fn long_chunks_match_their_twins() {
+        let gpu = testing::gpu();
+        let mut rng = Pcg64::seed_from_u64(11);
+        let (count, offsets) = (65_601, 2);
+        let layout = Layout { offsets };
+        let groups = vec![1, 1, 1, count as u32];
+        let parts = chunks(count).count();
+        assert_eq!(parts, 513);
+        let case = decode_backward_first::Arrays {
+            groups: groups.clone(),
+            inputs: random(&mut rng, count * INPUT_VEC4, -1.0, 1.0),
+            grad_hidden: random(&mut rng, count * HIDDEN_VEC4, -1.0, 1.0),
+            partial: unwritten(parts * FIRST_VEC4 + 3),
+        };
+        let first = twin(decode_backward_first::Kernel, &gpu, (), case, (), count).partial;
+        let case = decode_backward_second::Arrays {
+            groups: groups.clone(),
+            hidden: random(&mut rng, count * HIDDEN_VEC4, -1.0, 1.0),
+            grad_output: random(&mut rng, count * layout.rows() / 4, -1.0, 1.0),
+            partial: unwritten(parts * layout.rows() * (HIDDEN + 1) / 4 + 3),
+        };
+        let constants = decode_backward_second::Constants { offsets: 2 };
+        let second = twin(decode_backward_second::Kernel, &gpu, constants, case, (), count).partial;
+        let grad_weights = vec![testing::UNWRITTEN; layout.weights() + 3];
+        let case = decode_backward_weights::Arrays { groups, first, second, grad_weights };
+        let constants = decode_backward_weights::Constants { offsets: 2 };
+        twin(decode_backward_weights::Kernel, &gpu, constants, case, (), layout.packed());
+    }
+
     struct Results {
         outputs: Vec<(&'static str, Vec<f32>)>,
         gradients: Vec<(&'static str, Vec<f32>)>,

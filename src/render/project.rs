@@ -145,7 +145,7 @@ pub struct Gaussians<'a> {
     pub opacity: &'a Buffer<f32>,
 }
 
-/// What [`Project::record_backward`] reads besides: one element per slot.
+/// What [`ProjectBackward::record`] reads besides: one element per slot.
 #[derive(Clone, Copy)]
 pub struct SplatGradients<'a> {
     /// Per px.
@@ -156,7 +156,7 @@ pub struct SplatGradients<'a> {
     pub depth: Option<&'a Buffer<f32>>,
 }
 
-/// The stage: its outputs for `capacity` slots.
+/// The forward stage: its outputs.
 #[derive(Debug)]
 pub struct Project {
     /// px, \[slot\].
@@ -165,13 +165,18 @@ pub struct Project {
     pub covariance: Buffer<[f32; 3]>,
     /// Camera z; 0 where there is no Gaussian, \[slot\].
     pub depth: Buffer<f32>,
+    offsets: u32,
+}
+
+/// The backward stage: its outputs for as many slots.
+#[derive(Debug)]
+pub struct ProjectBackward {
     /// \[slot\].
     pub grad_position: Buffer<[f32; 3]>,
     /// \[slot\].
     pub grad_scale: Buffer<[f32; 3]>,
     /// Of the quaternion as given, \[slot\].
     pub grad_rotation: Buffer<[f32; 4]>,
-    offsets: u32,
 }
 
 impl Project {
@@ -185,9 +190,6 @@ impl Project {
             mean: gpu.buffer("mean", slots)?,
             covariance: gpu.buffer("covariance", slots)?,
             depth: gpu.buffer("depth", slots)?,
-            grad_position: gpu.buffer("grad_position", slots)?,
-            grad_scale: gpu.buffer("grad_scale", slots)?,
-            grad_rotation: gpu.buffer("grad_rotation", slots)?,
             offsets,
         })
     }
@@ -207,11 +209,28 @@ impl Project {
         };
         rec.run(project::Kernel, buffers, push(camera, near, self.offsets), groups);
     }
+}
 
-    /// Records its gradients, after [`Project::record`] with the same arguments.
-    pub fn record_backward(
+impl ProjectBackward {
+    /// Buffers for the gradients of `forward`'s slots.
+    ///
+    /// # Errors
+    /// When the device has no memory for them.
+    pub fn new(gpu: &Gpu, forward: &Project) -> Result<Self, Error> {
+        let slots = forward.depth.len();
+        Ok(Self {
+            grad_position: gpu.buffer("grad_position", slots)?,
+            grad_scale: gpu.buffer("grad_scale", slots)?,
+            grad_rotation: gpu.buffer("grad_rotation", slots)?,
+        })
+    }
+
+    /// Records the gradients, after [`Project::record`] with the same `groups`, Gaussians and camera.
+    #[allow(clippy::too_many_arguments, reason = "the forward call's arguments, its stage and the gradients")]
+    pub fn record(
         &self,
         rec: &mut Recorder<'_>,
+        forward: &Project,
         groups: &Groups,
         of: Gaussians<'_>,
         grad: SplatGradients<'_>,
@@ -225,7 +244,7 @@ impl Project {
                     position: of.position,
                     scale: of.scale,
                     rotation: of.rotation,
-                    depth: &self.depth,
+                    depth: &forward.depth,
                     grad_mean: grad.mean,
                     grad_covariance: grad.covariance,
                     grad_position: &self.grad_position,
@@ -233,7 +252,7 @@ impl Project {
                     grad_rotation: &self.grad_rotation,
                     $($grad_depth,)?
                 };
-                let push = camera_push!($module::Push, camera, near, offsets: self.offsets);
+                let push = camera_push!($module::Push, camera, near, offsets: forward.offsets);
                 rec.run($module::Kernel, buffers, push, groups);
             }};
         }
@@ -250,7 +269,8 @@ mod tests {
     use rand_pcg::Pcg64;
 
     use super::*;
-    use crate::gpu::testing;
+    use crate::gpu::{Kernel, testing};
+    use crate::primitives::dispatch;
 
     fn uniform(rng: &mut Pcg64, low: f32, high: f32) -> f32 {
         low + (high - low) * rng.random::<f32>()
@@ -328,6 +348,55 @@ mod tests {
                 testing::assert_twin(project_backward::Kernel, &gpu, case, push_backward(&camera, NEAR, 1), slots + 2);
             }
         }
+    }
+
+    /// Each Gaussian by its own size: a needle of a thousandth of a pixel beside one of thousands of pixels.
+    #[test]
+    fn small_gaussians_are_as_exact_as_large_ones() {
+        let gpu = testing::gpu();
+        let mut rng = Pcg64::seed_from_u64(6);
+        let camera = camera(LENSES[1]);
+        let case = case(&mut rng, 4000, 0);
+        let got = testing::run_once::<project::Kernel>(&gpu, &case, push(&camera, NEAR, 1), 4000u32);
+        let upstream = backward_case(&mut rng, &got);
+        let back =
+            testing::run_once::<project_backward::Kernel>(&gpu, &upstream, push_backward(&camera, NEAR, 1), 4000u32);
+        let (mut want, mut want_back) =
+            (project::Kernel::words(case), project_backward::Kernel::words(upstream.clone()));
+        project::Kernel::reference(project::Kernel::host(&mut want), push(&camera, NEAR, 1), ());
+        let host = project_backward::Kernel::host(&mut want_back);
+        project_backward::Kernel::reference(host, push_backward(&camera, NEAR, 1), ());
+        let (want, want_back) = (project::Kernel::arrays(&want), project_backward::Kernel::arrays(&want_back));
+        // Relative to the terms before they cancel: |t|^2 s^2 with t = J R and the Gaussian's longest s. The camera's
+        // focal lengths are at most 92, the rays' slopes lengthen a row of J by less than 1.6.
+        let slots: Vec<(f64, f64, f64)> = (0..4000)
+            .map(|s| {
+                let longest = upstream.scale[s].into_iter().fold(0.0f32, f32::max);
+                let z = f64::from(got.depth[s]);
+                (if z > 0.0 { 92.0 * 1.6 / z } else { 0.0 }, longest.into(), z)
+            })
+            .collect();
+        let assert_close = |name: &str, got: &[f32], want: &[f32], width: usize, powers: f64, sizes: Vec<f64>| {
+            for (s, (got, want)) in got.chunks_exact(width).zip(want.chunks_exact(width)).enumerate() {
+                for (g, w) in got.iter().zip(want) {
+                    let error = (f64::from(*g) - f64::from(*w)).abs();
+                    let limit = powers * PER_POWER_OF_DEPTH / 8.0 * sizes[s];
+                    assert!(error <= limit, "{name} of slot {s}: {got:?}, not {want:?} within {limit:e}");
+                }
+            }
+        };
+        // A row of the upstream gradient has two entries of at most 1, and both rows meet: 4 |t|^2 s^2.
+        let sizes = |f: fn((f64, f64, f64)) -> f64| slots.iter().map(|&s| f(s)).collect();
+        let size = sizes(|(t, s, _)| t * t * s * s + 0.3);
+        assert_close("covariance", got.covariance.as_flattened(), want.covariance.as_flattened(), 3, 2.0, size);
+        let size = sizes(|(t, s, _)| 4.0 * t * t * s);
+        assert_close("grad_scale", back.grad_scale.as_flattened(), want_back.grad_scale.as_flattened(), 3, 3.0, size);
+        let size = sizes(|(t, s, _)| 4.0 * t * t * s * s);
+        let (a, b) = (back.grad_rotation.as_flattened(), want_back.grad_rotation.as_flattened());
+        assert_close("grad_rotation", a, b, 4, 3.0, size);
+        let size = sizes(|(t, s, z)| if z > 0.0 { 4.0 * t * t * s * s / z + 2.0 * t + 1.0 } else { 0.0 });
+        let (a, b) = (back.grad_position.as_flattened(), want_back.grad_position.as_flattened());
+        assert_close("grad_position", a, b, 3, 4.0, size);
     }
 
     #[test]
@@ -435,5 +504,48 @@ mod tests {
             }
         }
         assert!(clamped > 20, "{clamped} clamped: the case tests too little");
+    }
+
+    /// The stages with the count on the device give what the kernels give.
+    #[test]
+    fn stages_run_on_a_count_on_the_device() {
+        let gpu = testing::gpu();
+        let mut rng = Pcg64::seed_from_u64(5);
+        let (anchors, offsets) = (77, 10);
+        let camera = camera(LENSES[1]);
+        let mut arrays = case(&mut rng, anchors * offsets, 0);
+        arrays.groups[3] = anchors as u32;
+        let push = push(&camera, NEAR, offsets as u32);
+        let want = testing::run_once::<project::Kernel>(&gpu, &arrays, push, anchors * offsets);
+        let upstream = backward_case(&mut rng, &want);
+        let push = push_backward(&camera, NEAR, offsets as u32);
+        let want_backward = testing::run_once::<project_backward::Kernel>(&gpu, &upstream, push, anchors * offsets);
+
+        let fine = "the device runs a test";
+        let forward = Project::new(&gpu, anchors as u32 + 9, offsets as u32).expect(fine);
+        let backward = ProjectBackward::new(&gpu, &forward).expect(fine);
+        let count = gpu.upload("visible_count", &[anchors as u32]).expect(fine);
+        let groups = dispatch::groups(&gpu, "groups", 64).expect(fine);
+        let position = gpu.upload("position", &arrays.position).expect(fine);
+        let scale = gpu.upload("scale", &arrays.scale).expect(fine);
+        let rotation = gpu.upload("rotation", &arrays.rotation).expect(fine);
+        let opacity = gpu.upload("opacity", &arrays.opacity).expect(fine);
+        let mean = gpu.upload("grad_mean", &upstream.grad_mean).expect(fine);
+        let covariance = gpu.upload("grad_covariance", &upstream.grad_covariance).expect(fine);
+        let depth = gpu.upload("grad_depth", &upstream.grad_depth).expect(fine);
+        let of = Gaussians { position: &position, scale: &scale, rotation: &rotation, opacity: &opacity };
+        let grad = SplatGradients { mean: &mean, covariance: &covariance, depth: &depth };
+        let mut rec = gpu.recorder().expect(fine);
+        dispatch::record(&mut rec, &count, &groups, anchors as u32 + 9, offsets as u32);
+        forward.record(&mut rec, &groups, of, &camera, NEAR);
+        backward.record(&mut rec, &forward, &groups, of, grad, &camera, NEAR);
+        rec.submit().expect(fine).wait().expect(fine);
+        let slots = anchors * offsets;
+        assert_eq!(gpu.read_range(&forward.mean, slots).expect(fine), want.mean);
+        assert_eq!(gpu.read_range(&forward.covariance, slots).expect(fine), want.covariance);
+        assert_eq!(gpu.read_range(&forward.depth, slots).expect(fine), want.depth);
+        assert_eq!(gpu.read_range(&backward.grad_position, slots).expect(fine), want_backward.grad_position);
+        assert_eq!(gpu.read_range(&backward.grad_scale, slots).expect(fine), want_backward.grad_scale);
+        assert_eq!(gpu.read_range(&backward.grad_rotation, slots).expect(fine), want_backward.grad_rotation);
     }
 }
