@@ -107,6 +107,15 @@ pub struct Rendered {
     pub transmittance: Vec<f32>,
 }
 
+impl Rendered {
+    /// The colours in 8 bits, clamped and rounded to the nearest.
+    pub fn to_rgb8(&self) -> image::RgbImage {
+        let byte = |v: f32| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
+        let bytes = self.rgb.iter().flat_map(|p| p.map(byte)).collect();
+        image::RgbImage::from_raw(self.size[0], self.size[1], bytes).expect("three bytes per pixel")
+    }
+}
+
 /// Renders views of a model.
 pub struct Renderer {
     gpu: Gpu,

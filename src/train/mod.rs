@@ -1,5 +1,7 @@
 //! What a scene needs, the step, the loop, checkpoints.
 
 pub mod config;
+pub mod plan;
+pub mod step;
 
 pub use config::Config;

@@ -1,0 +1,91 @@
+//! The training pictures on the device: 8 bits per channel, the mask in the fourth byte.
+
+use image::{GrayImage, RgbImage};
+
+use crate::gpu::{Buffer, Error, Gpu};
+use crate::scene::{Camera, Prior, PriorKind, Scene};
+
+/// One training view on the device.
+pub struct Photograph {
+    /// The view's name.
+    pub name: String,
+    /// Its camera.
+    pub camera: Camera,
+    /// True for the reference view: its picture is the inpainted one.
+    pub reference: bool,
+    /// `[pixel]` red | green << 8 | blue << 16 | mask << 24.
+    pub picture: Buffer<u32>,
+    /// `[pixel]` depth or disparity, where the view has a prior.
+    pub prior: Option<(PriorKind, Buffer<f32>)>,
+    /// Bounding box of the mask, (x0, y0) and one past (x1, y1), where there is one.
+    pub mask_box: Option<[u32; 4]>,
+}
+
+/// One word per pixel.
+pub fn pack(picture: &RgbImage, mask: Option<&GrayImage>) -> Vec<u32> {
+    let mut words: Vec<u32> =
+        picture.pixels().map(|p| u32::from_le_bytes([p.0[0], p.0[1], p.0[2], 0])).collect();
+    if let Some(mask) = mask {
+        for (word, m) in words.iter_mut().zip(mask.pixels()) {
+            if m.0[0] != 0 {
+                *word |= 0xff << 24;
+            }
+        }
+    }
+    words
+}
+
+/// Bounding box of what is not zero.
+pub fn mask_box(mask: &GrayImage) -> Option<[u32; 4]> {
+    mask.enumerate_pixels().filter(|(_, _, p)| p.0[0] != 0).fold(None, |found, (x, y, _)| {
+        let [x0, y0, x1, y1] = found.unwrap_or([x, y, x, y]);
+        Some([x0.min(x), y0.min(y), x1.max(x + 1), y1.max(y + 1)])
+    })
+}
+
+/// Uploads all training views. Priors stay behind when no loss looks at depth.
+///
+/// # Errors
+/// When the device has no room.
+pub fn upload(gpu: &Gpu, scene: &Scene, depth: bool) -> Result<Vec<Photograph>, Error> {
+    let mut all = vec![];
+    for (i, view) in scene.train.iter().enumerate() {
+        let reference = scene.reference.as_ref().filter(|r| r.view == i);
+        let picture = reference.map_or(&view.image, |r| &r.image);
+        let prior = match reference {
+            Some(r) => r.prior.as_ref(),
+            None => view.prior.as_ref(),
+        };
+        let prior = match prior.filter(|_| depth) {
+            Some(Prior { kind, values }) => Some((*kind, gpu.upload("prior", values)?)),
+            None => None,
+        };
+        all.push(Photograph {
+            name: view.name.clone(),
+            camera: view.camera,
+            reference: reference.is_some(),
+            picture: gpu.upload("picture", &pack(picture, view.mask.as_ref()))?,
+            prior,
+            mask_box: view.mask.as_ref().and_then(mask_box),
+        });
+    }
+    Ok(all)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn packing_and_boxes() {
+        let picture = RgbImage::from_pixel(3, 2, image::Rgb([1, 2, 255]));
+        let mut mask = GrayImage::new(3, 2);
+        assert_eq!(mask_box(&mask), None);
+        assert_eq!(pack(&picture, None), [0x00ff_0201; 6]);
+        mask.put_pixel(2, 1, image::Luma([1]));
+        assert_eq!(pack(&picture, Some(&mask))[5], 0xffff_0201);
+        assert_eq!(mask_box(&mask), Some([2, 1, 3, 2]));
+        mask.put_pixel(0, 1, image::Luma([255]));
+        assert_eq!(mask_box(&mask), Some([0, 1, 3, 2]));
+    }
+}

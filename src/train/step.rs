@@ -1,0 +1,306 @@
+//! One training step, as one straight line.
+
+use crate::config::Settings;
+use crate::gpu::{Buffer, Error, Gpu, Recorder};
+use crate::losses::{Losses, Targets};
+use crate::math::decoder::Layout;
+use crate::model::anchors::{Anchors, Parameter};
+use crate::model::files;
+use crate::optimizer::adam::{self, Tensors};
+use crate::optimizer::schedule::Rate;
+use crate::primitives::limit::Limits;
+use crate::render::decode::{self, AnchorGradients, DecodeBackward, GaussianGradients};
+use crate::render::project::{ProjectBackward, SplatGradients};
+use crate::render::rasterize::{self, Backward, Picture};
+use crate::render::view::{Capacity, Forward};
+use crate::scene::Camera;
+
+use super::plan::Plan;
+
+/// Where the model's gradients go, zeroed at the beginning of every step.
+struct Gradients {
+    feature: Buffer<f32>,
+    offset: Buffer<f32>,
+    log_scaling: Buffer<f32>,
+    weights: Buffer<f32>,
+}
+
+impl Gradients {
+    fn new(gpu: &Gpu, anchors: &Anchors, weights: &Parameter) -> Result<Self, Error> {
+        Ok(Self {
+            feature: gpu.buffer("grad_feature", anchors.feature.value.len())?,
+            offset: gpu.buffer("grad_offset", anchors.offset.value.len())?,
+            log_scaling: gpu.buffer("grad_log_scaling", anchors.log_scaling.value.len())?,
+            weights: gpu.buffer("grad_weights", weights.value.len())?,
+        })
+    }
+}
+
+/// The stages between the anchors and the picture, both ways.
+struct Stages {
+    forward: Forward,
+    rasterize: Backward,
+    project: ProjectBackward,
+    decode: DecodeBackward,
+}
+
+impl Stages {
+    fn new(gpu: &Gpu, plan: &Plan, capacity: Capacity, offsets: u32) -> Result<Self, Error> {
+        let forward = Forward::new(gpu, capacity, offsets, plan.tiling(gpu.info().subgroup_size), plan.largest())?;
+        let slots = (capacity.visible * offsets) as usize;
+        Ok(Self {
+            rasterize: Backward::new(gpu, slots, capacity.pairs as usize, plan.outputs())?,
+            project: ProjectBackward::new(gpu, &forward.project)?,
+            decode: DecodeBackward::new(gpu, &forward.decode)?,
+            forward,
+        })
+    }
+}
+
+/// What depends on the pictures' size.
+struct Canvas {
+    picture: Picture,
+    losses: Losses,
+}
+
+/// Learning rates of one step.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rates {
+    /// Anchor features.
+    pub feature: f64,
+    /// Offsets, the scene's radius included.
+    pub offset: f64,
+    /// Log-scales.
+    pub log_scaling: f64,
+    /// Opacity, colour and covariance decoder.
+    pub decoders: [f64; 3],
+    /// Attention's projections.
+    pub attention: f64,
+}
+
+impl Rates {
+    /// The rates of `step` (counted from 1) for a scene of this radius.
+    pub fn at(settings: &Settings, radius: f64, step: u32) -> Self {
+        let config = &settings.optimizer;
+        let length = if config.schedule_length == 0 { settings.train.iterations } else { config.schedule_length };
+        let at = |[initial, last]: [f64; 2]| Rate { initial, last }.at(step, length);
+        let rates = &config.learning_rate;
+        Self {
+            feature: at(rates.feature),
+            offset: at(rates.offset.map(|r| r * radius)),
+            log_scaling: at(rates.log_scaling),
+            decoders: [at(rates.mlp_opacity), at(rates.mlp_color), at(rates.mlp_cov)],
+            attention: at(rates.attention),
+        }
+    }
+}
+
+/// The model on the device and the stages that change it.
+pub struct Step {
+    gpu: Gpu,
+    /// The plan the stages were made for.
+    pub plan: Plan,
+    /// The anchors.
+    pub anchors: Anchors,
+    /// The decoders, flat.
+    pub weights: Parameter,
+    /// Overflow flag and counters.
+    pub limits: Limits,
+    capacity: Capacity,
+    gradients: Gradients,
+    stages: Stages,
+    canvases: Vec<Canvas>,
+    adam: adam::Config,
+    near: f32,
+    background: [f32; 3],
+}
+
+/// Names of the decoders' arrays on the device.
+const WEIGHTS: [&str; 3] = ["weights", "weights_first", "weights_root"];
+
+impl Step {
+    /// Uploads the model and makes the stages that the plan has.
+    ///
+    /// # Errors
+    /// When the device has no room.
+    pub fn new(gpu: &Gpu, plan: Plan, settings: &Settings, anchors: &files::Anchors, weights: &files::Weights) -> Result<Self, Error> {
+        let anchors = Anchors::upload(gpu, anchors, 0)?;
+        let flat = weights.decoders();
+        let weights = Parameter::new(gpu, WEIGHTS, flat.len() as u32, 1)?;
+        gpu.write(&weights.value, &flat)?;
+        let mut rec = gpu.recorder()?;
+        rec.zero(&weights.first);
+        rec.zero(&weights.root);
+        rec.submit()?.wait()?;
+        let capacity = Capacity::guess(anchors.capacity);
+        let stages = Stages::new(gpu, &plan, capacity, anchors.offsets)?;
+        let canvases = plan
+            .sizes
+            .iter()
+            .map(|&size| {
+                let pixels = size[0] as usize * size[1] as usize;
+                Ok(Canvas {
+                    picture: Picture::new(gpu, size, pixels, plan.outputs())?,
+                    losses: Losses::new(gpu, size, &settings.losses, plan.depth)?,
+                })
+            })
+            .collect::<Result<_, Error>>()?;
+        Ok(Self {
+            gradients: Gradients::new(gpu, &anchors, &weights)?,
+            limits: Limits::new(gpu)?,
+            gpu: gpu.clone(),
+            anchors,
+            weights,
+            capacity,
+            stages,
+            canvases,
+            adam: adam::Config {
+                beta1: settings.optimizer.betas[0],
+                beta2: settings.optimizer.betas[1],
+                epsilon: settings.optimizer.epsilon,
+            },
+            near: settings.render.near as f32,
+            background: settings.train.background.map(|c| c as f32),
+            plan,
+        })
+    }
+
+    /// Makes the stages anew for this capacity. Nothing of the step may be in flight.
+    ///
+    /// # Errors
+    /// When the device has no room.
+    pub fn resize(&mut self, capacity: Capacity) -> Result<(), Error> {
+        // The old stages' memory goes before the new ones' is taken.
+        let smallest = Capacity { anchors: 1, visible: 1, pairs: 1 };
+        self.stages = Stages::new(&self.gpu, &self.plan, smallest, self.anchors.offsets)?;
+        self.stages = Stages::new(&self.gpu, &self.plan, capacity, self.anchors.offsets)?;
+        self.gradients = Gradients::new(&self.gpu, &self.anchors, &self.weights)?;
+        self.capacity = capacity;
+        Ok(())
+    }
+
+    /// What the stages have room for.
+    pub fn capacity(&self) -> Capacity {
+        self.capacity
+    }
+
+    /// The losses of the last step, in [`crate::losses::NAMES`]' order, for pictures of this size.
+    pub fn losses(&self, size: [u32; 2]) -> &Buffer<f32> {
+        self.canvas(size).losses.values()
+    }
+
+    fn canvas(&self, size: [u32; 2]) -> &Canvas {
+        self.canvases
+            .iter()
+            .find(|c| c.picture.size == size)
+            .expect("the plan lists the sizes of all training pictures")
+    }
+
+    /// Records step `step` (counted from 1): `camera` sees `targets`.
+    pub fn record(&self, rec: &mut Recorder<'_>, camera: &Camera, targets: Targets<'_>, step: u32, rates: Rates) {
+        let Self { anchors, gradients, limits, near, .. } = self;
+        let Stages { forward, rasterize: backward, project: project_backward, decode: decode_backward } = &self.stages;
+        let Canvas { picture, losses } = self.canvas(camera.size);
+        for gradient in [&gradients.feature, &gradients.offset, &gradients.log_scaling] {
+            rec.zero(gradient);
+        }
+        forward.visible.record(rec, anchors, camera, *near, limits);
+        let offset = anchors.offset.value.view();
+        let model = decode::Anchors {
+            position: &anchors.position,
+            feature: &anchors.feature.value,
+            offset: &offset,
+            log_scaling: &anchors.log_scaling.value,
+            weights: &self.weights.value,
+            visible: &forward.visible.list,
+        };
+        forward.decode.record(rec, model, &forward.visible.count, camera.center());
+        forward.project.record(rec, &forward.visible.slots, forward.gaussians(), camera, *near);
+        let binned = forward.bin.record(rec, forward.projected(), camera.size, limits);
+        rasterize::forward(rec, forward.tiling(), forward.projected(), binned, self.background, picture);
+
+        let gradient = losses.record(rec, picture, targets);
+
+        backward.record(rec, forward.tiling(), forward.projected(), binned, picture, gradient);
+        let splats = SplatGradients {
+            mean: &backward.grad_mean,
+            covariance: &backward.grad_covariance,
+            depth: backward.grad_depth.as_ref(),
+        };
+        let slots = &forward.visible.slots;
+        project_backward.record(rec, &forward.project, slots, forward.gaussians(), splats, camera, *near);
+        let gaussians = GaussianGradients {
+            position: &project_backward.grad_position,
+            opacity: &backward.grad_opacity,
+            color: &backward.grad_color,
+            scale: &project_backward.grad_scale,
+            rotation: &project_backward.grad_rotation,
+        };
+        let to = AnchorGradients {
+            feature: &gradients.feature,
+            offset: &gradients.offset.view(),
+            log_scaling: &gradients.log_scaling,
+            weights: &gradients.weights,
+        };
+        decode_backward.record(rec, &forward.decode, model, gaussians, to);
+        self.optimize(rec, step, rates);
+    }
+
+    fn optimize(&self, rec: &mut Recorder<'_>, step: u32, rates: Rates) {
+        let Self { anchors, weights, gradients, .. } = self;
+        let overflow = self.limits.overflow();
+        let mut update = |parameter: &Parameter, gradient: &Buffer<f32>, range: (u32, u32), rate: f64| {
+            if rate == 0.0 {
+                return;
+            }
+            let tensors =
+                Tensors { value: &parameter.value, gradient, first: &parameter.first, root: &parameter.root };
+            adam::record(rec, &self.adam, tensors, overflow, range, (step, rate));
+        };
+        let all = |parameter: &Parameter| (0, anchors.count * parameter.width);
+        update(&anchors.feature, &gradients.feature, all(&anchors.feature), rates.feature);
+        update(&anchors.offset, &gradients.offset, all(&anchors.offset), rates.offset);
+        update(&anchors.log_scaling, &gradients.log_scaling, all(&anchors.log_scaling), rates.log_scaling);
+        let layout = Layout { offsets: anchors.offsets as usize };
+        for (head, rate) in rates.decoders.into_iter().enumerate() {
+            let first = layout.head(head);
+            update(weights, &gradients.weights, (first as u32, (layout.head(head + 1) - first) as u32), rate);
+        }
+    }
+
+    /// The gradients of the last recorded step by PyTorch's names: for tests.
+    ///
+    /// # Errors
+    /// Whatever the copies meet.
+    pub fn gradients(&self) -> Result<std::collections::BTreeMap<String, Vec<f32>>, Error> {
+        let mut all = std::collections::BTreeMap::new();
+        let n = self.anchors.count as usize;
+        for (name, buffer, width) in [
+            ("feature", &self.gradients.feature, 32),
+            ("offset", &self.gradients.offset, 3 * self.anchors.offsets as usize),
+            ("log_scaling", &self.gradients.log_scaling, 6),
+        ] {
+            all.insert(name.to_owned(), self.gpu.read_range(buffer, n * width)?);
+        }
+        let layout = Layout { offsets: self.anchors.offsets as usize };
+        let flat = self.gpu.read_range(&self.gradients.weights, layout.weights())?;
+        let weights = files::Weights::from_device(self.anchors.offsets as usize, &flat, None);
+        all.extend(weights.tensors.into_iter().map(|(name, tensor)| (name, tensor.data)));
+        Ok(all)
+    }
+
+    /// The rendered colour, and depth where the plan has it, of the last step.
+    pub fn picture(&self, size: [u32; 2]) -> &Picture {
+        &self.canvas(size).picture
+    }
+
+    /// The model as it is now.
+    ///
+    /// # Errors
+    /// Whatever the copies meet.
+    pub fn model(&self) -> Result<(files::Anchors, files::Weights), Error> {
+        let layout = Layout { offsets: self.anchors.offsets as usize };
+        let flat = self.gpu.read_range(&self.weights.value, layout.weights())?;
+        Ok((self.anchors.read(&self.gpu)?, files::Weights::from_device(layout.offsets, &flat, None)))
+    }
+}
