@@ -1,6 +1,7 @@
 //! Scalar functions that the CPU twins share.
 
 pub mod adam;
+pub mod align;
 pub mod camera;
 pub mod decoder;
 pub mod ssim;

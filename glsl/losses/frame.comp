@@ -1,0 +1,48 @@
+#version 460
+#extension GL_EXT_scalar_block_layout : require
+#extension GL_GOOGLE_include_directive : require
+#include "thread.glsl"
+// variant masked: MASKED
+// variant masked_depth: MASKED DEPTH
+// The step's photograph and what its mask says: from 8 bits per channel to the losses' arrays.
+layout(local_size_x = 64) in;
+layout(binding = 0, scalar) readonly buffer Picture { uint picture[]; };  // [pixel] red | green << 8 | blue << 16 | mask << 24, the mask 0 or 255
+layout(binding = 1, scalar) writeonly buffer Target { vec3 target[]; };   // [pixel] rgb in 0 to 1
+#ifdef MASKED
+layout(binding = 2, scalar) writeonly buffer Weight { float weight[]; };  // [pixel] of the photometric loss
+#endif
+#ifdef DEPTH
+layout(binding = 3, scalar) writeonly buffer Valid { float valid[]; };    // [pixel] 1 outside the mask
+layout(binding = 4, scalar) writeonly buffer DepthWeight { float depth_weight[]; }; // [pixel] of the depth L1 loss
+#endif
+layout(push_constant, scalar) uniform Push {
+  uint pixels; // width * height
+#ifdef MASKED
+  float outside; // photometric weight outside the mask
+  float inside;  // photometric weight inside
+#endif
+#ifdef DEPTH
+  float depth_outside; // depth weight outside the mask
+  float depth_inside;  // depth weight inside
+  float depth_added;   // added in the rectangle
+  uint width;          // pixels in a line
+  uvec2 low;           // the rectangle's first column and line
+  uvec2 high;          // the column and line behind its last
+#endif
+} push;
+void main() {
+  uint pixel = thread_index();
+  if (pixel >= push.pixels) return;
+  uint word = picture[pixel];
+  target[pixel] = vec3(word & 255u, word >> 8 & 255u, word >> 16 & 255u) / 255.0;
+#ifdef MASKED
+  bool inside = word >> 24 != 0u;
+  weight[pixel] = inside ? push.inside : push.outside;
+#endif
+#ifdef DEPTH
+  valid[pixel] = inside ? 0.0 : 1.0;
+  uvec2 at = uvec2(pixel % push.width, pixel / push.width);
+  bool added = all(greaterThanEqual(at, push.low)) && all(lessThan(at, push.high));
+  depth_weight[pixel] = (inside ? push.depth_inside : push.depth_outside) + (added ? push.depth_added : 0.0);
+#endif
+}

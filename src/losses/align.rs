@@ -1,0 +1,318 @@
+//! Online depth alignment (GScream, equation 4): the rendered depth is fitted to the view's prior by least squares over
+//! the valid pixels, and gradients flow through the fit.
+//!
+//! The sums are taken in trees and in two passes, means first and moments about them: with one pass of plain moments the
+//! determinant would lose `mean^2 / variance` of its digits.
+
+use crate::gpu::kernels::losses::{
+    align_backward, align_fit, align_gradient, align_gradient_masked, align_means, align_means_masked, align_moments,
+    align_moments_masked,
+};
+use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
+use crate::math::align::{Fit, alignable, alignable_slope};
+
+use super::sum;
+
+/// Pixels of a workgroup that sums over pixels: RUN in the kernels times 64.
+const GROUP_PIXELS: usize = 8 * 64;
+
+/// Workgroups that sum over so many pixels.
+pub(super) fn groups(pixels: u32) -> u32 {
+    pixels.div_ceil(GROUP_PIXELS as u32)
+}
+
+/// Threads of these workgroups.
+pub(super) fn threads(pixels: u32) -> u32 {
+    64 * groups(pixels)
+}
+
+/// One row of partial sums per term.
+pub(super) fn partial_sums<const N: usize>(pixels: u32, partial: &mut [f32], term: impl Fn(usize) -> [f64; N]) {
+    let groups = groups(pixels) as usize;
+    for group in 0..groups {
+        let mut sums = [0.0; N];
+        for pixel in group * GROUP_PIXELS..((group + 1) * GROUP_PIXELS).min(pixels as usize) {
+            for (sum, term) in sums.iter_mut().zip(term(pixel)) {
+                *sum += term;
+            }
+        }
+        for (row, sum) in sums.into_iter().enumerate() {
+            partial[row * groups + group] = sum as f32;
+        }
+    }
+}
+
+/// What a prior means.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Quantity {
+    /// A scaled and shifted depth.
+    Depth,
+    /// A scaled and shifted disparity. The rendered depth's disparity is fitted to it: `1 / depth`, below `near` (scene
+    /// units) its tangent.
+    Disparity {
+        /// Where the tangent begins.
+        near: f32,
+    },
+}
+
+impl Quantity {
+    /// `near` as the kernels have it.
+    pub(super) fn near(self) -> f32 {
+        match self {
+            Self::Depth => 0.0,
+            Self::Disparity { near } => near,
+        }
+    }
+}
+
+/// The sums of terms of one sign pass through 8 + 14 additions; distances from the mean cancel, and are small against
+/// the largest sum of the tensor where the means are right.
+const SUMS: Check = Check { relative: 3e-6, absolute: 3e-6, band: 0.0 };
+
+fn means_reference(
+    rendered: &[f32],
+    prior: &[f32],
+    valid: Option<&[f32]>,
+    partial: &mut [f32],
+    push: align_means::Push,
+) {
+    partial_sums(push.pixels, partial, |i| {
+        let v = valid.map_or(1.0, |v| f64::from(v[i]));
+        [v, v * alignable(rendered[i].into(), push.near.into()), v * f64::from(prior[i])]
+    });
+}
+
+impl Reference for align_means::Kernel {
+    fn reference(host: align_means::Host<'_>, push: align_means::Push, (): ()) {
+        means_reference(host.rendered, host.prior, None, host.partial, push);
+    }
+    fn check(_binding: &'static str) -> Check {
+        SUMS
+    }
+}
+
+impl Reference for align_means_masked::Kernel {
+    fn reference(host: align_means_masked::Host<'_>, push: align_means_masked::Push, (): ()) {
+        means_reference(host.rendered, host.prior, Some(host.valid), host.partial, bytemuck::cast(push));
+    }
+    fn check(_binding: &'static str) -> Check {
+        SUMS
+    }
+}
+
+fn moments_reference(
+    [rendered, prior, sums]: [&[f32]; 3],
+    valid: Option<&[f32]>,
+    partial: &mut [f32],
+    push: align_moments::Push,
+) {
+    // The means of the device's sums, in float32 as there: the distances' sums are these means' rounding.
+    let inverse = if sums[0] > 0.0 { 1.0 / sums[0] } else { 0.0 };
+    let mean = [f64::from(sums[1] * inverse), f64::from(sums[2] * inverse)];
+    partial_sums(push.pixels, partial, |i| {
+        let v = valid.map_or(1.0, |v| f64::from(v[i]));
+        let dx = alignable(rendered[i].into(), push.near.into()) - mean[0];
+        let dp = f64::from(prior[i]) - mean[1];
+        [v * dx, v * dp, v * dx * dx, v * dx * dp]
+    });
+}
+
+impl Reference for align_moments::Kernel {
+    fn reference(host: align_moments::Host<'_>, push: align_moments::Push, (): ()) {
+        moments_reference([host.rendered, host.prior, host.sums], None, host.partial, push);
+    }
+    fn check(_binding: &'static str) -> Check {
+        MOMENTS
+    }
+}
+
+impl Reference for align_moments_masked::Kernel {
+    fn reference(host: align_moments_masked::Host<'_>, push: align_moments_masked::Push, (): ()) {
+        let valid = Some(host.valid);
+        moments_reference([host.rendered, host.prior, host.sums], valid, host.partial, bytemuck::cast(push));
+    }
+    fn check(_binding: &'static str) -> Check {
+        MOMENTS
+    }
+}
+
+/// Distances carry the rounding of the mean and of the disparity: 3 * 6e-8 of the value each, up to ten times their
+/// own size where the values spread over a tenth of their mean; the products are as inexact as the distances.
+const MOMENTS: Check = Check { relative: 1e-5, absolute: 1e-5, band: 0.0 };
+
+impl Reference for align_fit::Kernel {
+    fn reference(host: align_fit::Host<'_>, (): (), (): ()) {
+        let sums = std::array::from_fn(|i| f64::from(host.sums[i]));
+        host.fit.copy_from_slice(&Fit::of(sums).to_array().map(|v| v as f32));
+    }
+    fn check(_binding: &'static str) -> Check {
+        // q = mean prior - w mean: a few roundings of the larger of the two.
+        Check { relative: 1e-6, absolute: 5e-7, band: 0.0 }
+    }
+}
+
+fn read_fit(fit: &[f32]) -> Fit {
+    Fit::from_array(std::array::from_fn(|i| f64::from(fit[i])))
+}
+
+impl Reference for align_backward::Kernel {
+    fn reference(host: align_backward::Host<'_>, push: align_backward::Push, (): ()) {
+        let fit = read_fit(host.fit);
+        partial_sums(push.pixels, host.partial, |i| {
+            let g = f64::from(host.grad_aligned[i]);
+            [g, g * (alignable(host.rendered[i].into(), push.near.into()) - fit.mean)]
+        });
+    }
+    fn check(_binding: &'static str) -> Check {
+        // 22 roundings of 512 terms of either sign; the largest partial sum is about sqrt(512) of them.
+        Check { relative: 1e-5, absolute: 22.0 * 6e-8 * 23.0, band: 0.0 }
+    }
+}
+
+fn gradient_reference(
+    [grad_aligned, rendered, prior, fit, sums]: [&[f32]; 5],
+    valid: Option<&[f32]>,
+    grad_depth: &mut [f32],
+    push: align_gradient::Push,
+) {
+    let fit = read_fit(fit);
+    let sums = [f64::from(sums[0]), f64::from(sums[1])];
+    for (i, out) in grad_depth.iter_mut().enumerate().take(push.pixels as usize) {
+        let (depth, near) = (f64::from(rendered[i]), f64::from(push.near));
+        let v = valid.map_or(1.0, |v| f64::from(v[i]));
+        let grad = fit.gradient(grad_aligned[i].into(), sums, alignable(depth, near), prior[i].into(), v);
+        *out = (grad * alignable_slope(depth, near)) as f32;
+    }
+}
+
+/// Four terms of a few roundings each, which may cancel.
+const GRADIENT: Check = Check { relative: 1e-5, absolute: 2e-6, band: 0.0 };
+
+impl Reference for align_gradient::Kernel {
+    fn reference(host: align_gradient::Host<'_>, push: align_gradient::Push, (): ()) {
+        let inputs = [host.grad_aligned, host.rendered, host.prior, host.fit, host.sums];
+        gradient_reference(inputs, None, host.grad_depth, push);
+    }
+    fn check(_binding: &'static str) -> Check {
+        GRADIENT
+    }
+}
+
+impl Reference for align_gradient_masked::Kernel {
+    fn reference(host: align_gradient_masked::Host<'_>, push: align_gradient_masked::Push, (): ()) {
+        let inputs = [host.grad_aligned, host.rendered, host.prior, host.fit, host.sums];
+        gradient_reference(inputs, Some(host.valid), host.grad_depth, bytemuck::cast(push));
+    }
+    fn check(_binding: &'static str) -> Check {
+        GRADIENT
+    }
+}
+
+/// A view's prior and the pixels the fit looks at.
+#[derive(Clone, Copy)]
+pub struct Prior<'a> {
+    /// The prior \[pixel\].
+    pub values: &'a Buffer<f32>,
+    /// What it means.
+    pub quantity: Quantity,
+    /// 1 where the fit looks, 0 elsewhere \[pixel\]; all pixels without it.
+    pub valid: Option<&'a Buffer<f32>>,
+}
+
+/// The fit and its gradient.
+#[derive(Debug)]
+pub struct Align {
+    pixels: u32,
+    partial: Buffer<f32>,
+    sums: Buffer<f32>,
+    grad_sums: Buffer<f32>,
+    fit: Buffer<f32>,
+    grad_depth: Buffer<f32>,
+}
+
+impl Align {
+    /// For maps of `size` = width, height.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub fn new(gpu: &Gpu, size: [u32; 2]) -> Result<Self, Error> {
+        let pixels = size[0] * size[1];
+        Ok(Self {
+            pixels,
+            partial: gpu.buffer("align_partial", 4 * groups(pixels) as usize)?,
+            sums: gpu.buffer("align_sums", 7)?,
+            grad_sums: gpu.buffer("grad_align_sums", 2)?,
+            fit: gpu.buffer("fit", 8)?,
+            grad_depth: gpu.buffer("grad_depth", pixels as usize)?,
+        })
+    }
+
+    /// Records the fit of `rendered` \[pixel\] to the prior and returns it: |w|, q, mean x, the aligned value there, w,
+    /// `1 / sum dx^2`, mean prior, 1 / n. The last four are of use to [`Align::backward`] only.
+    pub fn forward(&self, rec: &mut Recorder<'_>, rendered: &Buffer<f32>, prior: Prior<'_>) -> &Buffer<f32> {
+        let Self { pixels, partial, sums, fit, .. } = self;
+        let (pixels, near) = (*pixels, prior.quantity.near());
+        let (threads, groups) = (threads(pixels), groups(pixels));
+        let values = prior.values;
+        match prior.valid {
+            None => {
+                let buffers = align_means::Buffers { rendered, prior: values, partial };
+                rec.run(align_means::Kernel, buffers, align_means::Push { pixels, near }, threads);
+            }
+            Some(valid) => {
+                let buffers = align_means_masked::Buffers { rendered, prior: values, partial, valid };
+                rec.run(align_means_masked::Kernel, buffers, align_means_masked::Push { pixels, near }, threads);
+            }
+        }
+        sum::record(rec, partial, groups, 3, sums, 0);
+        match prior.valid {
+            None => {
+                let buffers = align_moments::Buffers { rendered, prior: values, sums, partial };
+                rec.run(align_moments::Kernel, buffers, align_moments::Push { pixels, near }, threads);
+            }
+            Some(valid) => {
+                let buffers = align_moments_masked::Buffers { rendered, prior: values, sums, partial, valid };
+                rec.run(align_moments_masked::Kernel, buffers, align_moments_masked::Push { pixels, near }, threads);
+            }
+        }
+        sum::record(rec, partial, groups, 4, sums, 3);
+        rec.run(align_fit::Kernel, align_fit::Buffers { sums, fit }, (), 1u32);
+        fit
+    }
+
+    /// Records the gradient by `rendered` \[pixel\] from that by the aligned values, directly and through the fit, of
+    /// what [`Align::forward`] fitted.
+    pub fn backward(
+        &self,
+        rec: &mut Recorder<'_>,
+        grad_aligned: &Buffer<f32>,
+        rendered: &Buffer<f32>,
+        prior: Prior<'_>,
+    ) -> &Buffer<f32> {
+        let Self { pixels, partial, grad_sums, fit, grad_depth, .. } = self;
+        let (pixels, near) = (*pixels, prior.quantity.near());
+        let buffers = align_backward::Buffers { grad_aligned, rendered, fit, partial };
+        rec.run(align_backward::Kernel, buffers, align_backward::Push { pixels, near }, threads(pixels));
+        sum::record(rec, partial, groups(pixels), 2, grad_sums, 0);
+        let (values, sums) = (prior.values, grad_sums);
+        match prior.valid {
+            None => {
+                let buffers = align_gradient::Buffers { grad_aligned, rendered, prior: values, fit, sums, grad_depth };
+                rec.run(align_gradient::Kernel, buffers, align_gradient::Push { pixels, near }, pixels);
+            }
+            Some(valid) => {
+                let buffers = align_gradient_masked::Buffers {
+                    grad_aligned,
+                    rendered,
+                    prior: values,
+                    fit,
+                    sums,
+                    grad_depth,
+                    valid,
+                };
+                rec.run(align_gradient_masked::Kernel, buffers, align_gradient_masked::Push { pixels, near }, pixels);
+            }
+        }
+        grad_depth
+    }
+}

@@ -1,0 +1,189 @@
+//! Multi-scale total variation of the depth difference (GScream, equation 6): the sum over scales s of
+//! `1 / sum(mask) sum |grad(mask d)|` over every 2^s-th pixel of every 2^s-th line, d = aligned - prior. A scale without
+//! a valid pixel counts nothing.
+
+use crate::gpu::kernels::losses::{depth_gradient, depth_gradient_counts, depth_gradient_masked};
+use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
+
+use super::align::{groups, partial_sums, threads};
+use super::sum;
+
+/// The kernels' largest number of scales.
+pub const MAX_SCALES: u32 = 8;
+
+/// Whether scale `s` has this pixel.
+fn has(s: u32, pixel: usize, width: usize) -> bool {
+    (pixel % width).is_multiple_of(1 << s) && (pixel / width).is_multiple_of(1 << s)
+}
+
+impl Reference for depth_gradient_counts::Kernel {
+    fn reference(host: depth_gradient_counts::Host<'_>, push: depth_gradient_counts::Push, (): ()) {
+        let [width, height] = push.size;
+        let groups = groups(width * height) as usize;
+        for s in 0..push.scales.min(MAX_SCALES) {
+            partial_sums(width * height, &mut host.partial[s as usize * groups..], |i| {
+                [if has(s, i, width as usize) { f64::from(host.valid[i]) } else { 0.0 }]
+            });
+        }
+    }
+    fn check(_binding: &'static str) -> Check {
+        // Counts are exact; a mask of other values is summed in 22 additions.
+        Check { relative: 2e-6, absolute: 0.0, band: 0.0 }
+    }
+}
+
+fn reference(
+    difference: &[f32],
+    mask: impl Fn(usize) -> f64,
+    count: impl Fn(u32) -> f64,
+    grad_aligned: &mut [f32],
+    partial: &mut [f32],
+    push: depth_gradient::Push,
+) {
+    let [width, height] = push.size.map(|v| v as usize);
+    let mut grad = vec![0.0; width * height];
+    let mut loss = vec![0.0; width * height];
+    // In float32 as on the device: the sign of a difference is then the same.
+    let value = |i: usize| f64::from(mask(i) as f32 * difference[i]);
+    for s in 0..push.scales {
+        let (step, count) = (1 << s, count(s));
+        if count == 0.0 {
+            break;
+        }
+        let scale = f64::from(push.factor) / count;
+        for (i, loss) in loss.iter_mut().enumerate().filter(|(i, _)| has(s, *i, width)) {
+            let neighbours = [(i % width + step < width, i + step), (i / width + step < height, i + step * width)];
+            for (_, j) in neighbours.into_iter().filter(|n| n.0) {
+                let (weight, d) = (scale * mask(i) * mask(j), value(j) - value(i));
+                *loss += weight * d.abs();
+                if d != 0.0 {
+                    grad[i] -= weight * d.signum() * mask(i);
+                    grad[j] += weight * d.signum() * mask(j);
+                }
+            }
+        }
+    }
+    for (out, grad) in grad_aligned.iter_mut().zip(grad) {
+        *out = (f64::from(*out) + grad) as f32;
+    }
+    partial_sums(push.size[0] * push.size[1], partial, |i| [loss[i]]);
+}
+
+fn check(binding: &str) -> Check {
+    match binding {
+        // Up to 4 terms a scale, and one addition.
+        "grad_aligned" => Check { relative: 2e-6, absolute: 1e-6, band: 0.0 },
+        _ => Check { relative: 1e-5, absolute: 1e-6, band: 0.0 },
+    }
+}
+
+/// Pixels of scale s along a side.
+fn along(side: u32, s: u32) -> u32 {
+    side.div_ceil(1 << s)
+}
+
+impl Reference for depth_gradient::Kernel {
+    fn reference(host: depth_gradient::Host<'_>, push: depth_gradient::Push, (): ()) {
+        let count = |s| f64::from(along(push.size[0], s)) * f64::from(along(push.size[1], s));
+        reference(host.difference, |_| 1.0, count, host.grad_aligned, host.partial, push);
+    }
+    fn check(binding: &'static str) -> Check {
+        check(binding)
+    }
+}
+
+impl Reference for depth_gradient_masked::Kernel {
+    fn reference(host: depth_gradient_masked::Host<'_>, push: depth_gradient_masked::Push, (): ()) {
+        let mask = |i: usize| f64::from(host.valid[i]);
+        let count = |s: u32| f64::from(host.counts[s as usize]);
+        reference(host.difference, mask, count, host.grad_aligned, host.partial, bytemuck::cast(push));
+    }
+    fn check(binding: &'static str) -> Check {
+        check(binding)
+    }
+}
+
+/// The depth gradient loss and its gradient by the aligned values.
+#[derive(Debug)]
+pub struct DepthGradient {
+    size: [u32; 2],
+    scales: u32,
+    partial: Buffer<f32>,
+    counts: Option<Counts>,
+}
+
+/// Only for losses that look at a part of the picture.
+#[derive(Debug)]
+struct Counts {
+    partial: Buffer<f32>,
+    counts: Buffer<f32>,
+}
+
+impl DepthGradient {
+    /// For maps of `size` = width, height and so many scales, 1 to 8; `masked` if it will be given valid pixels.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    ///
+    /// # Panics
+    /// With another number of scales.
+    pub fn new(gpu: &Gpu, size: [u32; 2], scales: u32, masked: bool) -> Result<Self, Error> {
+        assert!((1..=MAX_SCALES).contains(&scales), "the depth gradient has 1 to {MAX_SCALES} scales, not {scales}");
+        let groups = groups(size[0] * size[1]) as usize;
+        let counts = || -> Result<Counts, Error> {
+            Ok(Counts {
+                partial: gpu.buffer("depth_gradient_count_partial", scales as usize * groups)?,
+                counts: gpu.buffer("depth_gradient_counts", scales as usize)?,
+            })
+        };
+        Ok(Self {
+            size,
+            scales,
+            partial: gpu.buffer("depth_gradient_partial", groups)?,
+            counts: if masked { Some(counts()?) } else { None },
+        })
+    }
+
+    /// Records `factor` times the loss of `difference` \[pixel\] over the valid pixels (all without `valid`) into
+    /// `losses[slot]`, and adds its gradient to `grad_aligned` \[pixel\].
+    ///
+    /// # Panics
+    /// When given `valid` without having been made for it.
+    #[expect(
+        clippy::too_many_arguments,
+        reason = "a loss takes what it compares, its weights and where its value goes"
+    )]
+    pub fn forward_backward(
+        &self,
+        rec: &mut Recorder<'_>,
+        difference: &Buffer<f32>,
+        grad_aligned: &Buffer<f32>,
+        valid: Option<&Buffer<f32>>,
+        factor: f32,
+        losses: &Buffer<f32>,
+        slot: u32,
+    ) {
+        let Self { size, scales, partial, counts } = self;
+        let (size, scales) = (*size, *scales);
+        let pixels = size[0] * size[1];
+        match valid {
+            None => {
+                let buffers = depth_gradient::Buffers { difference, grad_aligned, partial };
+                let push = depth_gradient::Push { size, factor, scales };
+                rec.run(depth_gradient::Kernel, buffers, push, threads(pixels));
+            }
+            Some(valid) => {
+                let Counts { partial: count_partial, counts } =
+                    counts.as_ref().expect("a masked depth gradient is made with counts");
+                let buffers = depth_gradient_counts::Buffers { valid, partial: count_partial };
+                let push = depth_gradient_counts::Push { size, scales };
+                rec.run(depth_gradient_counts::Kernel, buffers, push, threads(pixels));
+                sum::record(rec, count_partial, groups(pixels), scales, counts, 0);
+                let buffers = depth_gradient_masked::Buffers { difference, grad_aligned, partial, valid, counts };
+                let push = depth_gradient_masked::Push { size, factor, scales };
+                rec.run(depth_gradient_masked::Kernel, buffers, push, threads(pixels));
+            }
+        }
+        sum::record(rec, partial, groups(pixels), 1, losses, slot);
+    }
+}

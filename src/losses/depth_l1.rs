@@ -1,0 +1,139 @@
+//! Weighted L1 between the aligned rendered depth and the prior (GScream, equation 5): `1 / (W H) sum weight |d|` with
+//! d = aligned - prior.
+
+use crate::gpu::kernels::losses::{depth_l1, depth_l1_weighted};
+use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
+use crate::math::align::{Fit, alignable};
+
+use super::align::{Prior, groups, partial_sums, threads};
+use super::sum;
+
+struct Inputs<'a> {
+    rendered: &'a [f32],
+    prior: &'a [f32],
+    fit: &'a [f32],
+    weight: Option<&'a [f32]>,
+}
+
+fn reference(
+    from: &Inputs<'_>,
+    [difference, grad_aligned, partial]: [&mut [f32]; 3],
+    depth_l1::Push { pixels, near, factor }: depth_l1::Push,
+) {
+    let fit = Fit::from_array(std::array::from_fn(|i| f64::from(from.fit[i])));
+    let d = |i: usize| fit.difference(alignable(from.rendered[i].into(), near.into()), from.prior[i].into());
+    let scale = |i: usize| f64::from(factor) * from.weight.map_or(1.0, |w| f64::from(w[i]));
+    for i in 0..pixels as usize {
+        let d = d(i);
+        difference[i] = d as f32;
+        grad_aligned[i] = if d == 0.0 { 0.0 } else { (scale(i) * d.signum()) as f32 };
+    }
+    partial_sums(pixels, partial, |i| [scale(i) * d(i).abs()]);
+}
+
+fn check(binding: &str) -> Check {
+    match binding {
+        // A sign may flip where the difference is within its rounding, 1e-6 of the depths, of zero.
+        "grad_aligned" => Check { relative: 1e-6, absolute: 0.0, band: 1e-5 },
+        // Six roundings of the aligned value and the prior, which cancel.
+        "difference" => Check { relative: 1e-6, absolute: 2e-6, band: 0.0 },
+        _ => Check { relative: 1e-5, absolute: 3e-6, band: 0.0 },
+    }
+}
+
+impl Reference for depth_l1::Kernel {
+    fn reference(host: depth_l1::Host<'_>, push: depth_l1::Push, (): ()) {
+        let from = Inputs { rendered: host.rendered, prior: host.prior, fit: host.fit, weight: None };
+        reference(&from, [host.difference, host.grad_aligned, host.partial], push);
+    }
+    fn check(binding: &'static str) -> Check {
+        check(binding)
+    }
+}
+
+impl Reference for depth_l1_weighted::Kernel {
+    fn reference(host: depth_l1_weighted::Host<'_>, push: depth_l1_weighted::Push, (): ()) {
+        let weight = Some(host.weight);
+        let from = Inputs { rendered: host.rendered, prior: host.prior, fit: host.fit, weight };
+        reference(&from, [host.difference, host.grad_aligned, host.partial], bytemuck::cast(push));
+    }
+    fn check(binding: &'static str) -> Check {
+        check(binding)
+    }
+}
+
+/// Weights of the pixels.
+#[derive(Clone, Copy)]
+pub enum Weight<'a> {
+    /// Of all pixels.
+    All(f32),
+    /// Of each \[pixel\].
+    Each(&'a Buffer<f32>),
+}
+
+/// The depth L1 loss and its gradient by the aligned values.
+#[derive(Debug)]
+pub struct DepthL1 {
+    pixels: u32,
+    difference: Buffer<f32>,
+    grad_aligned: Buffer<f32>,
+    partial: Buffer<f32>,
+}
+
+impl DepthL1 {
+    /// For maps of `size` = width, height.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub fn new(gpu: &Gpu, size: [u32; 2]) -> Result<Self, Error> {
+        let pixels = size[0] * size[1];
+        Ok(Self {
+            pixels,
+            difference: gpu.buffer("depth_difference", pixels as usize)?,
+            grad_aligned: gpu.buffer("grad_aligned", pixels as usize)?,
+            partial: gpu.buffer("depth_l1_partial", groups(pixels) as usize)?,
+        })
+    }
+
+    /// Records the loss of `rendered` \[pixel\] under `fit` into `losses[slot]` and returns aligned - prior and the
+    /// loss's gradient by the aligned values, both \[pixel\]. Where they agree the gradient is zero.
+    #[expect(
+        clippy::too_many_arguments,
+        reason = "a loss takes what it compares, its weights and where its value goes"
+    )]
+    pub fn forward_backward(
+        &self,
+        rec: &mut Recorder<'_>,
+        rendered: &Buffer<f32>,
+        prior: Prior<'_>,
+        fit: &Buffer<f32>,
+        weight: Weight<'_>,
+        losses: &Buffer<f32>,
+        slot: u32,
+    ) -> (&Buffer<f32>, &Buffer<f32>) {
+        let Self { pixels, difference, grad_aligned, partial } = self;
+        let (pixels, near, values) = (*pixels, prior.quantity.near(), prior.values);
+        match weight {
+            Weight::All(weight) => {
+                let push = depth_l1::Push { pixels, near, factor: weight / pixels as f32 };
+                let buffers = depth_l1::Buffers { rendered, prior: values, fit, difference, grad_aligned, partial };
+                rec.run(depth_l1::Kernel, buffers, push, threads(pixels));
+            }
+            Weight::Each(weight) => {
+                let push = depth_l1_weighted::Push { pixels, near, factor: 1.0 / pixels as f32 };
+                let buffers = depth_l1_weighted::Buffers {
+                    rendered,
+                    prior: values,
+                    fit,
+                    difference,
+                    grad_aligned,
+                    partial,
+                    weight,
+                };
+                rec.run(depth_l1_weighted::Kernel, buffers, push, threads(pixels));
+            }
+        }
+        sum::record(rec, partial, groups(pixels), 1, losses, slot);
+        (difference, grad_aligned)
+    }
+}

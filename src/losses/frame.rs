@@ -1,0 +1,234 @@
+//! The step's photograph and what its mask says, from 8 bits per channel to the arrays that the losses read.
+
+use crate::gpu::kernels::losses::{frame, frame_masked, frame_masked_depth};
+use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
+
+/// A word of a resident picture.
+pub fn pack([r, g, b]: [u8; 3], masked: bool) -> u32 {
+    u32::from_le_bytes([r, g, b, if masked { 255 } else { 0 }])
+}
+
+/// A weight outside the mask and one inside.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Weights {
+    /// Of pixels outside the mask.
+    pub outside: f32,
+    /// Of pixels inside the mask.
+    pub inside: f32,
+}
+
+/// A rectangle of pixels in which a weight is added.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rectangle {
+    /// First column and line.
+    pub low: [u32; 2],
+    /// The column and line behind the last.
+    pub high: [u32; 2],
+    /// The weight added.
+    pub added: f32,
+}
+
+fn target(picture: &[u32], target: &mut [[f32; 3]], pixels: u32) {
+    for (out, word) in target.iter_mut().zip(picture).take(pixels as usize) {
+        let [r, g, b, _] = word.to_le_bytes();
+        *out = [r, g, b].map(|v| (f64::from(v) / 255.0) as f32);
+    }
+}
+
+fn choose(picture: &[u32], out: &mut [f32], pixels: u32, value: impl Fn(u32, bool) -> f32) {
+    for (pixel, (out, word)) in out.iter_mut().zip(picture).enumerate().take(pixels as usize) {
+        *out = value(pixel as u32, word >> 24 != 0);
+    }
+}
+
+/// One division; weights are copied or are one sum.
+const CHECK: Check = Check { relative: 3e-7, absolute: 0.0, band: 0.0 };
+
+impl Reference for frame::Kernel {
+    fn reference(host: frame::Host<'_>, push: frame::Push, (): ()) {
+        target(host.picture, host.target, push.pixels);
+    }
+    fn check(_binding: &'static str) -> Check {
+        CHECK
+    }
+}
+
+impl Reference for frame_masked::Kernel {
+    fn reference(host: frame_masked::Host<'_>, push: frame_masked::Push, (): ()) {
+        target(host.picture, host.target, push.pixels);
+        choose(host.picture, host.weight, push.pixels, |_, inside| if inside { push.inside } else { push.outside });
+    }
+    fn check(_binding: &'static str) -> Check {
+        CHECK
+    }
+}
+
+impl Reference for frame_masked_depth::Kernel {
+    fn reference(host: frame_masked_depth::Host<'_>, push: frame_masked_depth::Push, (): ()) {
+        target(host.picture, host.target, push.pixels);
+        choose(host.picture, host.weight, push.pixels, |_, inside| if inside { push.inside } else { push.outside });
+        choose(host.picture, host.valid, push.pixels, |_, inside| if inside { 0.0 } else { 1.0 });
+        choose(host.picture, host.depth_weight, push.pixels, |pixel, inside| {
+            let at = [pixel % push.width, pixel / push.width];
+            let added = (0..2).all(|i| (push.low[i]..push.high[i]).contains(&at[i]));
+            (if inside { push.depth_inside } else { push.depth_outside }) + if added { push.depth_added } else { 0.0 }
+        });
+    }
+    fn check(_binding: &'static str) -> Check {
+        CHECK
+    }
+}
+
+/// The arrays of the current view. Those that the plan has no use for do not exist.
+#[derive(Debug)]
+pub struct Frame {
+    size: [u32; 2],
+    target: Buffer<[f32; 3]>,
+    masked: Option<Masked>,
+}
+
+#[derive(Debug)]
+struct Masked {
+    weight: Buffer<f32>,
+    depth: Option<MaskedDepth>,
+}
+
+#[derive(Debug)]
+struct MaskedDepth {
+    valid: Buffer<f32>,
+    weight: Buffer<f32>,
+}
+
+impl Frame {
+    /// For pictures of `size` = width, height; weights exist with `masks`, those of the depth with `depth` as well.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub fn new(gpu: &Gpu, size: [u32; 2], masks: bool, depth: bool) -> Result<Self, Error> {
+        let pixels = size[0] as usize * size[1] as usize;
+        let masked_depth = || -> Result<MaskedDepth, Error> {
+            Ok(MaskedDepth { valid: gpu.buffer("valid", pixels)?, weight: gpu.buffer("depth_weight", pixels)? })
+        };
+        let masked = || -> Result<Masked, Error> {
+            Ok(Masked {
+                weight: gpu.buffer("weight", pixels)?,
+                depth: if depth { Some(masked_depth()?) } else { None },
+            })
+        };
+        Ok(Self { size, target: gpu.buffer("target", pixels)?, masked: if masks { Some(masked()?) } else { None } })
+    }
+
+    /// Records the expansion of `picture` \[pixel\], see [`pack`]. The depth's arrays are written with `depth` only.
+    pub fn forward(
+        &self,
+        rec: &mut Recorder<'_>,
+        picture: &Buffer<u32>,
+        weights: Weights,
+        depth: Option<(Weights, Option<Rectangle>)>,
+    ) {
+        let Self { size: [width, height], target, masked } = self;
+        let pixels = width * height;
+        let Weights { outside, inside } = weights;
+        let Some(Masked { weight, depth: arrays }) = masked else {
+            return rec.run(frame::Kernel, frame::Buffers { picture, target }, frame::Push { pixels }, pixels);
+        };
+        let (Some(arrays), Some((depth, rectangle))) = (arrays, depth) else {
+            let buffers = frame_masked::Buffers { picture, target, weight };
+            return rec.run(frame_masked::Kernel, buffers, frame_masked::Push { pixels, outside, inside }, pixels);
+        };
+        let Rectangle { low, high, added } = rectangle.unwrap_or(Rectangle { low: [0; 2], high: [0; 2], added: 0.0 });
+        let push = frame_masked_depth::Push {
+            pixels,
+            outside,
+            inside,
+            depth_outside: depth.outside,
+            depth_inside: depth.inside,
+            depth_added: added,
+            width: *width,
+            low,
+            high,
+        };
+        let MaskedDepth { valid, weight: depth_weight } = arrays;
+        let buffers = frame_masked_depth::Buffers { picture, target, weight, valid, depth_weight };
+        rec.run(frame_masked_depth::Kernel, buffers, push, pixels);
+    }
+
+    /// The photograph \[pixel\], rgb in 0 to 1.
+    pub fn target(&self) -> &Buffer<[f32; 3]> {
+        &self.target
+    }
+
+    /// Photometric weight \[pixel\], with masks.
+    pub fn weight(&self) -> Option<&Buffer<f32>> {
+        self.masked.as_ref().map(|m| &m.weight)
+    }
+
+    /// 1 outside the mask, 0 inside \[pixel\], with masks and depth.
+    pub fn valid(&self) -> Option<&Buffer<f32>> {
+        self.masked.as_ref()?.depth.as_ref().map(|d| &d.valid)
+    }
+
+    /// Weight of the depth L1 loss \[pixel\], with masks and depth.
+    pub fn depth_weight(&self) -> Option<&Buffer<f32>> {
+        self.masked.as_ref()?.depth.as_ref().map(|d| &d.weight)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::testing::{self, UNWRITTEN};
+    use rand::{RngExt, SeedableRng};
+
+    #[test]
+    fn kernels_match_their_twins() {
+        let gpu = testing::gpu();
+        let mut rng = rand_pcg::Pcg32::seed_from_u64(5);
+        for (width, pixels) in [(1, 0), (1, 1), (17, 17), (9, 63), (8, 64), (5, 65), (53, 53 * 37), (252, 252 * 142)] {
+            // One pixel more than the picture has: left alone.
+            let n = pixels as usize + 1;
+            let picture: Vec<u32> =
+                (0..n).map(|_| pack(std::array::from_fn(|_| rng.random()), rng.random::<f32>() < 0.3)).collect();
+            let target = vec![[UNWRITTEN; 3]; n];
+            let unwritten = vec![UNWRITTEN; n];
+            let case = frame::Arrays { picture: picture.clone(), target: target.clone() };
+            testing::assert_twin(frame::Kernel, &gpu, case, frame::Push { pixels }, pixels);
+            let case =
+                frame_masked::Arrays { picture: picture.clone(), target: target.clone(), weight: unwritten.clone() };
+            let push = frame_masked::Push { pixels, outside: 1.0, inside: 20.0 };
+            testing::assert_twin(frame_masked::Kernel, &gpu, case, push, pixels);
+            let case = frame_masked_depth::Arrays {
+                picture,
+                target,
+                weight: unwritten.clone(),
+                valid: unwritten.clone(),
+                depth_weight: unwritten,
+            };
+            let push = frame_masked_depth::Push {
+                pixels,
+                outside: 1.0,
+                inside: 0.0,
+                depth_outside: 0.1,
+                depth_inside: 0.0,
+                depth_added: 99.0,
+                width,
+                low: [2, 1],
+                high: [width.saturating_sub(3), 30],
+            };
+            testing::assert_twin(frame_masked_depth::Kernel, &gpu, case, push, pixels);
+        }
+    }
+
+    #[test]
+    fn every_byte_comes_back() {
+        let gpu = testing::gpu();
+        let bytes: Vec<u8> = (0..=255).collect();
+        let picture = bytes.iter().map(|&v| pack([v, 255 - v, v ^ 0x55], v % 2 == 0)).collect();
+        let case = frame::Arrays { picture, target: vec![[UNWRITTEN; 3]; 256] };
+        let got = testing::run_once::<frame::Kernel>(&gpu, &case, frame::Push { pixels: 256 }, 256u32).target;
+        for (v, got) in bytes.iter().zip(got) {
+            assert_eq!(got.map(|c| (c * 255.0).round() as u8), [*v, 255 - v, v ^ 0x55]);
+        }
+        assert_eq!(pack([0, 0, 255], true), 0xFFFF_0000);
+    }
+}

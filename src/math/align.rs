@@ -1,0 +1,121 @@
+//! The least-squares fit of a rendered map to a prior that is known up to scale and shift, and the way back through it,
+//! in float64.
+
+/// What is fitted to a prior: the rendered depth itself (`near` = 0), or its disparity: `1 / depth`, continued below
+/// `near` by its tangent `(2 - depth / near) / near`, which is finite where nothing was rendered.
+pub fn alignable(depth: f64, near: f64) -> f64 {
+    if near == 0.0 {
+        depth
+    } else if depth >= near {
+        1.0 / depth
+    } else {
+        (2.0 - depth / near) / near
+    }
+}
+
+/// Derivative of [`alignable`] by the depth.
+pub fn alignable_slope(depth: f64, near: f64) -> f64 {
+    if near == 0.0 { 1.0 } else { -1.0 / depth.max(near).powi(2) }
+}
+
+/// Sums over valid pixels: of the weights, the values x and the priors p, and then of the distances dx, dp from these
+/// sums' means, of dx^2 and of dx dp. The distances' sums are zero but for the means' rounding.
+pub type Sums = [f64; 7];
+
+/// Both passes' sums in float64.
+pub fn sums(x: &[f64], prior: &[f64], valid: &[f64]) -> Sums {
+    let mut s = [0.0; 7];
+    for ((x, p), v) in x.iter().zip(prior).zip(valid) {
+        s[0] += v;
+        s[1] += v * x;
+        s[2] += v * p;
+    }
+    let n = if s[0] > 0.0 { s[0] } else { 1.0 };
+    let (mean, mean_prior) = (s[1] / n, s[2] / n);
+    for ((x, p), v) in x.iter().zip(prior).zip(valid) {
+        let (dx, dp) = (x - mean, p - mean_prior);
+        s[3] += v * dx;
+        s[4] += v * dp;
+        s[5] += v * dx * dx;
+        s[6] += v * dx * dp;
+    }
+    s
+}
+
+/// `slope * x + shift ~ prior` by least squares; aligned values are `scale * x + shift` with `scale = |slope|`.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Fit {
+    /// |slope|.
+    pub scale: f64,
+    /// Shift q.
+    pub shift: f64,
+    /// Mean of x over valid pixels.
+    pub mean: f64,
+    /// The aligned value at the mean: `scale * mean + shift`.
+    pub centre: f64,
+    /// Slope w, signed.
+    pub slope: f64,
+    /// One over the sum of squared distances from the mean; 0 when the fit is singular.
+    pub inverse_spread: f64,
+    /// Mean prior over valid pixels.
+    pub mean_prior: f64,
+    /// One over the number of valid pixels; 0 without any.
+    pub inverse_count: f64,
+}
+
+impl Fit {
+    /// From the sums of both passes. A singular fit (no valid pixel, or a standard deviation of x below 2^-21 of its
+    /// mean: eight float32 roundings) has no scale, no shift and no gradient.
+    pub fn of(sums: Sums) -> Self {
+        let n = sums[0];
+        if n.is_nan() || n <= 0.0 {
+            return Self::default();
+        }
+        let (correction, correction_prior) = (sums[3] / n, sums[4] / n);
+        let (mean, mean_prior) = (sums[1] / n + correction, sums[2] / n + correction_prior);
+        let spread = sums[5] - sums[3] * correction;
+        let rounding = mean * 2.0_f64.powi(-21);
+        let means = Self { mean, mean_prior, inverse_count: 1.0 / n, ..Self::default() };
+        if spread > (n * rounding * rounding).max(1e-37) {
+            let slope = (sums[6] - sums[3] * correction_prior) / spread;
+            Self {
+                scale: slope.abs(),
+                shift: mean_prior - slope * mean,
+                centre: mean_prior + (slope.abs() - slope) * mean,
+                slope,
+                inverse_spread: 1.0 / spread,
+                ..means
+            }
+        } else {
+            means
+        }
+    }
+
+    /// In the order in which the kernels keep it.
+    pub fn to_array(self) -> [f64; 8] {
+        let Self { scale, shift, mean, centre, slope, inverse_spread, mean_prior, inverse_count } = self;
+        [scale, shift, mean, centre, slope, inverse_spread, mean_prior, inverse_count]
+    }
+
+    /// Inverse of [`Fit::to_array`].
+    pub fn from_array(values: [f64; 8]) -> Self {
+        let [scale, shift, mean, centre, slope, inverse_spread, mean_prior, inverse_count] = values;
+        Self { scale, shift, mean, centre, slope, inverse_spread, mean_prior, inverse_count }
+    }
+
+    /// Aligned value less prior.
+    pub fn difference(&self, x: f64, prior: f64) -> f64 {
+        self.scale * (x - self.mean) - (prior - self.centre)
+    }
+
+    /// `dL/dx` of a pixel from `grad_aligned` = dL/d(aligned) there, with the sums of grad_aligned and of
+    /// `grad_aligned * (x - mean)` over all pixels:
+    /// `dw/dx = valid (dp - 2 w dx) / S`, `dq/dx = -mean dw/dx - valid w / n`; the gradient of |w| at 0 is 0.
+    pub fn gradient(&self, grad_aligned: f64, sums: [f64; 2], x: f64, prior: f64, valid: f64) -> f64 {
+        let sign = if self.slope == 0.0 { 0.0 } else { self.slope.signum() };
+        let grad_slope = sign * sums[1] + (sign - 1.0) * self.mean * sums[0];
+        let by_slope =
+            grad_slope * self.inverse_spread * (prior - self.mean_prior - 2.0 * self.slope * (x - self.mean));
+        self.scale * grad_aligned + valid * (by_slope - self.slope * sums[0] * self.inverse_count)
+    }
+}
