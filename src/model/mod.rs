@@ -1,1 +1,3 @@
 //! What is learnt: anchors, decoder, attention; files on disk.
+
+pub mod attention;
