@@ -10,8 +10,8 @@ use rand::{Rng, RngExt};
 
 use crate::gpu::kernels::model::{
     attention_backward, attention_backward_wide, attention_forward, attention_forward_wide, attention_output,
-    attention_output_backward, attention_project, attention_project_backward, attention_weight_backward,
-    attention_weight_sum,
+    attention_output_backward, attention_project, attention_project_backward, attention_skip,
+    attention_weight_backward, attention_weight_sum,
 };
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::math::attention::{FEATURE, HEAD, HEADS, INNER, Offsets, SIDES, dot, softmax_row};
@@ -207,6 +207,12 @@ impl Reference for attention_weight_sum::Kernel {
     }
 }
 
+impl Reference for attention_skip::Kernel {
+    fn reference(host: attention_skip::Host<'_>, (): (), (): ()) {
+        host.skip[0] = u32::from(host.overflow[0] != 0 || host.tokens[0] == 0 || host.tokens[1] == 0);
+    }
+}
+
 /// What belongs to one side of the attention.
 #[derive(Debug)]
 struct Side {
@@ -265,6 +271,7 @@ pub struct Attention {
     wide: bool,
     sides: [Side; 2],
     partial: Buffer<[f32; 4]>,
+    skip: Buffer<u32>,
 }
 
 impl Attention {
@@ -304,6 +311,7 @@ impl Attention {
                 ])?,
             ],
             partial: gpu.buffer("attention_partial", SLICES * WEIGHTS / 4)?,
+            skip: gpu.buffer("attention_skip", 1)?,
         })
     }
 
@@ -424,6 +432,14 @@ impl Attention {
         let buffers = attention_weight_sum::Buffers { tokens, partial: &self.partial, grad_weights };
         rec.run(attention_weight_sum::Kernel, buffers, (), WEIGHTS / 4);
         Pair { inside: &self.sides[0].grad_feature, around: &self.sides[1].grad_feature }
+    }
+
+    /// Records the flag `[1]` that the optimiser's pass over these weights takes for its overflow flag: set where the
+    /// step's is, and where there are no tokens (a step without attention moves nothing, not even by momentum).
+    pub fn skip(&self, rec: &mut Recorder<'_>, tokens: &Buffer<u32>, overflow: &Buffer<u32>) -> &Buffer<u32> {
+        let buffers = attention_skip::Buffers { tokens, overflow, skip: &self.skip };
+        rec.run(attention_skip::Kernel, buffers, (), 1u32);
+        &self.skip
     }
 
     fn shares_backward(&self, rec: &mut Recorder<'_>, tokens: &Buffer<u32>, own: u32) {
@@ -584,6 +600,16 @@ mod tests {
             for wide in [false, true] {
                 compare(&inputs, &run(&gpu, &inputs, 301, wide, false), WHOLE);
             }
+        }
+    }
+
+    #[test]
+    fn skip_flag() {
+        let gpu = testing::gpu();
+        for (tokens, overflow, want) in [([5, 5], 0, 0), ([5, 5], 2, 1), ([0, 0], 0, 1), ([3, 0], 0, 1), ([0, 3], 1, 1)] {
+            let case = attention_skip::Arrays { tokens: tokens.to_vec(), overflow: vec![overflow], skip: vec![9] };
+            testing::assert_twin(attention_skip::Kernel, &gpu, case.clone(), (), 1u32);
+            assert_eq!(testing::run_once::<attention_skip::Kernel>(&gpu, &case, (), 1u32).skip, [want]);
         }
     }
 
