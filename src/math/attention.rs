@@ -46,6 +46,10 @@ pub fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
+fn add(to: &mut [f64], factor: f64, x: &[f64]) {
+    to.iter_mut().zip(x).for_each(|(to, x)| *to += factor * x);
+}
+
 /// `x` (n, columns) times the transpose of `w` (rows, columns).
 pub fn linear(x: &[f64], w: &[f64], columns: usize) -> Vec<f64> {
     x.chunks(columns).flat_map(|x| w.chunks(columns).map(move |w| dot(x, w))).collect()
@@ -167,11 +171,9 @@ pub fn backward(
                 let product = dot(grad, head(&mixed[own], i, h));
                 for (j, p) in row.iter().enumerate() {
                     let s = p * (dot(grad, head(&value[other], j, h)) - product) / 8.0;
-                    for d in 0..HEAD {
-                        head_mut(&mut grad_value[other], j, h)[d] += p * grad[d];
-                        head_mut(&mut grad_qk[own], i, h)[d] += s * head(&qk[other], j, h)[d];
-                        head_mut(&mut grad_qk[other], j, h)[d] += s * head(&qk[own], i, h)[d];
-                    }
+                    add(head_mut(&mut grad_value[other], j, h), *p, grad);
+                    add(head_mut(&mut grad_qk[own], i, h), s, head(&qk[other], j, h));
+                    add(head_mut(&mut grad_qk[other], j, h), s, head(&qk[own], i, h));
                 }
             }
         }

@@ -568,9 +568,11 @@ mod tests {
                 assert!(difference.cosine > 1.0 - 1e-6, "{difference}");
             }
         };
-        for side in 0..2 {
-            matches("updated", &got.updated[side], &forward.updated[side]);
-            matches("grad_feature", &got.grad_features[side], &grad_features[side]);
+        for (got, want) in got.updated.iter().zip(&forward.updated) {
+            matches("updated", got, want);
+        }
+        for (got, want) in got.grad_features.iter().zip(&grad_features) {
+            matches("grad_feature", got, want);
         }
         matches("grad_weights", &got.grad_weights, &grad_weights);
     }
@@ -606,7 +608,8 @@ mod tests {
     #[test]
     fn skip_flag() {
         let gpu = testing::gpu();
-        for (tokens, overflow, want) in [([5, 5], 0, 0), ([5, 5], 2, 1), ([0, 0], 0, 1), ([3, 0], 0, 1), ([0, 3], 1, 1)] {
+        for (tokens, overflow, want) in [([5, 5], 0, 0), ([5, 5], 2, 1), ([0, 0], 0, 1), ([3, 0], 0, 1), ([0, 3], 1, 1)]
+        {
             let case = attention_skip::Arrays { tokens: tokens.to_vec(), overflow: vec![overflow], skip: vec![9] };
             testing::assert_twin(attention_skip::Kernel, &gpu, case.clone(), (), 1u32);
             assert_eq!(testing::run_once::<attention_skip::Kernel>(&gpu, &case, (), 1u32).skip, [want]);

@@ -295,21 +295,17 @@ mod tests {
             let (feature, upstream, weights) = (widen(&case.feature), widen(&case.upstream), widen(&case.weights));
             let sides = [0, 1].map(|side| case.rows(side, &feature));
             let forward = exact::forward([&sides[0], &sides[1]], &weights);
-            let grad_updated = [0, 1]
-                .map(|side| case.rows(side, &upstream).into_iter().map(|g| BLEND * g).collect::<Vec<f64>>());
-            let (grads, grad_weights) = exact::backward(
-                [&sides[0], &sides[1]],
-                &weights,
-                &forward,
-                [&grad_updated[0], &grad_updated[1]],
-            );
+            let grad_updated =
+                [0, 1].map(|side| case.rows(side, &upstream).into_iter().map(|g| BLEND * g).collect::<Vec<f64>>());
+            let (grads, grad_weights) =
+                exact::backward([&sides[0], &sides[1]], &weights, &forward, [&grad_updated[0], &grad_updated[1]]);
             let (mut blended, mut grad_feature, mut around_only) = (feature.clone(), upstream, feature.clone());
-            for side in 0..2 {
+            for (side, grads) in grads.iter().enumerate() {
                 for (t, &a) in case.lists()[side].iter().enumerate() {
                     for d in 0..FEATURE {
                         let (at, token) = (a as usize * FEATURE + d, t * FEATURE + d);
                         blended[at] = BLEND * forward.updated[side][token] + (1.0 - BLEND) * feature[at];
-                        grad_feature[at] = (1.0 - BLEND) * grad_feature[at] + grads[side][token];
+                        grad_feature[at] = (1.0 - BLEND) * grad_feature[at] + grads[token];
                         if side == 1 {
                             around_only[at] = blended[at];
                         }

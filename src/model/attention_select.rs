@@ -30,13 +30,12 @@ pub struct Patch {
 /// # Panics
 /// When the bounds are empty.
 pub fn patch_position(rng: &mut impl Rng, bounds: ([u32; 2], [u32; 2]), side: u32, size: [u32; 2]) -> Patch {
-    let mut patch = Patch { corner: [0; 2], side: size.map(|s| s.min(side)) };
-    for axis in 0..2 {
-        let centre = rng.random_range(bounds.0[axis]..bounds.1[axis]);
-        let most = size[axis] - patch.side[axis];
-        patch.corner[axis] = centre.saturating_sub(patch.side[axis] / 2).min(most);
-    }
-    patch
+    let ([left, top], [right, bottom]) = bounds;
+    let patch = size.map(|s| s.min(side));
+    let mut place = |bounds: Range<u32>, axis: usize| {
+        rng.random_range(bounds).saturating_sub(patch[axis] / 2).min(size[axis] - patch[axis])
+    };
+    Patch { corner: [place(left..right, 0), place(top..bottom, 1)], side: patch }
 }
 
 /// A camera as the selection needs it.
@@ -305,8 +304,7 @@ mod tests {
         }
         drop((first, second));
         let tokens = gpu.read(chosen.tokens).expect("readable");
-        let lists = [chosen.inside, chosen.around]
-            .map(|b| gpu.read_range(b, tokens[0] as usize).expect("readable"));
+        let lists = [chosen.inside, chosen.around].map(|b| gpu.read_range(b, tokens[0] as usize).expect("readable"));
         (tokens, lists)
     }
 
