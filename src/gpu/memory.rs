@@ -59,7 +59,7 @@ impl<T: bytemuck::Pod> Buffer<T> {
     /// in the padding behind the last element of `T`.
     pub fn view<U: bytemuck::Pod>(&self) -> Buffer<U> {
         let len = (self.len * size_of::<T>()).div_ceil(size_of::<U>());
-        let bytes = ((len * size_of::<U>()) as u64).max(4);
+        let bytes = (len.max(1) * size_of::<U>()) as u64;
         assert!(bytes <= self.memory.bytes, "{}: no {len} elements of {} bytes", self.name(), size_of::<U>());
         Buffer { memory: self.memory.clone(), bytes, len, element: PhantomData }
     }
@@ -181,7 +181,7 @@ impl Gpu {
         location: MemoryLocation,
     ) -> Result<Buffer<T>, Error> {
         const { assert!(size_of::<T>().is_multiple_of(4), "elements are made of 4-byte components") };
-        let bytes = (len * size_of::<T>()).max(4) as u64;
+        let bytes = (len.max(1) * size_of::<T>()) as u64; // never empty: a whole element, so that its words can be cast
         let limit = self.info().max_binding_bytes;
         if location == MemoryLocation::GpuOnly && bytes > limit {
             return Err(Error::TooLarge { name, bytes, limit, device: self.info().name.clone() });

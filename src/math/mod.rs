@@ -2,6 +2,7 @@
 
 pub mod adam;
 pub mod align;
+pub mod attention;
 pub mod camera;
 pub mod decoder;
 pub mod ssim;
