@@ -142,14 +142,31 @@ impl Losses {
         rec: &mut Recorder<'_>,
         view: &View<'_>,
         rgb: &Buffer<[f32; 3]>,
-        depth: &Buffer<f32>,
+        depth: Option<&Buffer<f32>>,
+    ) -> Gradients<'_> {
+        self.frame.forward(rec, view.picture, view.weights, view.depth.map(|d| (d.weights, d.rectangle)));
+        self.compare(rec, view.depth, rgb, depth)
+    }
+
+    /// The arrays of the current view, which [`Losses::compare`] reads.
+    pub fn frame(&self) -> &frame::Frame {
+        &self.frame
+    }
+
+    /// As [`Losses::forward_backward`], with the frame's arrays as they are.
+    pub fn compare(
+        &self,
+        rec: &mut Recorder<'_>,
+        view: Option<DepthView<'_>>,
+        rgb: &Buffer<[f32; 3]>,
+        depth: Option<&Buffer<f32>>,
     ) -> Gradients<'_> {
         let Self { frame, photometric, depth: stages, terms } = self;
         rec.zero(terms);
-        frame.forward(rec, view.picture, view.weights, view.depth.map(|d| (d.weights, d.rectangle)));
         let slot = Term::Photometric as u32;
         let grad_rgb = photometric.forward_backward(rec, rgb, frame.target(), frame.weight(), terms, slot);
-        let grad_depth = stages.as_ref().zip(view.depth).map(|(Depth { align, l1, gradient }, view)| {
+        let planned = stages.as_ref().zip(depth).zip(view);
+        let grad_depth = planned.map(|((Depth { align, l1, gradient }, depth), view)| {
             let prior = align::Prior { values: view.prior, quantity: view.quantity, valid: frame.valid() };
             let fit = align.forward(rec, depth, prior);
             let weight =

@@ -9,11 +9,14 @@ use crate::config::{Invalid, ensure};
 pub struct Config {
     /// Gaussians at camera depth `near` or less are not drawn, in scene units (3DGS: 0.2).
     pub near: f64,
+    /// Decode only the anchors whose own ellipsoid touches the view (Scaffold-GS). A Gaussian whose anchor is out of view
+    /// is then not drawn; without culling every anchor is decoded in every step.
+    pub cull: bool,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        Self { near: 0.2 }
+        Self { near: 0.2, cull: true }
     }
 }
 

@@ -58,9 +58,16 @@ impl Forward {
     ///
     /// # Errors
     /// As [`Gpu::buffer`].
-    pub fn new(gpu: &Gpu, capacity: Capacity, offsets: u32, tiling: Tiling, size: [u32; 2]) -> Result<Self, Error> {
+    pub fn new(
+        gpu: &Gpu,
+        capacity: Capacity,
+        offsets: u32,
+        tiling: Tiling,
+        size: [u32; 2],
+        cull: bool,
+    ) -> Result<Self, Error> {
         Ok(Self {
-            visible: Visible::new(gpu, capacity.anchors, offsets, capacity.visible)?,
+            visible: Visible::new(gpu, capacity.anchors, offsets, capacity.visible, cull)?,
             decode: Decode::new(gpu, capacity.visible, offsets)?,
             project: Project::new(gpu, capacity.visible, offsets)?,
             bin: Bin::new(gpu, tiling, capacity.visible * offsets, capacity.pairs, size)?,
@@ -122,6 +129,7 @@ pub struct Renderer {
     anchors: Anchors,
     weights: Buffer<f32>,
     near: f32,
+    cull: bool,
     background: [f32; 3],
     limits: Limits,
     capacity: Capacity,
@@ -145,6 +153,7 @@ impl Renderer {
         Ok(Self {
             gpu: gpu.clone(),
             near: config.near as f32,
+            cull: config.cull,
             background,
             limits: Limits::new(gpu)?,
             capacity: Capacity::guess(anchors.count),
@@ -166,7 +175,7 @@ impl Renderer {
                     let tiling = Tiling::of(self.gpu.info().subgroup_size);
                     let pixels = camera.size[0] as usize * camera.size[1] as usize;
                     (
-                        Forward::new(&self.gpu, self.capacity, self.anchors.offsets, tiling, camera.size)?,
+                        Forward::new(&self.gpu, self.capacity, self.anchors.offsets, tiling, camera.size, self.cull)?,
                         Picture::new(&self.gpu, camera.size, pixels, Outputs::ColorDepth)?,
                     )
                 }

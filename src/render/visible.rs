@@ -10,7 +10,8 @@ use crate::scene::Camera;
 
 /// Visible anchors in ascending order, and the dispatch of a thread per slot (visible anchor x Gaussian).
 pub struct Visible {
-    cull: Cull,
+    cull: Option<Cull>,
+    all: Option<Buffer<u32>>,
     compact: Compact,
     capacity: u32,
     offsets: u32,
@@ -24,13 +25,15 @@ pub struct Visible {
 }
 
 impl Visible {
-    /// For `anchors` anchors of `offsets` Gaussians of which at most `capacity` are visible at once.
+    /// For `anchors` anchors of `offsets` Gaussians of which at most `capacity` are visible at once; without culling all
+    /// are.
     ///
     /// # Errors
     /// As [`Gpu::buffer`].
-    pub fn new(gpu: &Gpu, anchors: u32, offsets: u32, capacity: u32) -> Result<Self, Error> {
+    pub fn new(gpu: &Gpu, anchors: u32, offsets: u32, capacity: u32, cull: bool) -> Result<Self, Error> {
         Ok(Self {
-            cull: Cull::new(gpu, anchors)?,
+            cull: if cull { Some(Cull::new(gpu, anchors)?) } else { None },
+            all: if cull { None } else { Some(gpu.upload("flags", &vec![1; anchors as usize])?) },
             compact: Compact::new(gpu, anchors)?,
             capacity,
             offsets,
@@ -46,7 +49,11 @@ impl Visible {
     /// leave the list empty.
     pub fn record(&self, rec: &mut Recorder<'_>, anchors: &Anchors, camera: &Camera, near: f32, limits: &Limits) {
         let log_scaling = &anchors.log_scaling.value;
-        let flags = self.cull.record(rec, &anchors.position, log_scaling, anchors.count, camera, near);
+        let flags = match (&self.cull, &self.all) {
+            (Some(cull), _) => cull.record(rec, &anchors.position, log_scaling, anchors.count, camera, near),
+            (None, Some(all)) => all,
+            (None, None) => unreachable!("made with one of the two"),
+        };
         self.compact.record(rec, flags, &self.list, &self.wanted, Count::Host(anchors.count));
         limits.record(rec, &self.wanted, &self.count, self.capacity, Counter::Visible, 1);
         limits.record(rec, &self.wanted, limits.slots(), self.capacity, Counter::Visible, self.offsets);

@@ -1,6 +1,8 @@
 //! What a scene needs, the step, the loop, checkpoints.
 
 pub mod config;
+pub mod order;
+pub mod photographs;
 pub mod plan;
 pub mod step;
 

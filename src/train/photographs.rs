@@ -3,6 +3,7 @@
 use image::{GrayImage, RgbImage};
 
 use crate::gpu::{Buffer, Error, Gpu};
+use crate::losses;
 use crate::scene::{Camera, Prior, PriorKind, Scene};
 
 /// One training view on the device.
@@ -23,16 +24,8 @@ pub struct Photograph {
 
 /// One word per pixel.
 pub fn pack(picture: &RgbImage, mask: Option<&GrayImage>) -> Vec<u32> {
-    let mut words: Vec<u32> =
-        picture.pixels().map(|p| u32::from_le_bytes([p.0[0], p.0[1], p.0[2], 0])).collect();
-    if let Some(mask) = mask {
-        for (word, m) in words.iter_mut().zip(mask.pixels()) {
-            if m.0[0] != 0 {
-                *word |= 0xff << 24;
-            }
-        }
-    }
-    words
+    let masked = |i: usize| mask.is_some_and(|m| m.as_raw()[i] != 0);
+    picture.pixels().enumerate().map(|(i, p)| losses::pack(p.0, masked(i))).collect()
 }
 
 /// Bounding box of what is not zero.

@@ -1,6 +1,7 @@
 //! What a scene needs: every stage that is present, and for each that is left out the reason.
 
 use crate::config::Settings;
+use crate::losses;
 use crate::render::bin::Tiling;
 use crate::render::rasterize::Outputs;
 use crate::scene::Scene;
@@ -51,12 +52,16 @@ impl Plan {
         let priors = scene.train.iter().any(|v| v.prior.is_some())
             || scene.reference.as_ref().is_some_and(|r| r.prior.is_some());
         let weighted = config.reference_weight + config.reference_inside_weight + config.other_weight > 0.0;
-        let gradient_weight = config.gradient.weight * (config.gradient.reference_weight + config.gradient.other_weight);
+        let gradient_weight =
+            config.gradient.weight * (config.gradient.reference_weight + config.gradient.other_weight);
         let depth = priors && config.enabled && (weighted || gradient_weight > 0.0);
         if !priors {
             leave("depth map, its gradient, alignment and depth losses", "no view has a depth prior");
         } else if !depth {
-            leave("depth map, its gradient, alignment and depth losses", "losses.depth.enabled is false or all its weights are zero");
+            leave(
+                "depth map, its gradient, alignment and depth losses",
+                "losses.depth.enabled is false or all its weights are zero",
+            );
         }
         let depth_gradient = depth && gradient_weight > 0.0;
         if depth && !depth_gradient {
@@ -93,6 +98,13 @@ impl Plan {
         sizes.dedup();
         let reference = scene.reference.as_ref().map(|r| r.view);
         Self { masks, depth, depth_gradient, attention, growth, reference, sizes, left_out }
+    }
+
+    /// The losses of pictures of this size.
+    pub fn losses(&self, size: [u32; 2], settings: &Settings) -> losses::Plan {
+        let gradient_scales = if self.depth_gradient { settings.losses.depth.gradient.scales } else { 0 };
+        let ssim_weight = settings.losses.ssim_weight as f32;
+        losses::Plan { size, ssim_weight, masks: self.masks, depth: self.depth, gradient_scales }
     }
 
     /// What the rasteriser writes.

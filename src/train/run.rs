@@ -14,7 +14,7 @@ use super::step::{Rates, Step};
 use crate::config::Settings;
 use crate::evaluate::{self, Report, ViewMetrics};
 use crate::gpu::{self, Buffer, Gpu, Submission, Timing, Timings};
-use crate::losses;
+use crate::losses::Term;
 use crate::model::{files, init};
 use crate::primitives::limit::{COUNTERS, Counter};
 use crate::render::view::{Rendered, Renderer};
@@ -175,11 +175,11 @@ impl<'a> Run<'a> {
         let initial = init::anchors(&points, settings.model.voxel, offsets)?;
         let weights = init::weights(settings.train.seed, offsets, plan.attention);
         let photographs = photographs::upload(gpu, scene, plan.depth)?;
-        let step = Step::new(gpu, plan, settings, &initial.anchors, &weights, initial.voxel, scene.radius)?;
+        let step = Step::new(gpu, plan, settings, &initial.anchors, &weights)?;
         let mailboxes = (0..DEPTH)
             .map(|_| {
                 Ok(Mailbox {
-                    losses: gpu.readback("losses_mail", losses::NAMES.len())?,
+                    losses: gpu.readback("losses_mail", Term::ALL.len())?,
                     counters: gpu.readback("counters_mail", COUNTERS)?,
                     overflow: gpu.readback("overflow_mail", 1)?,
                 })
@@ -202,7 +202,7 @@ impl<'a> Run<'a> {
 
     fn record_view(&self, rec: &mut gpu::Recorder<'_>, step: u32, view: usize) {
         let rates = Rates::at(self.settings, f64::from(self.scene.radius), step);
-        self.step.record_photograph(rec, self.settings, &self.photographs[view], step, rates);
+        self.step.record(rec, &self.photographs[view], step, rates);
     }
 
     fn submit(&mut self, step: u32, mailbox: usize) -> Result<InFlight<'a>, Error> {
@@ -210,8 +210,8 @@ impl<'a> Run<'a> {
         let mut rec = self.gpu.recorder()?;
         self.record_view(&mut rec, step, view);
         let mail = &self.mailboxes[mailbox];
-        let values = self.step.losses(self.photographs[view].camera.size);
-        rec.copy(values, &mail.losses, losses::NAMES.len());
+        let values = self.step.terms(self.photographs[view].camera.size);
+        rec.copy(values, &mail.losses, Term::ALL.len());
         rec.copy(self.step.limits.counters(), &mail.counters, COUNTERS);
         rec.copy(self.step.limits.overflow(), &mail.overflow, 1);
         Ok(InFlight { step, view, mailbox, submission: rec.submit()? })
@@ -274,7 +274,7 @@ impl<'a> Run<'a> {
                 seconds: started.elapsed().as_secs_f64() - paused,
                 view: self.photographs[view].name.clone(),
                 loss: values.iter().sum(),
-                losses: losses::NAMES.iter().copied().zip(values.iter().copied()).collect(),
+                losses: Term::ALL.iter().map(|t| t.name()).zip(values.iter().copied()).collect(),
                 anchors: self.step.anchors.count,
                 visible: counters[Counter::Visible as usize],
                 gaussians: counters[Counter::Drawn as usize],

@@ -1,20 +1,26 @@
 //! One training step, as one straight line.
 
+use rand::RngExt;
+
 use crate::config::Settings;
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
-use crate::losses::{Losses, Targets};
+use crate::losses::config::Region;
+use crate::losses::{self, DepthView, Losses, Quantity, Rectangle, View, Weights};
 use crate::math::decoder::Layout;
 use crate::model::anchors::{Anchors, Parameter};
 use crate::model::files;
 use crate::optimizer::adam::{self, Tensors};
 use crate::optimizer::schedule::Rate;
 use crate::primitives::limit::Limits;
+
 use crate::render::decode::{self, AnchorGradients, DecodeBackward, GaussianGradients};
 use crate::render::project::{ProjectBackward, SplatGradients};
-use crate::render::rasterize::{self, Backward, Picture};
+use crate::render::rasterize::{self, Backward, Picture, PictureGradient};
 use crate::render::view::{Capacity, Forward};
-use crate::scene::Camera;
+use crate::scene::{Camera, PriorKind};
 
+use super::order::{Stream, random};
+use super::photographs::Photograph;
 use super::plan::Plan;
 
 /// Where the model's gradients go, zeroed at the beginning of every step.
@@ -45,8 +51,9 @@ struct Stages {
 }
 
 impl Stages {
-    fn new(gpu: &Gpu, plan: &Plan, capacity: Capacity, offsets: u32) -> Result<Self, Error> {
-        let forward = Forward::new(gpu, capacity, offsets, plan.tiling(gpu.info().subgroup_size), plan.largest())?;
+    fn new(gpu: &Gpu, plan: &Plan, capacity: Capacity, offsets: u32, cull: bool) -> Result<Self, Error> {
+        let forward =
+            Forward::new(gpu, capacity, offsets, plan.tiling(gpu.info().subgroup_size), plan.largest(), cull)?;
         let slots = (capacity.visible * offsets) as usize;
         Ok(Self {
             rasterize: Backward::new(gpu, slots, capacity.pairs as usize, plan.outputs())?,
@@ -110,9 +117,26 @@ pub struct Step {
     gradients: Gradients,
     stages: Stages,
     canvases: Vec<Canvas>,
+    config: Settings,
     adam: adam::Config,
     near: f32,
     background: [f32; 3],
+}
+
+/// 80 % of the mask's bounding box (x0, y0, one past x1, y1), placed at random in that box enlarged 1.5 times, clipped to
+/// the picture (GScream's release).
+fn random_rectangle(rng: &mut impl RngExt, bounds: [u32; 4], size: [u32; 2]) -> ([u32; 2], [u32; 2]) {
+    let side = |rng: &mut dyn FnMut(f64, f64) -> f64, axis: usize| {
+        let (low, high) = (f64::from(bounds[axis]), f64::from(bounds[axis + 2]));
+        let (extent, middle) = (high - low, 0.5 * (low + high));
+        let (first, last) = (middle - 0.75 * extent, middle + 0.75 * extent - 0.8 * extent);
+        let at = rng(first, last);
+        let clip = |v: f64| v.round().clamp(0.0, f64::from(size[axis])) as u32;
+        (clip(at), clip(at + 0.8 * extent))
+    };
+    let mut uniform = |low: f64, high: f64| low + (high - low) * rng.random::<f64>();
+    let ((x0, x1), (y0, y1)) = (side(&mut uniform, 0), side(&mut uniform, 1));
+    ([x0, y0], [x1, y1])
 }
 
 /// Names of the decoders' arrays on the device.
@@ -123,7 +147,13 @@ impl Step {
     ///
     /// # Errors
     /// When the device has no room.
-    pub fn new(gpu: &Gpu, plan: Plan, settings: &Settings, anchors: &files::Anchors, weights: &files::Weights) -> Result<Self, Error> {
+    pub fn new(
+        gpu: &Gpu,
+        plan: Plan,
+        settings: &Settings,
+        anchors: &files::Anchors,
+        weights: &files::Weights,
+    ) -> Result<Self, Error> {
         let anchors = Anchors::upload(gpu, anchors, 0)?;
         let flat = weights.decoders();
         let weights = Parameter::new(gpu, WEIGHTS, flat.len() as u32, 1)?;
@@ -133,7 +163,7 @@ impl Step {
         rec.zero(&weights.root);
         rec.submit()?.wait()?;
         let capacity = Capacity::guess(anchors.capacity);
-        let stages = Stages::new(gpu, &plan, capacity, anchors.offsets)?;
+        let stages = Stages::new(gpu, &plan, capacity, anchors.offsets, settings.render.cull)?;
         let canvases = plan
             .sizes
             .iter()
@@ -141,7 +171,7 @@ impl Step {
                 let pixels = size[0] as usize * size[1] as usize;
                 Ok(Canvas {
                     picture: Picture::new(gpu, size, pixels, plan.outputs())?,
-                    losses: Losses::new(gpu, size, &settings.losses, plan.depth)?,
+                    losses: Losses::new(gpu, &plan.losses(size, settings))?,
                 })
             })
             .collect::<Result<_, Error>>()?;
@@ -161,6 +191,7 @@ impl Step {
             },
             near: settings.render.near as f32,
             background: settings.train.background.map(|c| c as f32),
+            config: settings.clone(),
             plan,
         })
     }
@@ -171,9 +202,10 @@ impl Step {
     /// When the device has no room.
     pub fn resize(&mut self, capacity: Capacity) -> Result<(), Error> {
         // The old stages' memory goes before the new ones' is taken.
+        let cull = self.config.render.cull;
         let smallest = Capacity { anchors: 1, visible: 1, pairs: 1 };
-        self.stages = Stages::new(&self.gpu, &self.plan, smallest, self.anchors.offsets)?;
-        self.stages = Stages::new(&self.gpu, &self.plan, capacity, self.anchors.offsets)?;
+        self.stages = Stages::new(&self.gpu, &self.plan, smallest, self.anchors.offsets, cull)?;
+        self.stages = Stages::new(&self.gpu, &self.plan, capacity, self.anchors.offsets, cull)?;
         self.gradients = Gradients::new(&self.gpu, &self.anchors, &self.weights)?;
         self.capacity = capacity;
         Ok(())
@@ -184,9 +216,14 @@ impl Step {
         self.capacity
     }
 
-    /// The losses of the last step, in [`crate::losses::NAMES`]' order, for pictures of this size.
-    pub fn losses(&self, size: [u32; 2]) -> &Buffer<f32> {
-        self.canvas(size).losses.values()
+    /// The weighted loss terms of the last step by [`Term`], for pictures of this size.
+    pub fn terms(&self, size: [u32; 2]) -> &Buffer<f32> {
+        self.canvas(size).losses.terms()
+    }
+
+    /// The losses for pictures of this size.
+    pub fn losses(&self, size: [u32; 2]) -> &Losses {
+        &self.canvas(size).losses
     }
 
     fn canvas(&self, size: [u32; 2]) -> &Canvas {
@@ -196,11 +233,76 @@ impl Step {
             .expect("the plan lists the sizes of all training pictures")
     }
 
-    /// Records step `step` (counted from 1): `camera` sees `targets`.
-    pub fn record(&self, rec: &mut Recorder<'_>, camera: &Camera, targets: Targets<'_>, step: u32, rates: Rates) {
+    /// Records step `step` (counted from 1) on a photograph.
+    pub fn record(&self, rec: &mut Recorder<'_>, photograph: &Photograph, step: u32, rates: Rates) {
+        let view = self.view(photograph, step);
+        self.line(rec, &photograph.camera, step, rates, |rec, canvas| {
+            let Canvas { picture, losses } = canvas;
+            losses.forward_backward(rec, &view, &picture.rgb, picture.depth.as_ref().map(|d| &d.0))
+        });
+    }
+
+    /// Records a step against the arrays that the losses' frame holds already: for tests.
+    pub fn record_prepared(
+        &self,
+        rec: &mut Recorder<'_>,
+        camera: &Camera,
+        depth: Option<DepthView<'_>>,
+        step: u32,
+        rates: Rates,
+    ) {
+        self.line(rec, camera, step, rates, |rec, canvas| {
+            let Canvas { picture, losses } = canvas;
+            losses.compare(rec, depth, &picture.rgb, picture.depth.as_ref().map(|d| &d.0))
+        });
+    }
+
+    /// How a photograph counts in a step.
+    fn view<'p>(&self, photograph: &'p Photograph, step: u32) -> View<'p> {
+        let config = &self.config.losses;
+        let (reference, near) = (photograph.reference, self.near);
+        let inside = |on_reference: f64| if reference { on_reference as f32 } else { 0.0 };
+        let depth = photograph.prior.as_ref().map(|(kind, prior)| {
+            let depth = &config.depth;
+            let gradient = &depth.gradient;
+            let outside = if reference { depth.reference_weight } else { depth.other_weight };
+            let boxed = reference && depth.reference_inside_region == Region::RandomRectangle;
+            let added = if boxed { 0.0 } else { depth.reference_inside_weight };
+            let rectangle = photograph.mask_box.filter(|_| boxed).map(|bounds| {
+                let mut rng = random(self.config.train.seed, Stream::Rectangle, step);
+                let (low, high) = random_rectangle(&mut rng, bounds, photograph.camera.size);
+                Rectangle { low, high, added: depth.reference_inside_weight as f32 }
+            });
+            let factor = if reference { gradient.reference_weight } else { gradient.other_weight };
+            DepthView {
+                prior,
+                quantity: match kind {
+                    PriorKind::Depth => Quantity::Depth,
+                    PriorKind::Disparity => Quantity::Disparity { near },
+                },
+                weights: Weights { outside: outside as f32, inside: inside(depth.reference_weight + added) },
+                rectangle,
+                gradient: (gradient.weight * factor) as f32,
+                gradient_inside: reference,
+            }
+        });
+        let weights = Weights { outside: 1.0, inside: inside(config.reference_inside_weight) };
+        View { picture: &photograph.picture, weights, depth }
+    }
+
+    /// The straight line of one step.
+    fn line<'s>(
+        &'s self,
+        rec: &mut Recorder<'_>,
+        camera: &Camera,
+        step: u32,
+        rates: Rates,
+        compare: impl FnOnce(&mut Recorder<'_>, &'s Canvas) -> losses::Gradients<'s>,
+    ) {
         let Self { anchors, gradients, limits, near, .. } = self;
         let Stages { forward, rasterize: backward, project: project_backward, decode: decode_backward } = &self.stages;
-        let Canvas { picture, losses } = self.canvas(camera.size);
+        let canvas = self.canvas(camera.size);
+        let picture = &canvas.picture;
         for gradient in [&gradients.feature, &gradients.offset, &gradients.log_scaling] {
             rec.zero(gradient);
         }
@@ -219,13 +321,14 @@ impl Step {
         let binned = forward.bin.record(rec, forward.projected(), camera.size, limits);
         rasterize::forward(rec, forward.tiling(), forward.projected(), binned, self.background, picture);
 
-        let gradient = losses.record(rec, picture, targets);
+        let gradient = compare(rec, canvas);
 
+        let gradient = PictureGradient { rgb: gradient.rgb, depth: gradient.depth, transmittance: None };
         backward.record(rec, forward.tiling(), forward.projected(), binned, picture, gradient);
         let splats = SplatGradients {
             mean: &backward.grad_mean,
             covariance: &backward.grad_covariance,
-            depth: backward.grad_depth.as_ref(),
+            depth: gradient.depth.and(backward.grad_depth.as_ref()),
         };
         let slots = &forward.visible.slots;
         project_backward.record(rec, &forward.project, slots, forward.gaussians(), splats, camera, *near);
@@ -253,8 +356,7 @@ impl Step {
             if rate == 0.0 {
                 return;
             }
-            let tensors =
-                Tensors { value: &parameter.value, gradient, first: &parameter.first, root: &parameter.root };
+            let tensors = Tensors { value: &parameter.value, gradient, first: &parameter.first, root: &parameter.root };
             adam::record(rec, &self.adam, tensors, overflow, range, (step, rate));
         };
         let all = |parameter: &Parameter| (0, anchors.count * parameter.width);
