@@ -9,6 +9,7 @@ use clap::CommandFactory as _;
 use gscream_vk::cli::Arguments;
 use gscream_vk::cli::folders::Record;
 use gscream_vk::config::Settings;
+use gscream_vk::model;
 use gscream_vk::scene::synthetic;
 use image::{Rgb, RgbImage};
 use tempfile::TempDir;
@@ -106,6 +107,8 @@ fn arguments_that_do_not_parse() {
         "synth scene --train-views 0",
         "eval renders --masks masks",
         "eval renders --truth photographs --downscale 0",
+        "render",
+        "render run --views side",
     ] {
         transcript.fails(folder.path(), 2, arguments);
     }
@@ -193,4 +196,81 @@ fn eval_of_what_cannot_be_compared() {
     fs::write(&broken, &whole[..whole.len() / 2]).expect("writable");
     transcript.fails(folder, 1, "eval scene/test_images --truth scene/test_images");
     insta::assert_snapshot!("eval_errors", transcript.0);
+}
+
+/// A random model of two anchors for the small scene, in a folder of its own.
+fn with_model(folder: &Path) {
+    let anchors = model::files::Anchors {
+        position: vec![[0.0, 1.0, 0.5], [0.3, 1.2, 0.7]],
+        feature: vec![[0.1; model::files::FEATURES]; 2],
+        offset: vec![0.05; 2 * 10 * 3],
+        offsets_per_anchor: 10,
+        log_scaling: vec![[-2.0; 6]; 2],
+    };
+    let weights = model::init::weights(1, 10, false);
+    model::files::save(&folder.join("model"), &anchors, &weights).expect("a writable folder");
+}
+
+#[test]
+fn render_writes_colour_depth_and_transmittance() {
+    let (folder, mut transcript) = (with_scene(), Transcript::default());
+    let folder = folder.path();
+    with_model(folder);
+    transcript.succeeds(folder, "render model --scene scene --validate");
+    transcript.succeeds(folder, "render model --scene scene --views train --downscale 2 --out train");
+    transcript.succeeds(folder, "render model --scene scene --views spiral --frames 11 --out film");
+    insta::assert_snapshot!("render", transcript.0);
+    let expected = [
+        ("model/renders/test", ["test_000", "test_001"].as_slice(), (32, 24)),
+        ("train", &["train_000", "train_001", "train_002"], (16, 12)),
+        ("film", &["frame_00", "frame_10"], (32, 24)),
+    ];
+    for (out, names, size) in expected {
+        for name in names {
+            let picture = image::open(folder.join(out).join(format!("{name}.png"))).expect("a picture");
+            assert_eq!((picture.width(), picture.height()), size);
+            let file = folder.join(out).join(format!("{name}.exr"));
+            let layers = exr::prelude::read_all_flat_layers_from_file(file).expect("an OpenEXR file");
+            let layer = &layers.layer_data[0];
+            let channels: Vec<String> = layer.channel_data.list.iter().map(|c| c.name.to_string()).collect();
+            assert_eq!((layer.size.0, layer.size.1), (size.0 as usize, size.1 as usize));
+            assert_eq!(channels, ["T", "Z"]);
+            for value in layer.channel_data.list[0].sample_data.values_as_f32() {
+                assert!((0.0..=1.0).contains(&value), "a transmittance is a share of light: {value}");
+            }
+        }
+    }
+    assert_eq!(fs::read_dir(folder.join("film")).expect("a folder").count(), 22);
+}
+
+/// What a machine has is cut away: the list behind the name.
+#[test]
+fn render_of_what_is_not_there() {
+    let (folder, mut transcript) = (with_scene(), Transcript::default());
+    let folder = folder.path();
+    with_model(folder);
+    transcript.fails(folder, 1, "render nowhere");
+    transcript.fails(folder, 1, "render scene");
+    transcript.fails(folder, 1, "render model");
+    transcript.fails(folder, 1, "render model --scene nowhere");
+    transcript.fails(folder, 2, "render model --scene scene --set render.nearr=1");
+    transcript.fails(folder, 2, "render model --scene scene --set render.near=-1");
+    transcript.fails(folder, 2, "render model --scene scene --set model.voxels");
+    transcript.fails(folder, 2, "render model --scene scene --config nowhere.toml");
+    transcript.fails(folder, 1, "render model --scene scene --device abacus");
+    fs::remove_dir_all(folder.join("scene/test_images")).expect("writable");
+    transcript.fails(folder, 1, "render model --scene scene");
+    let cameras = folder.join("scene/sparse/0/images.bin");
+    let whole = fs::read(&cameras).expect("a model");
+    fs::write(&cameras, &whole[..whole.len() / 2]).expect("writable");
+    transcript.fails(folder, 1, "render model --scene scene");
+    let weights = folder.join("model/weights.safetensors");
+    let whole = fs::read(&weights).expect("weights");
+    fs::write(&weights, &whole[..whole.len() / 2]).expect("writable");
+    transcript.fails(folder, 1, "render model --scene scene");
+    fs::remove_file(weights).expect("writable");
+    transcript.fails(folder, 1, "render model --scene scene");
+    let listed = |line: &str| line.split_once(" lists them").map(|(start, _)| format!("{start} lists them (...)"));
+    let text: Vec<String> = transcript.0.lines().map(|line| listed(line).unwrap_or_else(|| line.to_owned())).collect();
+    insta::assert_snapshot!("render_errors", text.join("\n"));
 }

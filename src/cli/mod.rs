@@ -8,6 +8,7 @@ mod devices;
 mod eval;
 pub mod folders;
 pub mod pictures;
+mod render;
 pub mod shared;
 mod synth;
 
@@ -39,6 +40,7 @@ pub struct Arguments {
 /// What can be done.
 #[derive(Debug, clap::Subcommand)]
 enum Command {
+    Render(render::Args),
     Eval(eval::Args),
     Devices(devices::Args),
     Synth(synth::Args),
@@ -50,6 +52,7 @@ enum Command {
 /// One sentence for the user, see [`message`].
 pub fn run(arguments: Arguments) -> anyhow::Result<()> {
     match arguments.command {
+        Command::Render(args) => render::run(&args),
         Command::Eval(args) => eval::run(&args),
         Command::Devices(args) => devices::run(&args),
         Command::Synth(args) => synth::run(&args),
