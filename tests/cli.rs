@@ -220,6 +220,7 @@ fn render_writes_colour_depth_and_transmittance() {
     transcript.succeeds(folder, "render model --scene scene --views train --downscale 2 --out train");
     transcript.succeeds(folder, "render model --scene scene --views spiral --frames 11 --out film");
     insta::assert_snapshot!("render", transcript.0);
+    assert!(folder.join("cache/gscream-vk/pipelines-default.bin").is_file(), "compiled kernels are kept");
     let expected = [
         ("model/renders/test", ["test_000", "test_001"].as_slice(), (32, 24)),
         ("train", &["train_000", "train_001", "train_002"], (16, 12)),

@@ -75,3 +75,19 @@ pub fn message(error: &anyhow::Error) -> String {
 pub fn exit_code(error: &anyhow::Error) -> ExitCode {
     ExitCode::from(if error.is::<crate::config::Error>() { 2 } else { 1 })
 }
+
+#[cfg(test)]
+mod tests {
+    use anyhow::Context as _;
+
+    use super::*;
+
+    #[test]
+    fn causes_are_printed_where_they_add_something() {
+        let io = || std::io::Error::other("disk full");
+        let saying = anyhow::Error::from(pictures::Error { path: "a.png".into(), source: io() });
+        assert_eq!(message(&saying), "error: a.png: the picture cannot be written: disk full");
+        let adding = Err::<(), _>(io()).context("a.json: cannot be written").expect_err("an error");
+        assert_eq!(message(&adding), "error: a.json: cannot be written\n  caused by: disk full");
+    }
+}

@@ -124,3 +124,67 @@ pub fn load_scene(scene: &Path, settings: &Settings) -> anyhow::Result<Scene> {
     }
     Ok(scene)
 }
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser as _;
+
+    use super::*;
+    use crate::cli::{exit_code, message};
+
+    #[derive(Debug, clap::Parser)]
+    struct Probe {
+        #[command(flatten)]
+        scene: SceneArgs,
+        #[command(flatten)]
+        device: DeviceArgs,
+    }
+
+    fn probe(arguments: &[&str]) -> Probe {
+        Probe::try_parse_from([&["probe"], arguments].concat()).expect("these arguments parse")
+    }
+
+    #[test]
+    fn the_built_in_scene_is_read_like_any_other() {
+        let arguments = probe(&["synthetic", "--preset", "demo", "--seed", "5", "--downscale", "4"]);
+        let (scene, settings) = arguments.scene.load().expect("it needs no files");
+        assert_eq!((scene.train.len(), scene.train[0].camera.size), (24, [40, 30]));
+        assert_eq!((settings.train.seed, settings.train.iterations), (5, 800));
+        let (other, _) = probe(&["synthetic", "--seed", "6", "--downscale", "4"]).scene.load().expect("likewise");
+        assert!(scene.train[0].image != other.train[0].image, "the seed is that of the scene");
+        assert_eq!(arguments.scene.name(), SYNTHETIC);
+        let folder = probe(&["a/scene"]).scene.name();
+        assert!(Path::new(&folder).is_absolute() && Path::new(&folder).ends_with("a/scene"), "{folder}");
+    }
+
+    #[test]
+    fn mistakes_are_one_line() {
+        let says = |arguments: &[&str]| {
+            let error = probe(arguments).scene.load().expect_err("a mistake");
+            (message(&error), exit_code(&error))
+        };
+        let (run, usage) = (1.into(), 2.into());
+        assert_eq!(says(&["nowhere"]), ("error: nowhere: there is no such folder".into(), run));
+        assert_eq!(
+            says(&["synthetic", "--set", "model.voxl=1"]),
+            ("error: --set model.voxl=1: unknown setting `model.voxl`; did you mean `model.voxel`?".into(), usage)
+        );
+        let error = Probe::try_parse_from(["probe", "synthetic", "--preset", "lavapip"]).expect_err("no such preset");
+        assert_eq!(error.exit_code(), 2);
+        assert!(error.to_string().contains("a similar value exists: 'lavapipe'"), "{error}");
+        let error =
+            probe(&["synthetic", "--device", "abacus"]).device.with_gpu(|_| Ok(())).expect_err("no such device");
+        assert!(message(&error).starts_with("error: no device matches \"abacus\": `gscream-vk devices` lists them"));
+    }
+
+    #[test]
+    fn the_cache_is_named_after_the_device() {
+        let name = |arguments: &[&str]| {
+            let cache = probe(arguments).device.options().cache.expect("a home folder");
+            assert!(cache.parent().is_some_and(|folder| folder.ends_with("gscream-vk")));
+            cache.file_name().expect("a file").to_string_lossy().into_owned()
+        };
+        assert_eq!(name(&["scene"]), "pipelines-default.bin");
+        assert_eq!(name(&["scene", "--device", "NVIDIA ../H100"]), "pipelines-nvidia----h100.bin");
+    }
+}
