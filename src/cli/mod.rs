@@ -1,1 +1,93 @@
-//! One file per command.
+//! The commands, one file each, and what they share.
+//!
+//! To add a command: a file with `Args` (clap) and `run(Args) -> anyhow::Result<()>`, a line in [`Command`] and one in
+//! [`run`]. Results go to stdout, progress and notes to stderr. The exit code is 0 when all went well, 2 when the
+//! arguments or settings make no sense, 1 when anything else went wrong.
+
+mod devices;
+mod eval;
+pub mod folders;
+pub mod pictures;
+mod render;
+pub mod shared;
+mod synth;
+
+use std::fmt::Write as _;
+use std::process::ExitCode;
+
+/// Removes an object from a 3D Gaussian scene, on any Vulkan 1.3 device.
+///
+/// A scene is a folder of photographs with a COLMAP model; masks of the object, depth priors and one inpainted view say
+/// what to remove and what belongs in its place.
+#[derive(Debug, clap::Parser)]
+#[command(
+    version,
+    max_term_width = 110,
+    after_help = "\
+Start here:
+  gscream-vk synth scene                           make a small scene with an object in it
+  gscream-vk eval renders --truth scene/test_images --masks scene/test_masks
+  gscream-vk devices                               what can be run on
+
+Exit codes: 0 done, 1 something went wrong, 2 the arguments or settings make no sense.
+Set RUST_LOG=info or debug for more on stderr."
+)]
+pub struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+/// What can be done.
+#[derive(Debug, clap::Subcommand)]
+enum Command {
+    Render(render::Args),
+    Eval(eval::Args),
+    Devices(devices::Args),
+    Synth(synth::Args),
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// One sentence for the user, see [`message`].
+pub fn run(arguments: Arguments) -> anyhow::Result<()> {
+    match arguments.command {
+        Command::Render(args) => render::run(&args),
+        Command::Eval(args) => eval::run(&args),
+        Command::Devices(args) => devices::run(&args),
+        Command::Synth(args) => synth::run(&args),
+    }
+}
+
+/// The error as printed: one line, and a line for each cause that says something the lines before it do not.
+pub fn message(error: &anyhow::Error) -> String {
+    let mut text = format!("error: {error}");
+    for cause in error.chain().skip(1) {
+        let cause = cause.to_string();
+        if !text.contains(&cause) {
+            write!(text, "\n  caused by: {cause}").expect("a string takes everything");
+        }
+    }
+    text
+}
+
+/// 2 for settings that make no sense, as for arguments that do not parse; 1 otherwise.
+pub fn exit_code(error: &anyhow::Error) -> ExitCode {
+    ExitCode::from(if error.is::<crate::config::Error>() { 2 } else { 1 })
+}
+
+#[cfg(test)]
+mod tests {
+    use anyhow::Context as _;
+
+    use super::*;
+
+    #[test]
+    fn causes_are_printed_where_they_add_something() {
+        let io = || std::io::Error::other("disk full");
+        let saying = anyhow::Error::from(pictures::Error { path: "a.png".into(), source: io() });
+        assert_eq!(message(&saying), "error: a.png: the picture cannot be written: disk full");
+        let adding = Err::<(), _>(io()).context("a.json: cannot be written").expect_err("an error");
+        assert_eq!(message(&adding), "error: a.json: cannot be written\n  caused by: disk full");
+    }
+}

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use super::{Error, PriorKind, priors};
 
 /// Extensions of pictures and masks, lower case.
-const PICTURES: [&str; 3] = ["png", "jpg", "jpeg"];
+pub(super) const PICTURES: [&str; 3] = ["png", "jpg", "jpeg"];
 
 /// SPIn-NeRF's split of its 100 sorted pictures: the first 40 are test views, and the reference is number 29 of the rest.
 const SPIN_PICTURES: usize = 100;
@@ -355,7 +355,7 @@ pub(super) fn stem(name: &str) -> &str {
 }
 
 /// The files of `folder` and of the folders below it that have one of `extensions`. A missing folder is an empty one.
-fn index(folder: &Path, extensions: &[&str]) -> Result<Index, Error> {
+pub(super) fn index(folder: &Path, extensions: &[&str]) -> Result<Index, Error> {
     let mut out = Index::new();
     let mut pending = vec![(folder.to_path_buf(), String::new())];
     while let Some((at, prefix)) = pending.pop() {

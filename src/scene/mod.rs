@@ -20,6 +20,7 @@
 mod camera;
 pub mod colmap;
 mod layout;
+pub mod path;
 mod priors;
 mod resample;
 pub mod synthetic;
@@ -616,6 +617,28 @@ fn object_mask(path: &Path, invert: bool) -> Result<GrayImage, Error> {
         .map(|p| if p.0.iter().any(|v| *v >= threshold) != invert { 255 } else { 0 })
         .collect();
     Ok(GrayImage::from_raw(w, h, raw).expect("one value per pixel"))
+}
+
+/// The pictures in a folder and in the folders below it, by their path below `folder` without extension.
+pub(crate) fn pictures(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Error> {
+    if !folder.is_dir() {
+        return Err(Error::File { path: folder.to_path_buf(), what: "there is no such folder".into() });
+    }
+    layout::index(folder, &layout::PICTURES)
+}
+
+/// A picture at 1 / `downscale` of its size, reduced as [`load`] reduces photographs.
+pub(crate) fn photograph(path: &Path, downscale: u32) -> Result<RgbImage, Error> {
+    let image = decode(path)?.into_rgb8();
+    let size = [image.width(), image.height()].map(|n| reduced(n, downscale));
+    Ok(if downscale == 1 { image } else { resample::photograph(&image, size) })
+}
+
+/// A mask at 1 / `downscale` of its size, reduced as [`load`] reduces masks: 255 inside, 0 elsewhere.
+pub(crate) fn mask(path: &Path, downscale: u32) -> Result<GrayImage, Error> {
+    let mask = object_mask(path, false)?;
+    let size = [mask.width(), mask.height()].map(|n| reduced(n, downscale));
+    Ok(if downscale == 1 { mask } else { resample::mask(&mask, size) })
 }
 
 /// Below this rank correlation, two priors of one view are taken to be unrelated.

@@ -1,0 +1,145 @@
+//! The folder of a run: what lies where.
+//!
+//! ```text
+//! RUN/run.json        version, device, scene and command line: see `Record`
+//! RUN/settings.toml   every setting of the run, resolved; --config reads it
+//! RUN/model/          point_cloud.ply and weights.safetensors
+//! RUN/test/NAME.png   the test views as rendered at the end
+//! ```
+
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, bail};
+use atomic_write_file::AtomicWriteFile;
+use serde::{Deserialize, Serialize};
+
+use crate::config::{Error as SettingsError, Settings, Source};
+use crate::model::files::POINT_CLOUD;
+
+/// The record's file within a run folder.
+pub const RECORD: &str = "run.json";
+/// The resolved settings within a run folder.
+pub const SETTINGS: &str = "settings.toml";
+/// The model's folder within a run folder.
+pub const MODEL: &str = "model";
+/// The rendered test views within a run folder.
+pub const TEST: &str = "test";
+
+/// Who made a run and of what.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Record {
+    /// Version of the program.
+    pub version: String,
+    /// Name of the device.
+    pub device: String,
+    /// Absolute path of the scene, or `synthetic` for the built-in one.
+    pub scene: String,
+    /// The command line.
+    pub command: String,
+}
+
+impl Record {
+    /// The record of this program's run on `scene` ([`super::shared::SceneArgs::name`]) by the device of that name.
+    pub fn new(device: &str, scene: &str) -> Self {
+        let command: Vec<String> = std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect();
+        Self {
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            device: device.to_owned(),
+            scene: scene.to_owned(),
+            command: command.join(" "),
+        }
+    }
+
+    /// Writes `run.json` into the run folder; the file appears complete or not at all.
+    ///
+    /// # Errors
+    /// A folder that cannot be written.
+    pub fn write(&self, run: &Path) -> anyhow::Result<()> {
+        let path = run.join(RECORD);
+        let write = || {
+            let mut file = AtomicWriteFile::open(&path)?;
+            file.write_all((serde_json::to_string_pretty(self)? + "\n").as_bytes())?;
+            file.commit()
+        };
+        write().with_context(|| format!("{}: cannot be written", path.display()))
+    }
+
+    /// Reads the run folder's `run.json`.
+    ///
+    /// # Errors
+    /// A file that is missing, or is no such record.
+    pub fn read(run: &Path) -> anyhow::Result<Self> {
+        let path = run.join(RECORD);
+        let text = std::fs::read(&path).with_context(|| format!("{}: cannot be read", path.display()))?;
+        serde_json::from_slice(&text).with_context(|| format!("{}: not the record of a run", path.display()))
+    }
+}
+
+/// Where a model came from.
+#[derive(Debug)]
+pub enum Origin {
+    /// A run folder.
+    Run {
+        /// The folder.
+        folder: PathBuf,
+        /// Its record.
+        record: Record,
+    },
+    /// A folder that holds a model and nothing about it.
+    Model {
+        /// The folder.
+        folder: PathBuf,
+    },
+}
+
+impl Origin {
+    /// Tells a run folder from a model's own.
+    ///
+    /// # Errors
+    /// A folder that is neither.
+    pub fn find(folder: &Path) -> anyhow::Result<Self> {
+        if !folder.is_dir() {
+            bail!("{}: there is no such folder", folder.display());
+        }
+        let owned = folder.to_owned();
+        if folder.join(RECORD).is_file() {
+            return Ok(Self::Run { folder: owned, record: Record::read(folder)? });
+        }
+        if folder.join(POINT_CLOUD).is_file() {
+            return Ok(Self::Model { folder: owned });
+        }
+        bail!(
+            "{}: neither a run folder (it has no {RECORD}) nor a model folder (it has no {POINT_CLOUD})",
+            folder.display()
+        )
+    }
+
+    /// Where the model's files are.
+    pub fn model(&self) -> PathBuf {
+        match self {
+            Self::Run { folder, .. } => folder.join(MODEL),
+            Self::Model { folder } => folder.clone(),
+        }
+    }
+
+    /// The settings it was made with, or the defaults where that is not known, under what `changes` ask for.
+    ///
+    /// # Errors
+    /// As [`Settings::resolve`].
+    pub fn settings(&self, changes: Vec<Source>) -> Result<Settings, SettingsError> {
+        let own = match self {
+            Self::Run { folder, .. } => Some(Source::File(folder.join(SETTINGS))),
+            Self::Model { .. } => None,
+        };
+        Settings::resolve(&own.into_iter().chain(changes).collect::<Vec<_>>())
+    }
+
+    /// The scene it was trained on, if that is known.
+    pub fn scene(&self) -> Option<&str> {
+        match self {
+            Self::Run { record, .. } => Some(&record.scene),
+            Self::Model { .. } => None,
+        }
+    }
+}

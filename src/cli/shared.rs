@@ -1,0 +1,190 @@
+//! Arguments that several commands take: a device, a scene with its settings.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, bail};
+
+use crate::config::{Settings, SettingsArgs};
+use crate::gpu::{Gpu, Options};
+use crate::scene::{self, Scene, synthetic};
+
+/// The word that stands for the built-in scene where a folder is expected.
+pub const SYNTHETIC: &str = "synthetic";
+
+/// Which device to compute on, and how closely to watch it.
+#[derive(Debug, Clone, Default, clap::Args)]
+#[command(next_help_heading = "Device")]
+pub struct DeviceArgs {
+    /// Index or part of the name from `gscream-vk devices` [default: the first usable one]
+    #[arg(long, value_name = "DEVICE")]
+    pub device: Option<String>,
+    /// Run under the Khronos validation layer, synchronisation included; any message of it is an error
+    #[arg(long)]
+    pub validate: bool,
+    /// Put a barrier after every pass instead of only where a hazard demands one
+    #[arg(long)]
+    pub serialize: bool,
+}
+
+impl DeviceArgs {
+    /// How to open the device. Compiled kernels are kept in the user's cache folder.
+    pub fn options(&self) -> Options {
+        Options {
+            device: self.device.clone(),
+            validate: self.validate,
+            serialize: self.serialize,
+            timestamps: false,
+            cache: self.cache(),
+        }
+    }
+
+    /// Opens the device, does the work and reports whatever the validation layer said meanwhile.
+    ///
+    /// # Errors
+    /// Without a usable device; the work's own error; messages of the validation layer.
+    pub fn with_gpu<T>(&self, work: impl FnOnce(&Gpu) -> anyhow::Result<T>) -> anyhow::Result<T> {
+        with_gpu(&self.options(), work)
+    }
+
+    /// A driver ignores what another one stored, so that a name that is not unique costs time at most.
+    fn cache(&self) -> Option<PathBuf> {
+        let of = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+        let folder = of("XDG_CACHE_HOME").or_else(|| Some(of("HOME")?.join(".cache")))?;
+        let device = self.device.as_deref().unwrap_or("default").to_lowercase();
+        let device: String = device.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect();
+        Some(folder.join("gscream-vk").join(format!("pipelines-{device}.bin")))
+    }
+}
+
+/// [`DeviceArgs::with_gpu`] with options of one's own.
+///
+/// # Errors
+/// As [`DeviceArgs::with_gpu`].
+pub fn with_gpu<T>(options: &Options, work: impl FnOnce(&Gpu) -> anyhow::Result<T>) -> anyhow::Result<T> {
+    let gpu = Gpu::open(options)?;
+    let result = work(&gpu);
+    let messages = gpu.take_messages();
+    if messages.is_empty() {
+        return result;
+    }
+    // What failed is likely to follow from what the layer saw, so both are said.
+    let failed = result.err().map_or_else(String::new, |error| format!("\nand then: {error:#}"));
+    bail!("the validation layer reported {} messages:\n{}{failed}", messages.len(), messages.join("\n"))
+}
+
+/// A scene and the settings to read it with.
+#[derive(Debug, Clone, clap::Args)]
+pub struct SceneArgs {
+    /// Folder of the scene, or the word `synthetic` for the built-in one
+    #[arg(value_name = "SCENE")]
+    pub scene: PathBuf,
+    /// Preset, file and single settings.
+    #[command(flatten)]
+    pub settings: SettingsArgs,
+}
+
+impl SceneArgs {
+    /// The scene and the resolved settings; what there is to know about the scene goes to stderr.
+    ///
+    /// # Errors
+    /// Settings that make no sense; a scene that cannot be read.
+    pub fn load(&self) -> anyhow::Result<(Scene, Settings)> {
+        let settings = self.settings.resolve()?;
+        Ok((load_scene(&self.scene, &settings)?, settings))
+    }
+
+    /// The scene as a run's record names it.
+    pub fn name(&self) -> String {
+        if self.scene == Path::new(SYNTHETIC) {
+            return SYNTHETIC.to_owned();
+        }
+        // Only a folder that was removed since it was read has no absolute path.
+        let absolute = std::path::absolute(&self.scene).unwrap_or_else(|_| self.scene.clone());
+        absolute.to_string_lossy().into_owned()
+    }
+}
+
+/// Reads a scene and prints its notes to stderr. `synthetic` writes the built-in scene of seed `train.seed` into a
+/// temporary folder and reads it like any other.
+///
+/// # Errors
+/// A scene that cannot be read, a temporary folder that cannot be written.
+pub fn load_scene(scene: &Path, settings: &Settings) -> anyhow::Result<Scene> {
+    let scene = if scene == Path::new(SYNTHETIC) {
+        let folder = tempfile::tempdir().context("no temporary folder for the synthetic scene can be made")?;
+        let options = synthetic::Options { seed: settings.train.seed, ..Default::default() };
+        let scene = folder.path().join(SYNTHETIC);
+        synthetic::write(&scene, &options)?;
+        scene::load(&scene, &settings.scene)?
+    } else {
+        scene::load(scene, &settings.scene)?
+    };
+    for note in &scene.notes {
+        eprintln!("scene: {note}");
+    }
+    Ok(scene)
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser as _;
+
+    use super::*;
+    use crate::cli::{exit_code, message};
+
+    #[derive(Debug, clap::Parser)]
+    struct Probe {
+        #[command(flatten)]
+        scene: SceneArgs,
+        #[command(flatten)]
+        device: DeviceArgs,
+    }
+
+    fn probe(arguments: &[&str]) -> Probe {
+        Probe::try_parse_from([&["probe"], arguments].concat()).expect("these arguments parse")
+    }
+
+    #[test]
+    fn the_built_in_scene_is_read_like_any_other() {
+        let arguments = probe(&["synthetic", "--preset", "demo", "--seed", "5", "--downscale", "4"]);
+        let (scene, settings) = arguments.scene.load().expect("it needs no files");
+        assert_eq!((scene.train.len(), scene.train[0].camera.size), (24, [40, 30]));
+        assert_eq!((settings.train.seed, settings.train.iterations), (5, 800));
+        let (other, _) = probe(&["synthetic", "--seed", "6", "--downscale", "4"]).scene.load().expect("likewise");
+        assert!(scene.train[0].image != other.train[0].image, "the seed is that of the scene");
+        assert_eq!(arguments.scene.name(), SYNTHETIC);
+        let folder = probe(&["a/scene"]).scene.name();
+        assert!(Path::new(&folder).is_absolute() && Path::new(&folder).ends_with("a/scene"), "{folder}");
+    }
+
+    #[test]
+    fn mistakes_are_one_line() {
+        let says = |arguments: &[&str]| {
+            let error = probe(arguments).scene.load().expect_err("a mistake");
+            (message(&error), exit_code(&error))
+        };
+        let (run, usage) = (1.into(), 2.into());
+        assert_eq!(says(&["nowhere"]), ("error: nowhere: there is no such folder".into(), run));
+        assert_eq!(
+            says(&["synthetic", "--set", "model.voxl=1"]),
+            ("error: --set model.voxl=1: unknown setting `model.voxl`; did you mean `model.voxel`?".into(), usage)
+        );
+        let error = Probe::try_parse_from(["probe", "synthetic", "--preset", "lavapip"]).expect_err("no such preset");
+        assert_eq!(error.exit_code(), 2);
+        assert!(error.to_string().contains("a similar value exists: 'lavapipe'"), "{error}");
+        let error =
+            probe(&["synthetic", "--device", "abacus"]).device.with_gpu(|_| Ok(())).expect_err("no such device");
+        assert!(message(&error).starts_with("error: no device matches \"abacus\": `gscream-vk devices` lists them"));
+    }
+
+    #[test]
+    fn the_cache_is_named_after_the_device() {
+        let name = |arguments: &[&str]| {
+            let cache = probe(arguments).device.options().cache.expect("a home folder");
+            assert!(cache.parent().is_some_and(|folder| folder.ends_with("gscream-vk")));
+            cache.file_name().expect("a file").to_string_lossy().into_owned()
+        };
+        assert_eq!(name(&["scene"]), "pipelines-default.bin");
+        assert_eq!(name(&["scene", "--device", "NVIDIA ../H100"]), "pipelines-nvidia----h100.bin");
+    }
+}

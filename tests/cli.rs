@@ -1,0 +1,277 @@
+//! The program as its user meets it: help, results, one clear line for every mistake, exit codes.
+
+use std::fs;
+use std::path::Path;
+
+use assert_cmd::Command;
+use assert_cmd::cargo::cargo_bin_cmd;
+use clap::CommandFactory as _;
+use gscream_vk::cli::Arguments;
+use gscream_vk::cli::folders::Record;
+use gscream_vk::config::Settings;
+use gscream_vk::model;
+use gscream_vk::scene::synthetic;
+use image::{Rgb, RgbImage};
+use tempfile::TempDir;
+
+/// The program, run inside `folder` at a fixed width and with a cache of its own.
+fn program(folder: &Path) -> Command {
+    let mut command = cargo_bin_cmd!("gscream-vk");
+    command
+        .current_dir(folder)
+        .env("COLUMNS", "100")
+        .env("XDG_CACHE_HOME", folder.join("cache"))
+        .env_remove("RUST_LOG");
+    command
+}
+
+struct Outcome {
+    code: i32,
+    stdout: String,
+    stderr: String,
+}
+
+fn run(folder: &Path, arguments: &str) -> Outcome {
+    let output = program(folder).args(arguments.split_whitespace()).output().expect("the program starts");
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).expect("UTF-8");
+    Outcome {
+        code: output.status.code().expect("the program ends by itself"),
+        stdout: text(output.stdout),
+        stderr: text(output.stderr),
+    }
+}
+
+fn succeeds(folder: &Path, arguments: &str) -> Outcome {
+    let outcome = run(folder, arguments);
+    assert_eq!(outcome.code, 0, "{arguments}: {}", outcome.stderr);
+    outcome
+}
+
+/// What was typed and what came back: a snapshot that reads like a terminal. Lines of stderr start with `! `.
+#[derive(Default)]
+struct Transcript(String);
+
+impl Transcript {
+    fn run(&mut self, folder: &Path, arguments: &str) -> Outcome {
+        let outcome = run(folder, arguments);
+        let errors = outcome.stderr.lines().map(|line| format!("! {line}").trim_end().to_owned() + "\n");
+        let code = if outcome.code == 0 { String::new() } else { format!("exit code {}\n", outcome.code) };
+        self.0 += &format!("$ gscream-vk {arguments}\n{}{}{code}\n", outcome.stdout, errors.collect::<String>());
+        outcome
+    }
+
+    /// A command that must fail, with this exit code and without a word on stdout.
+    fn fails(&mut self, folder: &Path, code: i32, arguments: &str) {
+        let outcome = self.run(folder, arguments);
+        assert_eq!((outcome.code, outcome.stdout.as_str()), (code, ""), "{arguments}: {}", outcome.stderr);
+    }
+
+    fn succeeds(&mut self, folder: &Path, arguments: &str) {
+        let outcome = self.run(folder, arguments);
+        assert_eq!(outcome.code, 0, "{arguments}: {}", outcome.stderr);
+    }
+}
+
+fn folder() -> TempDir {
+    tempfile::tempdir().expect("a temporary folder")
+}
+
+/// A folder with a small scene in `scene/`: 3 train views, 2 test views of 32 x 24.
+fn with_scene() -> TempDir {
+    let folder = folder();
+    let options = synthetic::Options { seed: 3, width: 32, height: 24, train_views: 3, test_views: 2, points: 50 };
+    synthetic::write(&folder.path().join("scene"), &options).expect("a writable folder");
+    folder
+}
+
+#[test]
+fn help_of_every_command() {
+    let folder = folder();
+    insta::assert_snapshot!("help", succeeds(folder.path(), "--help").stdout);
+    let program = Arguments::command();
+    for command in program.get_subcommands() {
+        let name = command.get_name();
+        insta::assert_snapshot!(format!("help_{name}"), succeeds(folder.path(), &format!("{name} --help")).stdout);
+        assert!(command.get_after_help().is_some(), "{name} has no example");
+    }
+    assert_eq!(succeeds(folder.path(), "--version").stdout, format!("gscream-vk {}\n", env!("CARGO_PKG_VERSION")));
+}
+
+#[test]
+fn arguments_that_do_not_parse() {
+    let (folder, mut transcript) = (folder(), Transcript::default());
+    for arguments in [
+        "evaluate",
+        "synth",
+        "synth scene --width 4",
+        "synth scene --train-views 0",
+        "eval renders --masks masks",
+        "eval renders --truth photographs --downscale 0",
+        "render",
+        "render run --views side",
+    ] {
+        transcript.fails(folder.path(), 2, arguments);
+    }
+    insta::assert_snapshot!("arguments", transcript.0);
+    assert!(!folder.path().join("scene").exists(), "nothing was written");
+}
+
+#[test]
+fn devices_are_listed_as_text_and_as_json() {
+    let folder = folder();
+    let json = succeeds(folder.path(), "devices --json").stdout;
+    let devices: Vec<serde_json::Value> = serde_json::from_str(&json).expect("JSON");
+    let text = succeeds(folder.path(), "devices").stdout;
+    assert_eq!(text.lines().count(), 4 * devices.len(), "{text}");
+    for (device, lines) in devices.iter().zip(text.lines().collect::<Vec<_>>().chunks(4)) {
+        let name = device["name"].as_str().expect("a name");
+        assert_eq!(lines[0], format!("{}  {name}", device["index"]));
+        assert!(lines[1].contains(device["api"].as_str().expect("a version")), "{text}");
+        let usable = device["lacks"].as_array().expect("a list").is_empty();
+        assert_eq!(lines[3].trim().starts_with("usable"), usable, "{text}");
+    }
+}
+
+#[test]
+fn synth_writes_a_scene_and_never_over_another() {
+    let (folder, mut transcript) = (folder(), Transcript::default());
+    let arguments = "synth scene --width 32 --height 24 --train-views 3 --test-views 2 --points 50 --seed 3";
+    transcript.succeeds(folder.path(), arguments);
+    let photograph = |folder: &TempDir| fs::read(folder.path().join("scene/images/train_001.png")).expect("written");
+    assert!(photograph(&folder) == photograph(&with_scene()), "the same options give the same files");
+    transcript.fails(folder.path(), 1, arguments);
+    insta::assert_snapshot!("synth", transcript.0);
+}
+
+#[test]
+fn eval_of_folders() {
+    let (folder, mut transcript) = (with_scene(), Transcript::default());
+    let folder = folder.path();
+    let truth = folder.join("scene/test_images");
+    transcript
+        .succeeds(folder, "eval scene/test_images --truth scene/test_images --masks scene/test_masks --json same.json");
+    insta::assert_snapshot!("eval_json", fs::read_to_string(folder.join("same.json")).expect("the report"));
+    // Grey 100 off by 51 is a fifth of the range: 13.98 dB.
+    let renders = folder.join("renders");
+    fs::create_dir(&renders).expect("a writable folder");
+    RgbImage::from_pixel(16, 12, Rgb([151; 3])).save(renders.join("test_001.png")).expect("writable");
+    RgbImage::from_pixel(16, 12, Rgb([100; 3])).save(renders.join("stray.png")).expect("writable");
+    RgbImage::from_pixel(32, 24, Rgb([100; 3])).save(truth.join("test_001.png")).expect("writable");
+    transcript.fails(folder, 1, "eval renders --truth scene/test_images");
+    transcript.succeeds(folder, "eval renders --truth scene/test_images --downscale 2");
+    assert!(renders.join("metrics.json").is_file());
+    insta::assert_snapshot!("eval", transcript.0);
+}
+
+#[test]
+fn eval_of_a_run() {
+    let (folder, mut transcript) = (with_scene(), Transcript::default());
+    let folder = folder.path();
+    let run = folder.join("run");
+    fs::create_dir(&run).expect("a writable folder");
+    fs::write(run.join("settings.toml"), Settings::default().to_toml()).expect("writable");
+    Record::new("none", "scene").write(&run).expect("writable");
+    transcript.fails(folder, 1, "eval run");
+    let test = run.join("test");
+    fs::create_dir(&test).expect("a writable folder");
+    fs::copy(folder.join("scene/test_images/test_000.png"), test.join("test_000.png")).expect("writable");
+    transcript.fails(folder, 1, "eval run");
+    fs::copy(folder.join("scene/test_images/test_001.png"), test.join("test_001.png")).expect("writable");
+    transcript.succeeds(folder, "eval run");
+    assert!(run.join("metrics.json").is_file());
+    insta::assert_snapshot!("eval_run", transcript.0);
+}
+
+#[test]
+fn eval_of_what_cannot_be_compared() {
+    let (folder, mut transcript) = (with_scene(), Transcript::default());
+    let folder = folder.path();
+    transcript.fails(folder, 1, "eval nowhere");
+    transcript.fails(folder, 1, "eval nowhere --truth scene/test_images");
+    transcript.fails(folder, 1, "eval scene/sparse --truth scene/test_images");
+    transcript.fails(folder, 1, "eval scene/images --truth scene/test_images");
+    transcript.fails(folder, 1, "eval scene/test_images");
+    let broken = folder.join("scene/test_images/test_000.png");
+    let whole = fs::read(&broken).expect("a photograph");
+    fs::write(&broken, &whole[..whole.len() / 2]).expect("writable");
+    transcript.fails(folder, 1, "eval scene/test_images --truth scene/test_images");
+    insta::assert_snapshot!("eval_errors", transcript.0);
+}
+
+/// A random model of two anchors for the small scene, in a folder of its own.
+fn with_model(folder: &Path) {
+    let anchors = model::files::Anchors {
+        position: vec![[0.0, 1.0, 0.5], [0.3, 1.2, 0.7]],
+        feature: vec![[0.1; model::files::FEATURES]; 2],
+        offset: vec![0.05; 2 * 10 * 3],
+        offsets_per_anchor: 10,
+        log_scaling: vec![[-2.0; 6]; 2],
+    };
+    let weights = model::init::weights(1, 10, false);
+    model::files::save(&folder.join("model"), &anchors, &weights).expect("a writable folder");
+}
+
+#[test]
+fn render_writes_colour_depth_and_transmittance() {
+    let (folder, mut transcript) = (with_scene(), Transcript::default());
+    let folder = folder.path();
+    with_model(folder);
+    transcript.succeeds(folder, "render model --scene scene --validate");
+    transcript.succeeds(folder, "render model --scene scene --views train --downscale 2 --out train");
+    transcript.succeeds(folder, "render model --scene scene --views spiral --frames 11 --out film");
+    insta::assert_snapshot!("render", transcript.0);
+    assert!(folder.join("cache/gscream-vk/pipelines-default.bin").is_file(), "compiled kernels are kept");
+    let expected = [
+        ("model/renders/test", ["test_000", "test_001"].as_slice(), (32, 24)),
+        ("train", &["train_000", "train_001", "train_002"], (16, 12)),
+        ("film", &["frame_00", "frame_10"], (32, 24)),
+    ];
+    for (out, names, size) in expected {
+        for name in names {
+            let picture = image::open(folder.join(out).join(format!("{name}.png"))).expect("a picture");
+            assert_eq!((picture.width(), picture.height()), size);
+            let file = folder.join(out).join(format!("{name}.exr"));
+            let layers = exr::prelude::read_all_flat_layers_from_file(file).expect("an OpenEXR file");
+            let layer = &layers.layer_data[0];
+            let channels: Vec<String> = layer.channel_data.list.iter().map(|c| c.name.to_string()).collect();
+            assert_eq!((layer.size.0, layer.size.1), (size.0 as usize, size.1 as usize));
+            assert_eq!(channels, ["T", "Z"]);
+            let transmittance: Vec<f32> = layer.channel_data.list[0].sample_data.values_as_f32().collect();
+            assert!(transmittance.iter().all(|t| (0.0..=1.0).contains(t)), "a transmittance is a share of light");
+            assert!(transmittance.iter().any(|t| *t < 0.99), "{name} shows nothing of the model");
+        }
+    }
+    assert_eq!(fs::read_dir(folder.join("film")).expect("a folder").count(), 22);
+}
+
+/// What a machine has is cut away: the list behind the name.
+#[test]
+fn render_of_what_is_not_there() {
+    let (folder, mut transcript) = (with_scene(), Transcript::default());
+    let folder = folder.path();
+    with_model(folder);
+    transcript.fails(folder, 1, "render nowhere");
+    transcript.fails(folder, 1, "render scene");
+    transcript.fails(folder, 1, "render model");
+    transcript.fails(folder, 1, "render model --scene nowhere");
+    transcript.fails(folder, 2, "render model --scene scene --set render.nearr=1");
+    transcript.fails(folder, 2, "render model --scene scene --set render.near=-1");
+    transcript.fails(folder, 2, "render model --scene scene --set model.voxels");
+    transcript.fails(folder, 2, "render model --scene scene --config nowhere.toml");
+    transcript.fails(folder, 1, "render model --scene scene --device abacus");
+    fs::remove_dir_all(folder.join("scene/test_images")).expect("writable");
+    transcript.fails(folder, 1, "render model --scene scene");
+    let cameras = folder.join("scene/sparse/0/images.bin");
+    let whole = fs::read(&cameras).expect("a model");
+    fs::write(&cameras, &whole[..whole.len() / 2]).expect("writable");
+    transcript.fails(folder, 1, "render model --scene scene");
+    let weights = folder.join("model/weights.safetensors");
+    let whole = fs::read(&weights).expect("weights");
+    fs::write(&weights, &whole[..whole.len() / 2]).expect("writable");
+    transcript.fails(folder, 1, "render model --scene scene");
+    fs::remove_file(weights).expect("writable");
+    transcript.fails(folder, 1, "render model --scene scene");
+    let listed = |line: &str| line.split_once(" lists them").map(|(start, _)| format!("{start} lists them (...)"));
+    let text: Vec<String> = transcript.0.lines().map(|line| listed(line).unwrap_or_else(|| line.to_owned())).collect();
+    insta::assert_snapshot!("render_errors", text.join("\n"));
+}
