@@ -11,6 +11,7 @@ pub mod pictures;
 mod render;
 pub mod shared;
 mod synth;
+mod train;
 
 use std::fmt::Write as _;
 use std::process::ExitCode;
@@ -40,6 +41,7 @@ pub struct Arguments {
 /// What can be done.
 #[derive(Debug, clap::Subcommand)]
 enum Command {
+    Train(train::Args),
     Render(render::Args),
     Eval(eval::Args),
     Devices(devices::Args),
@@ -52,6 +54,7 @@ enum Command {
 /// One sentence for the user, see [`message`].
 pub fn run(arguments: Arguments) -> anyhow::Result<()> {
     match arguments.command {
+        Command::Train(args) => train::run(&args),
         Command::Render(args) => render::run(&args),
         Command::Eval(args) => eval::run(&args),
         Command::Devices(args) => devices::run(&args),

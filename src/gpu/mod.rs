@@ -2,7 +2,7 @@
 //!
 //! A pass is one call: [`Recorder::run`] takes a kernel's typed bindings, its push constants and a number of threads.
 //! The recorder knows from the bindings what the pass reads and writes and records a barrier exactly where a hazard
-//! demands one. Every kernel has a CPU twin ([`Reference`]); [`Recorder::checked`] runs both and compares.
+//! demands one. Every kernel has a CPU twin ([`Reference`]); [`Gpu::checked`] runs both and compares.
 
 pub mod check;
 pub mod device;

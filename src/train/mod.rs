@@ -1,9 +1,11 @@
 //! What a scene needs, the step, the loop, checkpoints.
 
+pub mod attend;
 pub mod config;
 pub mod order;
 pub mod photographs;
 pub mod plan;
+pub mod run;
 pub mod step;
 
 pub use config::Config;

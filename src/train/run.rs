@@ -44,7 +44,9 @@ pub enum Error {
         source: std::io::Error,
     },
     /// A number stopped being one.
-    #[error("the loss of step {step} (view {view}) is {loss}: the model before it is not saved; lower the learning rates or look at that view's prior and mask")]
+    #[error(
+        "the loss of step {step} (view {view}) is {loss}: the model before it is not saved; lower the learning rates or look at that view's prior and mask"
+    )]
     NotFinite {
         /// The step.
         step: u32,
@@ -207,6 +209,7 @@ impl<'a> Run<'a> {
 
     fn submit(&mut self, step: u32, mailbox: usize) -> Result<InFlight<'a>, Error> {
         let view = self.order.view(step);
+        self.step.prepare(step)?;
         let mut rec = self.gpu.recorder()?;
         self.record_view(&mut rec, step, view);
         let mail = &self.mailboxes[mailbox];
@@ -304,7 +307,8 @@ impl<'a> Run<'a> {
                     debug_assert!(later.step > done);
                 }
                 report = self.evaluate(None)?.or(report);
-                if let Some(Report { mean, .. }) = &report {
+                if let Some(mean) = report.as_ref().and_then(|r| r.mean.as_ref()) {
+                    let mean = &mean.metrics;
                     let masked = mean.mask.as_ref().map_or(String::new(), |m| format!(", masked {:.2} dB", m.psnr));
                     watch.say(&format!("step {done}: PSNR {:.2} dB{masked} on the test views", mean.full.psnr));
                 }
@@ -312,12 +316,13 @@ impl<'a> Run<'a> {
             paused += pause.elapsed().as_secs_f64();
             if done.is_multiple_of(self.settings.train.log_interval) || done == iterations {
                 let (steps, loss, since) = since_line;
+                let figures = report.as_ref().and_then(|r| r.mean.as_ref()).map(|m| &m.metrics);
                 let line = Line {
                     progress: &progress,
                     mean_loss: loss / f64::from(steps),
                     steps_per_second: f64::from(steps) / (since.elapsed().as_secs_f64()),
-                    psnr: report.as_ref().map(|r| r.mean.full.psnr),
-                    masked_psnr: report.as_ref().and_then(|r| r.mean.mask.as_ref()).map(|m| m.psnr),
+                    psnr: figures.map(|m| m.full.psnr),
+                    masked_psnr: figures.and_then(|m| m.mask.as_ref()).map(|m| m.psnr),
                     device_bytes: self.gpu.memory().0,
                     host_bytes: host_bytes(),
                 };

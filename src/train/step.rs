@@ -19,6 +19,7 @@ use crate::render::rasterize::{self, Backward, Picture, PictureGradient};
 use crate::render::view::{Capacity, Forward};
 use crate::scene::{Camera, PriorKind};
 
+use super::attend::{Attend, Attended};
 use super::order::{Stream, random};
 use super::photographs::Photograph;
 use super::plan::Plan;
@@ -117,6 +118,8 @@ pub struct Step {
     gradients: Gradients,
     stages: Stages,
     canvases: Vec<Canvas>,
+    attend: Option<Attend>,
+    attention_weights: Option<Vec<f32>>,
     config: Settings,
     adam: adam::Config,
     near: f32,
@@ -155,7 +158,8 @@ impl Step {
         weights: &files::Weights,
     ) -> Result<Self, Error> {
         let anchors = Anchors::upload(gpu, anchors, 0)?;
-        let flat = weights.decoders();
+        let initial = weights;
+        let flat = initial.decoders();
         let weights = Parameter::new(gpu, WEIGHTS, flat.len() as u32, 1)?;
         gpu.write(&weights.value, &flat)?;
         let mut rec = gpu.recorder()?;
@@ -184,6 +188,8 @@ impl Step {
             capacity,
             stages,
             canvases,
+            attend: None,
+            attention_weights: plan.attention.then(|| initial.attention()),
             adam: adam::Config {
                 beta1: settings.optimizer.betas[0],
                 beta2: settings.optimizer.betas[1],
@@ -207,6 +213,9 @@ impl Step {
         self.stages = Stages::new(&self.gpu, &self.plan, smallest, self.anchors.offsets, cull)?;
         self.stages = Stages::new(&self.gpu, &self.plan, capacity, self.anchors.offsets, cull)?;
         self.gradients = Gradients::new(&self.gpu, &self.anchors, &self.weights)?;
+        if let Some(attend) = &mut self.attend {
+            attend.resize(&self.gpu, self.anchors.capacity)?;
+        }
         self.capacity = capacity;
         Ok(())
     }
@@ -219,6 +228,19 @@ impl Step {
     /// The weighted loss terms of the last step by [`Term`], for pictures of this size.
     pub fn terms(&self, size: [u32; 2]) -> &Buffer<f32> {
         self.canvas(size).losses.terms()
+    }
+
+    /// Whether anchors are grown or pruned behind this step.
+    pub fn changes_anchors(&self, _step: u32) -> bool {
+        false
+    }
+
+    /// Grows and prunes anchors behind this step; says what changed.
+    ///
+    /// # Errors
+    /// When the device has no room.
+    pub fn change_anchors(&mut self, _settings: &Settings, _step: u32) -> Result<String, Error> {
+        Ok(String::new())
     }
 
     /// The losses for pictures of this size.
@@ -236,7 +258,7 @@ impl Step {
     /// Records step `step` (counted from 1) on a photograph.
     pub fn record(&self, rec: &mut Recorder<'_>, photograph: &Photograph, step: u32, rates: Rates) {
         let view = self.view(photograph, step);
-        self.line(rec, &photograph.camera, step, rates, |rec, canvas| {
+        self.line(rec, &photograph.camera, Some(photograph), step, rates, |rec, canvas| {
             let Canvas { picture, losses } = canvas;
             losses.forward_backward(rec, &view, &picture.rgb, picture.depth.as_ref().map(|d| &d.0))
         });
@@ -251,7 +273,7 @@ impl Step {
         step: u32,
         rates: Rates,
     ) {
-        self.line(rec, camera, step, rates, |rec, canvas| {
+        self.line(rec, camera, None, step, rates, |rec, canvas| {
             let Canvas { picture, losses } = canvas;
             losses.compare(rec, depth, &picture.rgb, picture.depth.as_ref().map(|d| &d.0))
         });
@@ -295,6 +317,7 @@ impl Step {
         &'s self,
         rec: &mut Recorder<'_>,
         camera: &Camera,
+        photograph: Option<&Photograph>,
         step: u32,
         rates: Rates,
         compare: impl FnOnce(&mut Recorder<'_>, &'s Canvas) -> losses::Gradients<'s>,
@@ -307,10 +330,14 @@ impl Step {
             rec.zero(gradient);
         }
         forward.visible.record(rec, anchors, camera, *near, limits);
+        let (feature, attended) = match self.attend.as_ref().zip(photograph) {
+            Some((attend, photograph)) => attend.forward(rec, anchors, &forward.visible, photograph, *near, step),
+            None => (&anchors.feature.value, None),
+        };
         let offset = anchors.offset.value.view();
         let model = decode::Anchors {
             position: &anchors.position,
-            feature: &anchors.feature.value,
+            feature,
             offset: &offset,
             log_scaling: &anchors.log_scaling.value,
             weights: &self.weights.value,
@@ -346,10 +373,13 @@ impl Step {
             weights: &gradients.weights,
         };
         decode_backward.record(rec, &forward.decode, model, gaussians, to);
-        self.optimize(rec, step, rates);
+        if let Some((attend, attended)) = self.attend.as_ref().zip(attended) {
+            attend.backward(rec, attended, &gradients.feature);
+        }
+        self.optimize(rec, attended, step, rates);
     }
 
-    fn optimize(&self, rec: &mut Recorder<'_>, step: u32, rates: Rates) {
+    fn optimize(&self, rec: &mut Recorder<'_>, attended: Option<Attended<'_>>, step: u32, rates: Rates) {
         let Self { anchors, weights, gradients, .. } = self;
         let overflow = self.limits.overflow();
         let mut update = |parameter: &Parameter, gradient: &Buffer<f32>, range: (u32, u32), rate: f64| {
@@ -368,6 +398,30 @@ impl Step {
             let first = layout.head(head);
             update(weights, &gradients.weights, (first as u32, (layout.head(head + 1) - first) as u32), rate);
         }
+        if let Some((attend, _)) = self.attend.as_ref().zip(attended) {
+            let weights = &attend.weights;
+            let since = step + 1 - self.config.model.attention.start.max(1);
+            let tensors = Tensors {
+                value: &weights.value,
+                gradient: &attend.grad_weights,
+                first: &weights.first,
+                root: &weights.root,
+            };
+            adam::record(rec, &self.adam, tensors, overflow, (0, weights.width), (since, rates.attention));
+        }
+    }
+
+    /// Makes the stages that begin with this step.
+    ///
+    /// # Errors
+    /// When the device has no room.
+    pub fn prepare(&mut self, step: u32) -> Result<(), Error> {
+        let config = &self.config.model.attention;
+        if let Some(weights) = self.attention_weights.take_if(|_| step >= config.start) {
+            let attend = Attend::new(&self.gpu, config, self.config.train.seed, self.anchors.capacity, &weights)?;
+            self.attend = Some(attend);
+        }
+        Ok(())
     }
 
     /// The gradients of the last recorded step by PyTorch's names: for tests.
@@ -403,6 +457,11 @@ impl Step {
     pub fn model(&self) -> Result<(files::Anchors, files::Weights), Error> {
         let layout = Layout { offsets: self.anchors.offsets as usize };
         let flat = self.gpu.read_range(&self.weights.value, layout.weights())?;
-        Ok((self.anchors.read(&self.gpu)?, files::Weights::from_device(layout.offsets, &flat, None)))
+        let attention = match (&self.attend, &self.attention_weights) {
+            (Some(attend), _) => Some(self.gpu.read(&attend.weights.value)?),
+            (None, initial) => initial.clone(),
+        };
+        let weights = files::Weights::from_device(layout.offsets, &flat, attention.as_deref());
+        Ok((self.anchors.read(&self.gpu)?, weights))
     }
 }

@@ -1,0 +1,122 @@
+//! Cross-attention within a step: choose tokens in a patch around the mask, blend their features, and back.
+
+use super::order::{Stream, random};
+use super::photographs::Photograph;
+use crate::gpu::{Buffer, Error, Gpu, Recorder};
+use crate::math::attention::WEIGHTS;
+use crate::model::anchors::{Anchors, Parameter};
+use crate::model::attention_blend::{Blend, Inputs};
+use crate::model::attention_select::{Chosen, Draw, KEY_BITS, Select, View, patch_position};
+use crate::model::config::Attention as Config;
+use crate::primitives::Count;
+use crate::primitives::sort::{Pairs, Sort};
+use crate::render::visible::Visible;
+
+/// The stage, from the step at which attention starts.
+pub struct Attend {
+    config: Config,
+    seed: u64,
+    select: Select,
+    sort: Sort,
+    blend: Blend,
+    blended: Buffer<f32>,
+    /// Projections, flat, with their moments.
+    pub weights: Parameter,
+    /// dL/d weights.
+    pub grad_weights: Buffer<f32>,
+}
+
+/// The anchors chosen in a step.
+#[derive(Clone, Copy)]
+pub struct Attended<'a> {
+    chosen: Chosen<'a>,
+    reference: bool,
+}
+
+impl Attend {
+    /// The stage for so many anchors with these initial projections.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub fn new(gpu: &Gpu, config: &Config, seed: u64, anchors: u32, weights: &[f32]) -> Result<Self, Error> {
+        let parameter =
+            Parameter::new(gpu, ["attention_weights", "attention_first", "attention_root"], WEIGHTS as u32, 1)?;
+        gpu.write(&parameter.value, weights)?;
+        let mut rec = gpu.recorder()?;
+        rec.zero(&parameter.first);
+        rec.zero(&parameter.root);
+        rec.submit()?.wait()?;
+        Ok(Self {
+            seed,
+            select: Select::new(gpu, anchors as usize, config.tokens, config.min_tokens)?,
+            sort: Sort::new(gpu, anchors)?,
+            blend: Blend::new(gpu, config.tokens, config.blend as f32)?,
+            blended: gpu.buffer("blended", anchors as usize * 32)?,
+            grad_weights: gpu.buffer("grad_attention_weights", WEIGHTS)?,
+            weights: parameter,
+            config: config.clone(),
+        })
+    }
+
+    /// The same projections for another number of anchors.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub fn resize(&mut self, gpu: &Gpu, anchors: u32) -> Result<(), Error> {
+        self.select = Select::new(gpu, anchors as usize, self.config.tokens, self.config.min_tokens)?;
+        self.sort = Sort::new(gpu, anchors)?;
+        self.blended = gpu.buffer("blended", anchors as usize * 32)?;
+        Ok(())
+    }
+
+    /// Chooses tokens and blends their features. Returns the features to decode, and what the way back needs; nothing
+    /// where the view has no mask.
+    pub fn forward<'a>(
+        &'a self,
+        rec: &mut Recorder<'_>,
+        anchors: &'a Anchors,
+        visible: &Visible,
+        photograph: &Photograph,
+        near: f32,
+        step: u32,
+    ) -> (&'a Buffer<f32>, Option<Attended<'a>>) {
+        let Some([x0, y0, x1, y1]) = photograph.mask_box else { return (&anchors.feature.value, None) };
+        let camera = &photograph.camera;
+        let view = View {
+            rotation: camera.rotation,
+            translation: camera.translation,
+            lens: [camera.focal[0], camera.focal[1], camera.principal[0], camera.principal[1]],
+            distortion: camera.distortion,
+            near,
+            max_radius2: camera.max_radius2(),
+            size: camera.size,
+        };
+        let mut rng = random(self.seed, Stream::Patch, step);
+        let patch = patch_position(&mut rng, ([x0, y0], [x1, y1]), self.config.patch, camera.size);
+        let draw = Draw { patch, seed: self.seed as u32, step };
+        let listed = (&visible.list, &visible.count, anchors.count);
+        let candidates = self.select.candidates(rec, listed, &anchors.position, &photograph.picture, &view, draw);
+        let pairs = Pairs { keys: candidates.keys, values: candidates.anchors };
+        let sorted = self.sort.record(rec, pairs, Count::Device(&visible.count), KEY_BITS);
+        let chosen = self.select.take(rec, sorted.values);
+        let inputs = Inputs { chosen, weights: &self.weights.value };
+        let feature = &anchors.feature.value;
+        let attended = Attended { chosen, reference: photograph.reference };
+        if self.config.write_back {
+            self.blend.write_back(rec, inputs, feature, attended.reference);
+            return (feature, Some(attended));
+        }
+        self.blend.mix(rec, inputs, feature, &self.blended, anchors.count as usize);
+        (&self.blended, Some(attended))
+    }
+
+    /// From the gradient of the decoded features to that of the features and of the projections.
+    pub fn backward(&self, rec: &mut Recorder<'_>, attended: Attended<'_>, grad_feature: &Buffer<f32>) {
+        let inputs = Inputs { chosen: attended.chosen, weights: &self.weights.value };
+        if self.config.write_back {
+            self.blend.weights_backward(rec, inputs, grad_feature, &self.grad_weights);
+        } else {
+            self.blend.backward(rec, inputs, grad_feature, &self.grad_weights);
+        }
+    }
+}
