@@ -485,27 +485,4 @@ mod tests {
             assert_eq!(run(&gpu, size, &a, &b, Some(&vec![1.0; a.len()])), run(&gpu, size, &a, &b, None));
         }
     }
-
-    #[test]
-    fn zz_time() {
-        let gpu = testing::gpu_with(crate::gpu::Options { timestamps: true, ..Default::default() });
-        for size in [[252, 142], [1008, 567]] {
-            let [a, b] = pictures(size).remove(0);
-            let stage = Photometric::new(&gpu, size, 0.2).expect("buffers");
-            let rendered = gpu.upload("rgb", &a).expect("upload");
-            let target = gpu.upload("target", &b).expect("upload");
-            let weight = gpu.upload("weight", &weights(size)).expect("upload");
-            let losses = gpu.upload("losses", &[UNWRITTEN; 3]).expect("upload");
-            let mut best = std::collections::BTreeMap::new();
-            for _ in 0..20 {
-                let mut rec = gpu.recorder().expect("recorder");
-                stage.forward_backward(&mut rec, &rendered, &target, Some(&weight), &losses, 1);
-                for t in rec.submit().expect("submit").wait().expect("wait") {
-                    let e = best.entry(t.name).or_insert(f64::MAX);
-                    *e = e.min(t.duration / 1e6);
-                }
-            }
-            println!("{size:?} {:.3} {best:.3?}", best.values().sum::<f64>());
-        }
-    }
 }
