@@ -316,3 +316,114 @@ impl Align {
         grad_depth
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::testing::{self, UNWRITTEN};
+    use rand::{RngExt, SeedableRng};
+
+    /// Sizes about the workgroups' borders, arrays longer than the picture.
+    #[test]
+    fn kernels_match_their_twins() {
+        let gpu = testing::gpu();
+        let mut rng = rand_pcg::Pcg32::seed_from_u64(6);
+        for pixels in [0_u32, 1, 63, 64, 65, 511, 512, 513, 1000, 35784] {
+            for near in [0.0, 0.2] {
+                let n = pixels as usize + 3;
+                let mut noise = |low: f32, high: f32| -> Vec<f32> {
+                    (0..n).map(|_| low + (high - low) * rng.random::<f32>()).collect()
+                };
+                let (rendered, prior, grad_aligned) = (noise(0.0, 6.0), noise(0.2, 0.9), noise(-1.0, 1.0));
+                let valid: Vec<f32> = noise(0.0, 1.0).into_iter().map(f32::round).collect();
+                let partial = vec![UNWRITTEN; 4 * groups(pixels) as usize + 1];
+                let threads = threads(pixels);
+                let case =
+                    align_means::Arrays { rendered: rendered.clone(), prior: prior.clone(), partial: partial.clone() };
+                testing::assert_twin(align_means::Kernel, &gpu, case, align_means::Push { pixels, near }, threads);
+                let case = align_means_masked::Arrays {
+                    rendered: rendered.clone(),
+                    prior: prior.clone(),
+                    partial: partial.clone(),
+                    valid: valid.clone(),
+                };
+                let push = align_means_masked::Push { pixels, near };
+                testing::assert_twin(align_means_masked::Kernel, &gpu, case, push, threads);
+                for n in [0.0, 1.0, pixels as f32] {
+                    let sums = vec![n, 2.5 * n, 0.5 * n];
+                    let case = align_moments_masked::Arrays {
+                        rendered: rendered.clone(),
+                        prior: prior.clone(),
+                        sums: sums.clone(),
+                        partial: partial.clone(),
+                        valid: valid.clone(),
+                    };
+                    let push = align_moments_masked::Push { pixels, near };
+                    testing::assert_twin(align_moments_masked::Kernel, &gpu, case, push, threads);
+                    let case = align_moments::Arrays {
+                        rendered: rendered.clone(),
+                        prior: prior.clone(),
+                        sums,
+                        partial: partial.clone(),
+                    };
+                    let push = align_moments::Push { pixels, near };
+                    testing::assert_twin(align_moments::Kernel, &gpu, case, push, threads);
+                }
+                for slope in [0.1_f32, -0.1, 0.0] {
+                    let fit = vec![slope.abs(), 0.3, 2.9, 0.5, slope, 1.0 / n as f32, 0.6, 1.0 / n as f32];
+                    let case = align_backward::Arrays {
+                        grad_aligned: grad_aligned.clone(),
+                        rendered: rendered.clone(),
+                        fit: fit.clone(),
+                        partial: partial.clone(),
+                    };
+                    let push = align_backward::Push { pixels, near };
+                    testing::assert_twin(align_backward::Kernel, &gpu, case, push, threads);
+                    let (sums, grad_depth) = (vec![0.4, -1.7], vec![UNWRITTEN; n]);
+                    let case = align_gradient::Arrays {
+                        grad_aligned: grad_aligned.clone(),
+                        rendered: rendered.clone(),
+                        prior: prior.clone(),
+                        fit: fit.clone(),
+                        sums: sums.clone(),
+                        grad_depth: grad_depth.clone(),
+                    };
+                    let push = align_gradient::Push { pixels, near };
+                    testing::assert_twin(align_gradient::Kernel, &gpu, case, push, pixels);
+                    let case = align_gradient_masked::Arrays {
+                        grad_aligned: grad_aligned.clone(),
+                        rendered: rendered.clone(),
+                        prior: prior.clone(),
+                        fit,
+                        sums,
+                        grad_depth,
+                        valid: valid.clone(),
+                    };
+                    let push = align_gradient_masked::Push { pixels, near };
+                    testing::assert_twin(align_gradient_masked::Kernel, &gpu, case, push, pixels);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn singular_fits_are_seen() {
+        let gpu = testing::gpu();
+        let regular = vec![100.0, 250.0, 50.0, 1e-4, -1e-4, 80.0, -8.0];
+        let cases = [
+            regular.clone(),
+            vec![0.0; 7],
+            vec![1.0, 2.5, 0.5, 0.0, 0.0, 0.0, 0.0],
+            // A spread of one rounding per pixel.
+            vec![100.0, 250.0, 50.0, 0.0, 0.0, 100.0 * (2.5_f32 * 6e-8).powi(2), 1e-9],
+            vec![100.0, 0.0, 50.0, 0.0, 0.0, 1e-40, 0.0],
+            vec![100.0, f32::NAN, 50.0, f32::NAN, 0.0, f32::NAN, f32::NAN],
+        ];
+        for (i, sums) in cases.into_iter().enumerate() {
+            let case = align_fit::Arrays { sums, fit: vec![UNWRITTEN; 8] };
+            testing::assert_twin(align_fit::Kernel, &gpu, case.clone(), (), 1u32);
+            let fit = testing::run_once::<align_fit::Kernel>(&gpu, &case, (), 1u32).fit;
+            assert_eq!(fit[0] == 0.0 && fit[1] == 0.0 && fit[5] == 0.0, i > 0, "{i}: {fit:?}");
+        }
+    }
+}

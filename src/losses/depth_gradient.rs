@@ -187,3 +187,57 @@ impl DepthGradient {
         sum::record(rec, partial, groups(pixels), 1, losses, slot);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::testing::{self, UNWRITTEN};
+    use rand::{RngExt, SeedableRng};
+
+    #[test]
+    fn kernels_match_their_twins() {
+        let gpu = testing::gpu();
+        let mut rng = rand_pcg::Pcg32::seed_from_u64(8);
+        for size in [[1, 1], [2, 2], [1, 17], [63, 2], [5, 300], [300, 5], [53, 37], [252, 142]] {
+            for scales in [1, 4, 8] {
+                let pixels = size[0] * size[1];
+                let n = pixels as usize + 3;
+                let mut noise = || -> Vec<f32> { (0..n).map(|_| rng.random()).collect() };
+                let partial = vec![UNWRITTEN; groups(pixels) as usize + 1];
+                // Of eight values, so that neighbours agree now and then.
+                let difference: Vec<f32> = noise().iter().map(|v| (8.0 * v).floor() / 8.0).collect();
+                let case = depth_gradient::Arrays {
+                    difference: difference.clone(),
+                    grad_aligned: noise(),
+                    partial: partial.clone(),
+                };
+                let push = depth_gradient::Push { size, factor: 0.5, scales };
+                testing::assert_twin(depth_gradient::Kernel, &gpu, case.clone(), push, threads(pixels));
+                let random: Vec<f32> = noise().iter().map(|v| v.round()).collect();
+                for valid in [random, vec![0.0; n], noise()] {
+                    let case = depth_gradient_counts::Arrays {
+                        valid: valid.clone(),
+                        partial: vec![UNWRITTEN; scales as usize * groups(pixels) as usize + 1],
+                    };
+                    let push = depth_gradient_counts::Push { size, scales };
+                    testing::assert_twin(depth_gradient_counts::Kernel, &gpu, case, push, threads(pixels));
+                    let [width, height] = size;
+                    let counts = (0..scales).map(|s| {
+                        let on = (0..(width * height) as usize).filter(|&i| has(s, i, width as usize));
+                        on.map(|i| valid[i]).sum()
+                    });
+                    let counts = counts.collect();
+                    let case = depth_gradient_masked::Arrays {
+                        difference: difference.clone(),
+                        grad_aligned: noise(),
+                        partial: partial.clone(),
+                        valid,
+                        counts,
+                    };
+                    let push = depth_gradient_masked::Push { size, factor: 0.5, scales };
+                    testing::assert_twin(depth_gradient_masked::Kernel, &gpu, case, push, threads(pixels));
+                }
+            }
+        }
+    }
+}

@@ -188,3 +188,316 @@ impl Losses {
         &self.terms
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::testing::{self, UNWRITTEN};
+    use crate::math::align::{Fit, alignable, sums};
+    use rand::{RngExt, SeedableRng};
+    use rand_pcg::Pcg32;
+
+    const SIZES: [[u32; 2]; 6] = [[2, 2], [1, 17], [63, 2], [5, 300], [53, 37], [252, 142]];
+
+    /// A depth map and a prior for it.
+    struct Maps {
+        size: [u32; 2],
+        rendered: Vec<f32>,
+        prior: Vec<f32>,
+        valid: Vec<f32>,
+        weight: Vec<f32>,
+    }
+
+    impl Maps {
+        /// `prior = slope x + 0.05 + noise` of x = the rendered depth between 0 and 6 or its disparity.
+        fn new(size: [u32; 2], seed: u64, slope: f64, quantity: Quantity) -> Self {
+            let mut rng = Pcg32::seed_from_u64(seed);
+            let pixels = size[0] * size[1];
+            let rendered: Vec<f32> = (0..pixels).map(|_| 6.0 * rng.random::<f32>()).collect();
+            let prior = rendered.iter().map(|&d| {
+                let x = alignable(d.into(), quantity.near().into());
+                (slope * x + 0.05 + 0.1 * slope.abs() * rng.random::<f64>()) as f32
+            });
+            let prior = prior.collect();
+            let inside = |p: u32| {
+                let (x, y) = (p % size[0] * 8 / size[0], p / size[0] * 8 / size[1]);
+                (2..5).contains(&x) && (2..6).contains(&y)
+            };
+            let of = |inside_value, outside_value| {
+                (0..pixels).map(|p| if inside(p) { inside_value } else { outside_value }).collect()
+            };
+            Self { size, rendered, prior, valid: of(0.0, 1.0), weight: of(100.0, 1.0) }
+        }
+
+        /// Fit, terms and gradient by the rendered depth. `checked` compares every pass with its twin.
+        fn run(
+            &self,
+            gpu: &Gpu,
+            quantity: Quantity,
+            gradient_valid: bool,
+            checked: bool,
+        ) -> ([f64; 8], [f32; 2], Vec<f32>) {
+            let Self { size, rendered, prior, valid, weight } = self;
+            let upload = |name, data: &[f32]| gpu.upload(name, data).expect("upload");
+            let (rendered, prior) = (upload("rendered", rendered), upload("prior", prior));
+            let (valid, weight) = (upload("valid", valid), upload("weight", weight));
+            let terms = upload("terms", &[UNWRITTEN; 2]);
+            let align = align::Align::new(gpu, *size).expect("buffers");
+            let l1 = depth_l1::DepthL1::new(gpu, *size).expect("buffers");
+            let gradient = depth_gradient::DepthGradient::new(gpu, *size, 4, gradient_valid).expect("buffers");
+            let prior = align::Prior { values: &prior, quantity, valid: Some(&valid) };
+            let mut rec = if checked { gpu.checked() } else { gpu.recorder() }.expect("recorder");
+            let fit = align.forward(&mut rec, &rendered, prior);
+            let weight = depth_l1::Weight::Each(&weight);
+            let (difference, grad_aligned) = l1.forward_backward(&mut rec, &rendered, prior, fit, weight, &terms, 0);
+            let mask = gradient_valid.then_some(&valid);
+            gradient.forward_backward(&mut rec, difference, grad_aligned, mask, 0.5, &terms, 1);
+            let grad = align.backward(&mut rec, grad_aligned, &rendered, prior);
+            finish(rec);
+            let fit = gpu.read(fit).expect("read");
+            let terms = gpu.read(&terms).expect("read");
+            (std::array::from_fn(|i| fit[i].into()), [terms[0], terms[1]], gpu.read(grad).expect("read"))
+        }
+
+        /// The whole loss in float64 for these rendered depths.
+        fn loss(&self, rendered: &[f64], quantity: Quantity, gradient_valid: bool) -> f64 {
+            let double = |v: &[f32]| -> Vec<f64> { v.iter().map(|&v| f64::from(v)).collect() };
+            let (prior, valid, weight) = (double(&self.prior), double(&self.valid), double(&self.weight));
+            let x: Vec<f64> = rendered.iter().map(|&d| alignable(d, quantity.near().into())).collect();
+            let fit = Fit::of(sums(&x, &prior, &valid));
+            let d: Vec<f64> = x.iter().zip(&prior).map(|(x, p)| fit.scale * x + fit.shift - p).collect();
+            let mask = if gradient_valid { valid } else { vec![1.0; d.len()] };
+            let mut loss: f64 = d.iter().zip(&weight).map(|(d, w)| w * d.abs()).sum::<f64>() / d.len() as f64;
+            let [width, height] = self.size.map(|v| v as usize);
+            for step in [1, 2, 4, 8] {
+                let (mut variation, mut count) = (0.0, 0.0);
+                for y in (0..height).step_by(step) {
+                    for x in (0..width).step_by(step) {
+                        let i = y * width + x;
+                        count += mask[i];
+                        for (there, j) in [(x + step < width, i + step), (y + step < height, i + step * width)] {
+                            if there {
+                                variation += mask[i] * mask[j] * (mask[j] * d[j] - mask[i] * d[i]).abs();
+                            }
+                        }
+                    }
+                }
+                if count > 0.0 {
+                    loss += 0.5 * variation / count;
+                }
+            }
+            loss
+        }
+    }
+
+    fn finish(rec: Recorder<'_>) {
+        let submission = rec.submit().expect("submit");
+        for difference in &submission.differences {
+            assert!(difference.ok(), "{difference}");
+        }
+        submission.wait().expect("wait");
+    }
+
+    const DISPARITY: Quantity = Quantity::Disparity { near: 0.2 };
+
+    #[test]
+    fn every_pass_of_the_depth_losses_matches_its_twin() {
+        let gpu = testing::gpu();
+        for size in SIZES {
+            for (seed, slope) in [(1, 0.12), (2, -0.3)] {
+                for quantity in [Quantity::Depth, DISPARITY] {
+                    for gradient_valid in [false, true] {
+                        Maps::new(size, seed, slope, quantity).run(&gpu, quantity, gradient_valid, true);
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn gradient_through_the_fit_is_the_slope_of_the_definition() {
+        let gpu = testing::gpu();
+        for size in [[2, 2], [19, 13], [3, 30], [30, 3]] {
+            for (seed, slope) in [(3, 0.12), (4, -0.3)] {
+                for quantity in [Quantity::Depth, DISPARITY] {
+                    for gradient_valid in [false, true] {
+                        let maps = Maps::new(size, seed, slope, quantity);
+                        let (fit, terms, grad) = maps.run(&gpu, quantity, gradient_valid, false);
+                        assert!(fit[4] * slope > 0.0, "{fit:?}");
+                        let mut rendered: Vec<f64> = maps.rendered.iter().map(|&v| v.into()).collect();
+                        let want = maps.loss(&rendered, quantity, gradient_valid);
+                        // The differences cancel to a tenth or so of the values.
+                        assert!((f64::from(terms[0] + terms[1]) - want).abs() < 3e-5 * want, "{terms:?}, {want}");
+                        let largest = grad.iter().fold(0.0_f64, |m, g| m.max(f64::from(g.abs())));
+                        let (mut at_kink, step) = (0, 1e-6);
+                        for (i, &got) in grad.iter().enumerate() {
+                            let old = rendered[i];
+                            let mut at = |d: f64| {
+                                rendered[i] = old + d;
+                                let loss = maps.loss(&rendered, quantity, gradient_valid);
+                                rendered[i] = old;
+                                loss
+                            };
+                            let (above, below) = ((at(step) - want) / step, (want - at(-step)) / step);
+                            // Both sides differ by the curvature (of 1 / depth: up to 2 / near^3 = 250 times the step)
+                            // unless a kink lies between them.
+                            if (above - below).abs() > 1e-3 * largest {
+                                at_kink += 1;
+                                continue;
+                            }
+                            let slope = 0.5 * (above + below);
+                            // 1e-5 of rounding on the device; 1e-16 / 1e-6 in the quotient; the curvature's own change.
+                            let limit = 1e-4 * largest + 1e-8;
+                            assert!(
+                                (slope - f64::from(got)).abs() < limit,
+                                "{size:?} {quantity:?} [{i}] {got}, slope {slope}"
+                            );
+                        }
+                        assert!(at_kink <= grad.len() / 50, "{at_kink} of {}", grad.len());
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_fit_to_nothing_has_no_gradient() {
+        let gpu = testing::gpu();
+        for quantity in [Quantity::Depth, DISPARITY] {
+            let good = || Maps::new([53, 37], 7, 0.2, quantity);
+            let n = 53 * 37;
+            let mut one = vec![0.0; n];
+            one[1000] = 1.0;
+            for (case, maps) in [
+                ("one pixel", Maps::new([1, 1], 7, 0.2, quantity)),
+                ("one valid pixel", Maps { valid: one, ..good() }),
+                ("no valid pixel", Maps { valid: vec![0.0; n], ..good() }),
+                ("one depth", Maps { rendered: vec![3.3; n], ..good() }),
+                ("nothing rendered", Maps { rendered: vec![0.0; n], ..good() }),
+            ] {
+                // Distances from the mean are nothing but rounding, which the twins do not share.
+                let (fit, terms, grad) = maps.run(&gpu, quantity, false, false);
+                assert_eq!([fit[0], fit[1]], [0.0, 0.0], "{case}");
+                assert!(grad.iter().all(|&g| g == 0.0), "{case}");
+                let rendered: Vec<f64> = maps.rendered.iter().map(|&v| v.into()).collect();
+                let want = maps.loss(&rendered, quantity, false);
+                assert!((f64::from(terms[0] + terms[1]) - want).abs() < 1e-5 * want, "{case}: {terms:?}, {want}");
+            }
+        }
+    }
+
+    #[test]
+    fn no_weight_and_no_variation_no_gradient() {
+        let gpu = testing::gpu();
+        let size = [53, 37];
+        let nothing = vec![0.0; 53 * 37];
+        let maps = Maps { weight: nothing.clone(), ..Maps::new(size, 8, 0.2, Quantity::Depth) };
+        let (_, terms, _) = maps.run(&gpu, Quantity::Depth, true, true);
+        assert_eq!(terms[0], 0.0);
+        let maps = Maps { valid: nothing, ..maps };
+        let (_, terms, grad) = maps.run(&gpu, Quantity::Depth, true, true);
+        assert!(terms == [0.0, 0.0] && grad.iter().all(|&g| g == 0.0), "{terms:?}");
+    }
+
+    #[test]
+    fn a_prior_of_one_value_flattens_nothing_else() {
+        let gpu = testing::gpu();
+        let maps = Maps { prior: vec![0.7; 53 * 37], ..Maps::new([53, 37], 9, 0.2, Quantity::Depth) };
+        // Every difference is at its kink, so that signs are the rounding's: not compared with the twins.
+        let (fit, terms, grad) = maps.run(&gpu, Quantity::Depth, false, false);
+        assert!(fit[0] < 1e-6 && (fit[1] - 0.7).abs() < 1e-6, "{fit:?}");
+        assert!(terms[0] < 1e-4 && terms[1] < 1e-5, "{terms:?}");
+        // |w| of rounding, and a slope's gradient times the prior's distance from its mean: rounding as well.
+        assert!(grad.iter().all(|g| g.abs() < 1e-6), "{:?}", grad.iter().fold(0.0_f32, |m, g| m.max(g.abs())));
+    }
+
+    /// Far from zero and nearly flat: the plain determinant would have no digit left in float32.
+    #[test]
+    fn the_fit_keeps_its_digits() {
+        let gpu = testing::gpu();
+        let mut rng = Pcg32::seed_from_u64(11);
+        let size = [1008, 567];
+        let pixels = size[0] * size[1];
+        let rendered: Vec<f32> = (0..pixels).map(|_| 1000.0 + rng.random::<f32>()).collect();
+        let prior: Vec<f32> = rendered.iter().map(|r| ((f64::from(*r) - 1000.0) * 0.25 + 3.0) as f32).collect();
+        let ones = vec![1.0; pixels as usize];
+        let maps = Maps { size, rendered, prior, valid: ones.clone(), weight: ones };
+        let (fit, ..) = maps.run(&gpu, Quantity::Depth, false, false);
+        // The depths are exact; their distances from the mean are good to 6e-8 * 1000 of 0.3, at random.
+        assert!((fit[0] - 0.25).abs() < 1e-5 * 0.25, "{fit:?}");
+        assert!((fit[0] * fit[2] + fit[1] - fit[6]).abs() < 1e-4, "{fit:?}");
+    }
+
+    fn random_view(size: [u32; 2], masks: bool) -> (Vec<u32>, Vec<[f32; 3]>) {
+        let mut rng = Pcg32::seed_from_u64(12);
+        (0..size[0] * size[1])
+            .map(|p| {
+                let inside = masks && (3..9).contains(&(p % size[0])) && (2..30).contains(&(p / size[0]));
+                (pack(std::array::from_fn(|_| rng.random()), inside), std::array::from_fn(|_| rng.random()))
+            })
+            .unzip()
+    }
+
+    #[test]
+    fn all_losses_of_a_step_match_their_twins() {
+        let gpu = testing::gpu();
+        for size in SIZES {
+            for masks in [false, true] {
+                let plan = Plan { size, ssim_weight: 0.2, masks, depth: true, gradient_scales: 4 };
+                let losses = Losses::new(&gpu, &plan).expect("buffers");
+                let (picture, rgb) = random_view(size, masks);
+                let picture = gpu.upload("picture", &picture).expect("upload");
+                let rgb = gpu.upload("rgb", &rgb).expect("upload");
+                let maps = Maps::new(size, 13, 0.2, DISPARITY);
+                let depth = gpu.upload("depth", &maps.rendered).expect("upload");
+                let prior = gpu.upload("prior", &maps.prior).expect("upload");
+                let rectangle = Some(Rectangle { low: [1, 1], high: [20, 20], added: 99.0 });
+                let of_depth = DepthView {
+                    prior: &prior,
+                    quantity: DISPARITY,
+                    weights: Weights { outside: 1.0, inside: 1.0 },
+                    rectangle,
+                    gradient: 0.5,
+                    gradient_inside: true,
+                };
+                let reference =
+                    View { picture: &picture, weights: Weights { outside: 1.0, inside: 20.0 }, depth: Some(of_depth) };
+                let other_depth = DepthView {
+                    weights: Weights { outside: 0.1, inside: 0.0 },
+                    rectangle: None,
+                    gradient: 0.05,
+                    gradient_inside: false,
+                    ..of_depth
+                };
+                let weights = Weights { outside: 1.0, inside: 0.0 };
+                let other = View { weights, depth: Some(other_depth), ..reference };
+                let plain = View { depth: None, ..other };
+                for (view, with_depth) in [(reference, true), (other, true), (plain, false)] {
+                    let mut rec = gpu.checked().expect("recorder");
+                    let gradients = losses.forward_backward(&mut rec, &view, &rgb, &depth);
+                    assert_eq!(gradients.depth.is_some(), with_depth);
+                    finish(rec);
+                    let terms = gpu.read(losses.terms()).expect("read");
+                    assert!(terms[0] > 0.0, "{terms:?}");
+                    let expected = with_depth && size[0] * size[1] > 17;
+                    assert!(!expected || terms[1..].iter().all(|&t| t > 0.0), "{terms:?}");
+                    assert!(with_depth || terms[1..] == [0.0, 0.0], "{terms:?}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_not_planned_has_no_buffer() {
+        let gpu = testing::gpu();
+        let plan = Plan { size: [8, 8], ssim_weight: 0.2, masks: false, depth: false, gradient_scales: 4 };
+        let losses = Losses::new(&gpu, &plan).expect("buffers");
+        assert!(losses.depth.is_none() && losses.frame.weight().is_none() && losses.frame.valid().is_none());
+        let masks = Plan { masks: true, ..plan };
+        let losses = Losses::new(&gpu, &masks).expect("buffers");
+        assert!(losses.frame.weight().is_some() && losses.frame.valid().is_none());
+        let names: Vec<_> = Term::ALL.iter().map(|t| t.name()).collect();
+        assert_eq!(names, ["photometric", "depth_l1", "depth_gradient"]);
+        assert!(Term::ALL.iter().enumerate().all(|(i, &t)| t as usize == i));
+    }
+}

@@ -132,7 +132,7 @@ fn gradient_reference(from: &Pictures<'_>, grad_rendered: &mut [[f32; 3]], parti
         for x in 0..width {
             let pixel = y * width + x;
             let scale = f64::from(push.factor) * from.weight.map_or(1.0, |w| f64::from(w[pixel]));
-            for c in 0..3 {
+            for (c, grad) in grad_rendered[pixel].iter_mut().enumerate() {
                 let (a, b) = (f64::from(from.rendered[pixel][c]), f64::from(from.target[pixel][c]));
                 let s: [f64; 3] = std::array::from_fn(|k| {
                     ssim::blur(y, height, |y: usize| f64::from(from.grad_rows[(y * width + x) * 3 + c][k]))
@@ -140,7 +140,7 @@ fn gradient_reference(from: &Pictures<'_>, grad_rendered: &mut [[f32; 3]], parti
                 losses[(y / RUN * width + x) / 64] += scale * (a - b).abs();
                 let sign = if a == b { 0.0 } else { (a - b).signum() };
                 let value = s[0] + 2.0 * ((a - 0.5) * s[1] + (a - b) * s[2]) + scale * sign;
-                grad_rendered[pixel][c] = value as f32;
+                *grad = value as f32;
             }
         }
     }
@@ -293,11 +293,7 @@ mod tests {
         let near: Vec<[f32; 3]> =
             a.iter().zip(&b).map(|(a, b)| std::array::from_fn(|i| a[i] + 0.02 * (b[i] - 0.5))).collect();
         let edges = (0..size[0] * size[1])
-            .map(|p| {
-                std::array::from_fn(
-                    |i| if (p % size[0] / 9 + p / size[0] / (7 + i as u32)) % 2 == 0 { 1.0 } else { 0.0 },
-                )
-            })
+            .map(|p| std::array::from_fn(|i| ((p % size[0] / 9 + p / size[0] / (7 + i as u32)) % 2) as f32))
             .collect();
         let bright = vec![[0.9, 1.0, 0.8]; pixels];
         vec![
@@ -483,29 +479,6 @@ mod tests {
         let size = [53, 37];
         for [a, b] in pictures(size) {
             assert_eq!(run(&gpu, size, &a, &b, Some(&vec![1.0; a.len()])), run(&gpu, size, &a, &b, None));
-        }
-    }
-
-    #[test]
-    fn zz_time() {
-        let gpu = testing::gpu_with(crate::gpu::Options { timestamps: true, ..Default::default() });
-        for size in [[252, 142], [1008, 567]] {
-            let [a, b] = pictures(size).remove(0);
-            let stage = Photometric::new(&gpu, size, 0.2).expect("buffers");
-            let rendered = gpu.upload("rgb", &a).expect("upload");
-            let target = gpu.upload("target", &b).expect("upload");
-            let weight = gpu.upload("weight", &weights(size)).expect("upload");
-            let losses = gpu.upload("losses", &[UNWRITTEN; 3]).expect("upload");
-            let mut best = std::collections::BTreeMap::new();
-            for _ in 0..20 {
-                let mut rec = gpu.recorder().expect("recorder");
-                stage.forward_backward(&mut rec, &rendered, &target, Some(&weight), &losses, 1);
-                for t in rec.submit().expect("submit").wait().expect("wait") {
-                    let e = best.entry(t.name).or_insert(f64::MAX);
-                    *e = e.min(t.duration / 1e6);
-                }
-            }
-            println!("{size:?} {:.3} {best:.3?}", best.values().sum::<f64>());
         }
     }
 }
