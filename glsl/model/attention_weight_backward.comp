@@ -4,13 +4,13 @@
 #extension GL_GOOGLE_include_directive : require
 #include "thread.glsl"
 #include "attention.glsl"
-// Gradient of one matrix, output gradient times input summed over one of 16 slices of the tokens; with a bias (behind
+// Gradient of one matrix, output gradient times input summed over one of 8 slices of the tokens; with a bias (behind
 // the matrix) also the sum of the output gradient. A thread: 8 rows, 8 columns, one slice.
 layout(local_size_x = 64) in;
 layout(binding = 0, scalar) readonly buffer Tokens { uint tokens[]; };          // [2] tokens inside, around
 layout(binding = 1, scalar) readonly buffer GradOutput { vec4 grad_output[]; }; // [capacity * rows / 4]
 layout(binding = 2, scalar) readonly buffer Input { vec4 inputs[]; };           // [capacity * columns / 4]
-layout(binding = 3, scalar) writeonly buffer Partial { vec4 partial[]; };       // [16 * 24592] slices of all weights' gradient
+layout(binding = 3, scalar) writeonly buffer Partial { vec4 partial[]; };       // [8 * 24592] slices of all weights' gradient
 layout(push_constant, scalar) uniform Push {
   uint own;      // 0: the side is inside, 1: around
   uint capacity; // tokens at most
@@ -19,7 +19,7 @@ layout(push_constant, scalar) uniform Push {
   uint matrix;   // vec4 offset of the matrix in the weights
   uint bias;     // 1: a bias follows
 } push;
-const uint SLICES = 16u;
+const uint SLICES = 8u;
 const uint ALL = 24592u;
 void main() {
   uint n = sides(tokens[push.own], tokens[1u - push.own], push.capacity).x;

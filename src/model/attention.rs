@@ -18,7 +18,7 @@ use crate::math::attention::{FEATURE, HEAD, HEADS, INNER, Offsets, SIDES, dot, s
 pub use crate::math::attention::{TENSORS, WEIGHTS};
 
 /// Slices of the tokens in the sum of a weight's gradient: the kernels'.
-const SLICES: usize = 16;
+const SLICES: usize = 8;
 
 /// Tokens of the own and the other side, clamped; both 0 where one is empty.
 fn sides(tokens: &[u32], own: u32, capacity: u32) -> (usize, usize) {
