@@ -73,8 +73,16 @@ struct Sums {
   float z;
 };
 
+const Sums NO_SUMS = Sums(vec2(0.0), vec3(0.0), 0.0, vec3(0.0), 0.0);
+
+bool any_live() {
+  bool any_pixel = false;
+  [[unroll]] for (uint r = 0u; r < ROWS; r++) any_pixel = any_pixel || live[r];
+  return any_pixel;
+}
+
 Sums sums_of(vec2 m, vec3 q, float o, vec3 c, float z) {
-  Sums s = Sums(vec2(0.0), vec3(0.0), 0.0, vec3(0.0), 0.0);
+  Sums s = NO_SUMS;
   float dx = pixel.x - m.x;
   [[unroll]] for (uint r = 0u; r < ROWS; r++) {
     float dy = pixel.y + float(r) - m.y;
@@ -129,6 +137,7 @@ Sums over_subgroup(Sums s) {
 #ifndef NARROW
 const uint BATCH = 32u;
 const uint SUBGROUPS = 16u; // most there can be: 64 threads in subgroups of at least 4
+shared uint s_live;
 shared vec2 s_mean[BATCH];
 shared vec3 s_conic[BATCH];
 shared float s_opacity[BATCH];
@@ -163,8 +172,10 @@ void main() {
     remaining[r] = total;
   }
   uvec2 range = ranges[tile];
+  uint base = range.x;
 #ifdef NARROW
-  for (uint base = range.x; base < range.y; base += THREADS) {
+  for (; base < range.y; base += THREADS) {
+    if (!subgroupAny(any_live())) break;
     // A lane beyond the end has opacity 0, which no pixel blends.
     uint i = base + t;
     bool some = i < range.y;
@@ -179,7 +190,7 @@ void main() {
 #else
     float z = 0.0;
 #endif
-    Sums mine = Sums(vec2(0.0), vec3(0.0), 0.0, vec3(0.0), 0.0);
+    Sums mine = NO_SUMS;
 #define SUM(k) { \
       Sums s = over_subgroup(sums_of(subgroupBroadcast(m, k), subgroupBroadcast(q, k), subgroupBroadcast(o, k), subgroupBroadcast(c, k), subgroupBroadcast(z, k))); \
       bool own = t == k; \
@@ -193,9 +204,11 @@ void main() {
     if (some) write(p, q, mine);
   }
 #else
-  for (uint base = range.x; base < range.y; base += BATCH) {
+  for (; base < range.y; base += BATCH) {
     uint n = min(BATCH, range.y - base);
+    if (t == 0u) s_live = 0u;
     barrier();
+    if (any_live()) atomicOr(s_live, 1u);
     if (t < n) {
       uint g = pair_slot[sorted[base + t]];
       s_mean[t] = mean[g];
@@ -207,6 +220,7 @@ void main() {
 #endif
     }
     barrier();
+    if (s_live == 0u) break;
     for (uint k = 0u; k < n; k++) {
 #ifdef WITH_DEPTH
       float z = s_depth[k];
@@ -224,7 +238,7 @@ void main() {
     }
     barrier();
     if (t < n) {
-      Sums s = Sums(vec2(0.0), vec3(0.0), 0.0, vec3(0.0), 0.0);
+      Sums s = NO_SUMS;
       for (uint u = 0u; u < gl_NumSubgroups; u++) {
         uint at = t * SUBGROUPS + u;
         s.first += s_first[at];
@@ -235,6 +249,9 @@ void main() {
       }
       write(sorted[base + t], s_conic[t], s);
     }
+    barrier();
   }
 #endif
+  // Behind the last Gaussian that any pixel of the tile can still see.
+  for (uint i = base + t; i < range.y; i += THREADS) write(sorted[i], vec3(0.0), NO_SUMS);
 }

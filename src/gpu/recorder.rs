@@ -131,6 +131,8 @@ impl Gpu {
     pub fn recorder(&self) -> Result<Recorder<'_>, Error> {
         let context = lock(&self.inner().contexts).pop();
         let context = context.map_or_else(|| Context::new(self), Ok)?;
+        // From here on the device may come to use whatever is recorded: dropped buffers wait.
+        self.inner().began();
         let mut recorder = Recorder {
             gpu: self,
             context: Some(context),
@@ -454,6 +456,7 @@ impl<'g> Recorder<'g> {
         submission.start()?;
         submission.wait()?;
         let context = lock(&self.gpu.inner().contexts).pop();
+        self.gpu.inner().began();
         self.context = Some(context.map_or_else(|| Context::new(self.gpu), Ok)?);
         self.begin()
     }
@@ -465,6 +468,7 @@ impl Drop for Recorder<'_> {
             // SAFETY: recording, never submitted; ending it makes it reusable.
             let _ = unsafe { self.gpu.inner().device.end_command_buffer(context.commands) };
             lock(&self.gpu.inner().contexts).push(context);
+            self.gpu.inner().ended();
         }
     }
 }
@@ -503,7 +507,6 @@ impl Submission<'_> {
             inner.device.end_command_buffer(context.commands).named("ending a command buffer")?;
             inner.device.queue_submit2(inner.queue, &submit, context.fence)
         };
-        inner.began();
         self.lost(result)
     }
 
