@@ -29,7 +29,7 @@ shared uint counters[PAIRS * 65u]; // a row of 64 threads per pair of digits, on
 shared uint places[PAIRS * 2u];    // where the block's first key with the digit goes
 void main() {
   uint n = min(count[0], push.capacity);
-  uint t = gl_LocalInvocationID.x;
+  uint t = scan_thread();
   uint block = group_index();
   uint first = (block * 64u + t) * ITEMS;
   uint last = min(first + ITEMS, n);
