@@ -1,25 +1,19 @@
-// Exclusive prefix sum over the 64 threads of a workgroup, whatever the subgroup size: eight rows of eight.
-// Called from uniform control flow; may be called again in a loop.
-shared uint scan_terms[64];
-shared uint scan_rows[8];
+#extension GL_KHR_shader_subgroup_arithmetic : require
+// Exclusive prefix sum over the 64 threads of a workgroup, for any subgroup size from 4 on. Threads are numbered by
+// subgroup and lane, since nothing says that lanes follow gl_LocalInvocationID.
+// Called from uniform control flow; a second call needs a barrier() in between.
+shared uint scan_rows[16];
+uint scan_thread() { return gl_SubgroupID * gl_SubgroupSize + gl_SubgroupInvocationID; }
 uint exclusive_sum(uint term, out uint total) {
-  const uint t = gl_LocalInvocationID.x;
-  barrier(); // the previous call's readers are done
-  scan_terms[t] = term;
+  uint inclusive = subgroupInclusiveAdd(term);
+  if (gl_SubgroupInvocationID == gl_SubgroupSize - 1u) scan_rows[gl_SubgroupID] = inclusive;
   barrier();
-  if (t < 8u) {
-    uint row = 0u;
-    for (uint i = 0u; i < 8u; ++i) row += scan_terms[t * 8u + i];
-    scan_rows[t] = row;
-  }
-  barrier();
-  uint before = 0u;
+  uint before = inclusive - term;
   total = 0u;
-  for (uint i = 0u; i < 8u; ++i) {
+  for (uint i = 0u; i < gl_NumSubgroups; ++i) {
     uint row = scan_rows[i];
-    before += i < t / 8u ? row : 0u;
+    before += i < gl_SubgroupID ? row : 0u;
     total += row;
   }
-  for (uint i = t & ~7u; i < t; ++i) before += scan_terms[i];
   return before;
 }

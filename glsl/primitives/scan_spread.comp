@@ -15,7 +15,7 @@ layout(push_constant, scalar) uniform Push {
 void main() {
   uint n = min(count[0], push.capacity);
   uint block = group_index();
-  uint first = block * 1024u + gl_LocalInvocationID.x * 16u;
+  uint first = block * 1024u + scan_thread() * 16u;
   uint run[16];
   uint sum = 0u;
   for (uint i = 0u; i < 16u; ++i) {

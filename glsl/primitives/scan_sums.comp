@@ -17,7 +17,7 @@ void main() {
   uint block = group_index();
   uint sum = 0u;
   for (uint i = 0u; i < 16u; ++i) {
-    uint at = block * 1024u + i * 64u + gl_LocalInvocationID.x;
+    uint at = block * 1024u + i * 64u + scan_thread();
     if (at < n) {
 #ifdef NONZERO
       sum += uint(terms[at] != 0u);
@@ -28,5 +28,5 @@ void main() {
   }
   uint total;
   exclusive_sum(sum, total);
-  if (gl_LocalInvocationID.x == 0u && block * 1024u < n) sums[block] = total;
+  if (scan_thread() == 0u && block * 1024u < n) sums[block] = total;
 }

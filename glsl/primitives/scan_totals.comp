@@ -17,7 +17,7 @@ void main() {
   uint n = clamped / push.items + uint(clamped % push.items != 0u);
   uint carry = 0u;
   for (uint start = 0u; start < n; start += 1024u) {
-    uint first = start + gl_LocalInvocationID.x * 16u;
+    uint first = start + scan_thread() * 16u;
     uint run[16];
     uint sum = 0u;
     for (uint i = 0u; i < 16u; ++i) {
@@ -31,6 +31,7 @@ void main() {
       before += run[i];
     }
     carry += all;
+    barrier(); // all have read the sums of this round
   }
-  if (gl_LocalInvocationID.x == 0u) total[0] = carry;
+  if (scan_thread() == 0u) total[0] = carry;
 }

@@ -315,6 +315,21 @@ impl<'g> Recorder<'g> {
         self.fill(buffer, 0);
     }
 
+    /// Sets `len` elements from `at` on to zero.
+    pub fn zero_range<T: bytemuck::Pod>(&mut self, buffer: &Buffer<T>, at: usize, len: usize) {
+        assert!(at + len <= buffer.len(), "zero {len} from {at} of {buffer:?}");
+        if len == 0 {
+            return;
+        }
+        let slot = buffer.slot();
+        let inner = self.gpu.inner().clone();
+        let [at, bytes] = [at, len].map(|n| (n * size_of::<T>()) as u64);
+        self.pass("fill", &[(slot.id(), slot.name, Access::Write)], |commands| {
+            // SAFETY: a live buffer with transfer usage, the range within it.
+            unsafe { inner.device.cmd_fill_buffer(commands, slot.raw, at, bytes, 0) }
+        });
+    }
+
     /// Copies the first `len` elements.
     pub fn copy<T: bytemuck::Pod>(&mut self, from: &Buffer<T>, to: &Buffer<T>, len: usize) {
         assert!(len <= from.len() && len <= to.len(), "copy of {len} from {from:?} to {to:?}");

@@ -22,8 +22,8 @@ impl Parameter {
     /// # Errors
     /// As [`Gpu::buffer`].
     pub fn new(gpu: &Gpu, names: [&'static str; 3], width: u32, capacity: u32) -> Result<Self, Error> {
-        // Whole vectors of four, which the optimiser works in.
-        let len = (capacity as usize * width as usize).next_multiple_of(4);
+        // Whole vectors of four, which the optimiser works in, and of three, as which offsets are viewed.
+        let len = (capacity as usize * width as usize).next_multiple_of(12);
         let [value, first, root] = names;
         Ok(Self { value: gpu.buffer(value, len)?, first: gpu.buffer(first, len)?, root: gpu.buffer(root, len)?, width })
     }
@@ -64,6 +64,13 @@ impl Anchors {
             offset: Parameter::new(gpu, ["offset", "offset_first", "offset_root"], 3 * offsets, capacity)?,
             log_scaling: Parameter::new(gpu, ["log_scaling", "log_scaling_first", "log_scaling_root"], 6, capacity)?,
         })
+    }
+
+    /// As many anchors of `offsets` Gaussians as one binding of the device holds of every array, and a `u32` counts.
+    pub fn most(gpu: &Gpu, offsets: u32) -> u32 {
+        // The feature or the offsets, whichever is wider; less what rounding to whole vectors may add.
+        let widest = 4 * u64::from((3 * offsets).max(32));
+        ((gpu.info().max_binding_bytes.min(u32::MAX.into()) - 48) / widest) as u32
     }
 
     /// The anchors of a model, moments zero, with room for at least `capacity`.
