@@ -1,6 +1,6 @@
 //! The commands, one file each, and what they share.
 //!
-//! To add a command: a file with `Args` (clap) and `run(Args) -> anyhow::Result<()>`, a line in [`Command`] and one in
+//! To add a command: a file with `Args` (clap) and `run(Args) -> anyhow::Result<()>`, a line in `Command` and one in
 //! [`run`]. Results go to stdout, progress and notes to stderr. The exit code is 0 when all went well, 2 when the
 //! arguments or settings make no sense, 1 when anything else went wrong.
 
