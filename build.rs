@@ -17,7 +17,6 @@ use rspirv::spirv::{Decoration, ExecutionMode, Op, StorageClass, Word};
 
 fn main() -> Result<()> {
     println!("cargo:rerun-if-changed=glsl");
-    println!("cargo:rerun-if-changed=src");
     println!("cargo:rerun-if-changed=build.rs");
     let out = PathBuf::from(env::var("OUT_DIR")?);
     let mut tree = Tree::default();
@@ -50,7 +49,7 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-/// `glsl/` mirrors `src/`: kernel `a/b_backward.comp` belongs to `src/a/b_backward.rs` or `src/a/b.rs`.
+/// `glsl/` mirrors `src/` (checked when anything in `glsl/` changes): kernel `a/b_backward.comp` belongs to `src/a/b_backward.rs` or `src/a/b.rs`.
 fn check_mirror(path: &Path) -> Result<()> {
     let relative = path.strip_prefix("glsl")?;
     let folder = Path::new("src").join(relative.parent().unwrap_or(Path::new("")));

@@ -8,10 +8,12 @@ mod devices;
 mod eval;
 pub mod folders;
 pub mod pictures;
+mod plan;
 mod render;
 pub mod shared;
 mod synth;
 mod train;
+mod verify;
 
 use std::fmt::Write as _;
 use std::process::ExitCode;
@@ -46,6 +48,8 @@ enum Command {
     Eval(eval::Args),
     Devices(devices::Args),
     Synth(synth::Args),
+    Plan(plan::Args),
+    Verify(verify::Args),
 }
 
 /// Runs the command.
@@ -59,6 +63,8 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
         Command::Eval(args) => eval::run(&args),
         Command::Devices(args) => devices::run(&args),
         Command::Synth(args) => synth::run(&args),
+        Command::Plan(args) => plan::run(&args),
+        Command::Verify(args) => verify::run(&args),
     }
 }
 

@@ -78,6 +78,7 @@ pub(super) struct Inner {
     pub options: Options,
     pub contexts: Mutex<Vec<Context>>,
     pub debug: Option<ash::ext::debug_utils::Device>,
+    pub live: Mutex<HashMap<u64, (&'static str, u64)>>,
     in_flight: Mutex<u32>,
     trash: Mutex<Vec<(vk::Buffer, Allocation)>>,
     pipelines: Mutex<HashMap<PipelineKey, Arc<Pipeline>>>,
@@ -378,6 +379,7 @@ impl Gpu {
             info,
             options: options.clone(),
             contexts: Mutex::default(),
+            live: Mutex::default(),
             in_flight: Mutex::new(0),
             trash: Mutex::default(),
             pipelines: Mutex::default(),
@@ -410,6 +412,18 @@ impl Gpu {
     /// Bytes of buffers alive now, and the most there ever were.
     pub fn memory(&self) -> (u64, u64) {
         *lock(&self.0.allocated)
+    }
+
+    /// Name, number and bytes of the buffers alive now, the largest first.
+    pub fn buffers(&self) -> Vec<(&'static str, usize, u64)> {
+        let mut sums: HashMap<&'static str, (usize, u64)> = HashMap::new();
+        for &(name, bytes) in lock(&self.0.live).values() {
+            let sum = sums.entry(name).or_default();
+            *sum = (sum.0 + 1, sum.1 + bytes);
+        }
+        let mut all: Vec<_> = sums.into_iter().map(|(name, (number, bytes))| (name, number, bytes)).collect();
+        all.sort_by(|a, b| b.2.cmp(&a.2).then(a.0.cmp(b.0)));
+        all
     }
 
     /// Waits until the device has nothing left to do.

@@ -3,11 +3,11 @@
 use std::marker::PhantomData;
 use std::sync::Arc;
 
-use ash::vk;
+use ash::vk::{self, Handle as _};
 use gpu_allocator::MemoryLocation;
 use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, AllocationScheme};
 
-use super::device::{Gpu, Inner};
+use super::device::{Gpu, Inner, lock};
 use super::error::{Error, Named};
 use super::hazards::Id;
 
@@ -38,7 +38,7 @@ pub struct Slot {
 
 impl Slot {
     pub(super) fn id(&self) -> Id {
-        ash::vk::Handle::as_raw(self.raw)
+        self.raw.as_raw()
     }
 }
 
@@ -90,6 +90,7 @@ impl<T: bytemuck::Pod> Buffer<T> {
 impl Drop for Memory {
     fn drop(&mut self) {
         if let Some(allocation) = self.allocation.take() {
+            lock(&self.gpu.live).remove(&self.raw.as_raw());
             self.gpu.discard(self.raw, allocation);
         }
     }
@@ -218,6 +219,7 @@ impl Gpu {
         unsafe { inner.device.bind_buffer_memory(raw, allocation.memory(), allocation.offset()) }
             .named("binding a buffer's memory")?;
         inner.name_object(raw, name);
+        lock(&inner.live).insert(raw.as_raw(), (name, padded));
         let memory = Memory { raw, bytes: padded, name, allocation: Some(allocation), gpu: inner.clone() };
         Ok(Buffer { memory: Arc::new(memory), bytes, len, element: PhantomData })
     }

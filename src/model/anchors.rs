@@ -100,7 +100,7 @@ impl Anchors {
         [&self.feature, &self.offset, &self.log_scaling]
     }
 
-    /// The same anchors in buffers with room for `capacity`; the copy is recorded, the old buffers live until it ran.
+    /// The same anchors in buffers with room for `capacity`; the copy is recorded.
     ///
     /// # Errors
     /// As [`Gpu::buffer`].

@@ -534,7 +534,7 @@ mod tests {
         let covariance = gpu.upload("grad_covariance", &upstream.grad_covariance).expect(fine);
         let depth = gpu.upload("grad_depth", &upstream.grad_depth).expect(fine);
         let of = Gaussians { position: &position, scale: &scale, rotation: &rotation, opacity: &opacity };
-        let grad = SplatGradients { mean: &mean, covariance: &covariance, depth: &depth };
+        let grad = SplatGradients { mean: &mean, covariance: &covariance, depth: Some(&depth) };
         let mut rec = gpu.recorder().expect(fine);
         dispatch::record(&mut rec, &count, &groups, anchors as u32 + 9, offsets as u32);
         forward.record(&mut rec, &groups, of, &camera, NEAR);

@@ -110,6 +110,11 @@ impl Attend {
         (&self.blended, Some(attended))
     }
 
+    /// The flag that makes the optimiser leave the projections alone: the step overflowed, or had no tokens.
+    pub fn skip(&self, rec: &mut Recorder<'_>, attended: Attended<'_>, overflow: &Buffer<u32>) -> &Buffer<u32> {
+        self.blend.attention().skip(rec, attended.chosen.tokens, overflow)
+    }
+
     /// From the gradient of the decoded features to that of the features and of the projections.
     pub fn backward(&self, rec: &mut Recorder<'_>, attended: Attended<'_>, grad_feature: &Buffer<f32>) {
         let inputs = Inputs { chosen: attended.chosen, weights: &self.weights.value };

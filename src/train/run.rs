@@ -174,10 +174,12 @@ impl<'a> Run<'a> {
         let plan = Plan::new(scene, settings);
         let points: Vec<[f32; 3]> = scene.points.iter().map(|p| p.position).collect();
         let offsets = settings.model.offsets as usize;
-        let initial = init::anchors(&points, settings.model.voxel, offsets)?;
+        let derived = || init::median_nearest_distance(&points).map_or(0.0, |d| d * settings.model.voxel_factor);
+        let voxel = if settings.model.voxel > 0.0 { settings.model.voxel } else { derived() };
+        let initial = init::anchors(&points, voxel, offsets)?;
         let weights = init::weights(settings.train.seed, offsets, plan.attention);
         let photographs = photographs::upload(gpu, scene, plan.depth)?;
-        let step = Step::new(gpu, plan, settings, &initial.anchors, &weights)?;
+        let step = Step::new(gpu, plan, settings, &initial.anchors, &weights, initial.voxel)?;
         let mailboxes = (0..DEPTH)
             .map(|_| {
                 Ok(Mailbox {
@@ -196,10 +198,32 @@ impl<'a> Run<'a> {
         &self.step
     }
 
-    /// Records one step into any recorder: for `plan` and `verify`.
-    pub fn record(&mut self, rec: &mut gpu::Recorder<'_>, step: u32) {
+    /// Records one step into any recorder: for `plan` and `verify`. Returns the view's name.
+    ///
+    /// # Errors
+    /// When the device has no room for the stages that begin with this step.
+    pub fn record(&mut self, rec: &mut gpu::Recorder<'_>, step: u32) -> Result<String, Error> {
         let view = self.order.view(step);
+        self.step.prepare(step)?;
         self.record_view(rec, step, view);
+        Ok(self.photographs[view].name.clone())
+    }
+
+    /// Runs one step and waits; repeats it with larger buffers until it fits.
+    ///
+    /// # Errors
+    /// When the device has no room or is lost.
+    pub fn run_one(&mut self, step: u32) -> Result<(), Error> {
+        loop {
+            let mut rec = self.gpu.recorder()?;
+            self.record(&mut rec, step)?;
+            rec.submit()?.wait()?;
+            if self.gpu.read(self.step.limits.overflow())?[0] == 0 {
+                return Ok(());
+            }
+            let counters = self.gpu.read(self.step.limits.counters())?;
+            self.grow(&counters)?;
+        }
     }
 
     fn record_view(&self, rec: &mut gpu::Recorder<'_>, step: u32, view: usize) {
@@ -296,7 +320,7 @@ impl<'a> Run<'a> {
             since_line.0 += 1;
             since_line.1 += f64::from(progress.loss);
             if self.step.changes_anchors(done) {
-                let change = self.step.change_anchors(self.settings, done)?;
+                let change = self.step.change_anchors(done)?;
                 watch.say(&change);
             }
             let pause = Instant::now();

@@ -3,6 +3,7 @@
 use rand::RngExt;
 
 use crate::config::Settings;
+use crate::densify::{self, Drawn, Statistics};
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::losses::config::Region;
 use crate::losses::{self, DepthView, Losses, Quantity, Rectangle, View, Weights};
@@ -118,6 +119,8 @@ pub struct Step {
     gradients: Gradients,
     stages: Stages,
     canvases: Vec<Canvas>,
+    statistics: Option<Statistics>,
+    voxel: f64,
     attend: Option<Attend>,
     attention_weights: Option<Vec<f32>>,
     config: Settings,
@@ -146,7 +149,7 @@ fn random_rectangle(rng: &mut impl RngExt, bounds: [u32; 4], size: [u32; 2]) -> 
 const WEIGHTS: [&str; 3] = ["weights", "weights_first", "weights_root"];
 
 impl Step {
-    /// Uploads the model and makes the stages that the plan has.
+    /// Uploads the model and makes the stages that the plan has. `voxel` is the side of the anchors' grid, scene units.
     ///
     /// # Errors
     /// When the device has no room.
@@ -156,6 +159,7 @@ impl Step {
         settings: &Settings,
         anchors: &files::Anchors,
         weights: &files::Weights,
+        voxel: f64,
     ) -> Result<Self, Error> {
         let anchors = Anchors::upload(gpu, anchors, 0)?;
         let initial = weights;
@@ -188,6 +192,8 @@ impl Step {
             capacity,
             stages,
             canvases,
+            statistics: None,
+            voxel,
             attend: None,
             attention_weights: plan.attention.then(|| initial.attention()),
             adam: adam::Config {
@@ -230,17 +236,35 @@ impl Step {
         self.canvas(size).losses.terms()
     }
 
-    /// Whether anchors are grown or pruned behind this step.
-    pub fn changes_anchors(&self, _step: u32) -> bool {
-        false
+    /// Whether anchors are grown and pruned behind this step.
+    pub fn changes_anchors(&self, step: u32) -> bool {
+        let config = &self.config.densify;
+        self.plan.growth && (config.from..=config.until).contains(&step) && step.is_multiple_of(config.every)
     }
 
-    /// Grows and prunes anchors behind this step; says what changed.
+    /// Grows and prunes anchors behind this step, with nothing in flight; says what changed.
     ///
     /// # Errors
     /// When the device has no room.
-    pub fn change_anchors(&mut self, _settings: &Settings, _step: u32) -> Result<String, Error> {
-        Ok(String::new())
+    pub fn change_anchors(&mut self, step: u32) -> Result<String, Error> {
+        let Some(statistics) = &mut self.statistics else { return Ok(String::new()) };
+        let config = &self.config.densify;
+        let round = densify::Round { voxel: self.voxel as f32, seed: self.config.train.seed, step };
+        let before = self.anchors.count;
+        let grown = densify::grow::run(&self.gpu, &mut self.anchors, statistics, config, round)?;
+        let pruned = densify::prune::run(&self.gpu, &mut self.anchors, statistics, config)?;
+        if self.anchors.capacity != self.capacity.anchors {
+            self.resize(Capacity { anchors: self.anchors.capacity, ..self.capacity })?;
+        }
+        let mut text =
+            format!("step {step}: {} new anchors, {pruned} pruned: {before} -> {}", grown.added, self.anchors.count);
+        if grown.refused > 0 {
+            text.push_str(&format!(
+                "; {} more had no room (densify.max_anchors, or the device's memory)",
+                grown.refused
+            ));
+        }
+        Ok(text)
     }
 
     /// The losses for pictures of this size.
@@ -373,6 +397,18 @@ impl Step {
             weights: &gradients.weights,
         };
         decode_backward.record(rec, &forward.decode, model, gaussians, to);
+        if let Some(statistics) = &self.statistics {
+            let drawn = Drawn {
+                slots,
+                overflow: limits.overflow(),
+                visible: &forward.visible.list,
+                grad_mean: &backward.grad_mean,
+                tiles: forward.bin.tiles(),
+                opacity: &forward.decode.opacity,
+                size: camera.size,
+            };
+            statistics.record(rec, drawn);
+        }
         if let Some((attend, attended)) = self.attend.as_ref().zip(attended) {
             attend.backward(rec, attended, &gradients.feature);
         }
@@ -398,7 +434,7 @@ impl Step {
             let first = layout.head(head);
             update(weights, &gradients.weights, (first as u32, (layout.head(head + 1) - first) as u32), rate);
         }
-        if let Some((attend, _)) = self.attend.as_ref().zip(attended) {
+        if let Some((attend, attended)) = self.attend.as_ref().zip(attended) {
             let weights = &attend.weights;
             let since = step + 1 - self.config.model.attention.start.max(1);
             let tensors = Tensors {
@@ -407,11 +443,12 @@ impl Step {
                 first: &weights.first,
                 root: &weights.root,
             };
-            adam::record(rec, &self.adam, tensors, overflow, (0, weights.width), (since, rates.attention));
+            let skip = attend.skip(rec, attended, overflow);
+            adam::record(rec, &self.adam, tensors, skip, (0, weights.width), (since, rates.attention));
         }
     }
 
-    /// Makes the stages that begin with this step.
+    /// Makes the stages that begin with this step and lets go of those whose time is over.
     ///
     /// # Errors
     /// When the device has no room.
@@ -420,6 +457,13 @@ impl Step {
         if let Some(weights) = self.attention_weights.take_if(|_| step >= config.start) {
             let attend = Attend::new(&self.gpu, config, self.config.train.seed, self.anchors.capacity, &weights)?;
             self.attend = Some(attend);
+        }
+        let config = &self.config.densify;
+        let counting = self.plan.growth && (config.statistics_from..=config.until).contains(&step);
+        if counting && self.statistics.is_none() {
+            self.statistics = Some(Statistics::new(&self.gpu, self.anchors.capacity, self.anchors.offsets)?);
+        } else if !counting {
+            self.statistics = None;
         }
         Ok(())
     }
@@ -458,7 +502,7 @@ impl Step {
         let layout = Layout { offsets: self.anchors.offsets as usize };
         let flat = self.gpu.read_range(&self.weights.value, layout.weights())?;
         let attention = match (&self.attend, &self.attention_weights) {
-            (Some(attend), _) => Some(self.gpu.read(&attend.weights.value)?),
+            (Some(attend), _) => Some(self.gpu.read_range(&attend.weights.value, crate::math::attention::WEIGHTS)?),
             (None, initial) => initial.clone(),
         };
         let weights = files::Weights::from_device(layout.offsets, &flat, attention.as_deref());

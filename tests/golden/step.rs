@@ -59,7 +59,7 @@ fn step() {
         };
         let size = cameras[0].size;
         assert_eq!(size, cameras[1].size);
-        let step = Step::new(&gpu, plan, &settings, &anchors, &files::Weights { tensors }).unwrap();
+        let step = Step::new(&gpu, plan, &settings, &anchors, &files::Weights { tensors }, 0.1).unwrap();
         let priors = [0, 1].map(|v| gpu.upload("prior", &case.f32(&format!("view{v}.prior"))).unwrap());
         let count = case.shape("losses")[0];
         let mut losses = vec![];
