@@ -474,7 +474,7 @@ mod tests {
                 let plain = View { depth: None, ..other };
                 for (view, with_depth) in [(reference, true), (other, true), (plain, false)] {
                     let mut rec = gpu.checked().expect("recorder");
-                    let gradients = losses.forward_backward(&mut rec, &view, &rgb, &depth);
+                    let gradients = losses.forward_backward(&mut rec, &view, &rgb, Some(&depth));
                     assert_eq!(gradients.depth.is_some(), with_depth);
                     finish(rec);
                     let terms = gpu.read(losses.terms()).expect("read");

@@ -111,8 +111,7 @@ macro_rules! backward_twin {
                         let upstream = Splat {
                             mean: host.grad_mean[s].map(f64::from),
                             covariance,
-                            $(depth: host.$grad_depth[s].into(),)?
-                            ..Splat::default()
+                            depth: [$(host.$grad_depth[s].into())?].first().copied().unwrap_or(0.0),
                         };
                         let rotation = host.rotation[s].map(f64::from);
                         grad = project_one_backward(&lens, position, scale, rotation, bounds, upstream);
@@ -534,7 +533,7 @@ mod tests {
         let covariance = gpu.upload("grad_covariance", &upstream.grad_covariance).expect(fine);
         let depth = gpu.upload("grad_depth", &upstream.grad_depth).expect(fine);
         let of = Gaussians { position: &position, scale: &scale, rotation: &rotation, opacity: &opacity };
-        let grad = SplatGradients { mean: &mean, covariance: &covariance, depth: &depth };
+        let grad = SplatGradients { mean: &mean, covariance: &covariance, depth: Some(&depth) };
         let mut rec = gpu.recorder().expect(fine);
         dispatch::record(&mut rec, &count, &groups, anchors as u32 + 9, offsets as u32);
         forward.record(&mut rec, &groups, of, &camera, NEAR);
