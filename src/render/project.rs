@@ -111,8 +111,7 @@ macro_rules! backward_twin {
                         let upstream = Splat {
                             mean: host.grad_mean[s].map(f64::from),
                             covariance,
-                            $(depth: host.$grad_depth[s].into(),)?
-                            ..Splat::default()
+                            depth: [$(host.$grad_depth[s].into())?].first().copied().unwrap_or(0.0),
                         };
                         let rotation = host.rotation[s].map(f64::from);
                         grad = project_one_backward(&lens, position, scale, rotation, bounds, upstream);
