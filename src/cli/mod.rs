@@ -4,6 +4,7 @@
 //! [`run`]. Results go to stdout, progress and notes to stderr. The exit code is 0 when all went well, 2 when the
 //! arguments or settings make no sense, 1 when anything else went wrong.
 
+mod ablate;
 mod devices;
 mod eval;
 pub mod folders;
@@ -28,6 +29,7 @@ use std::process::ExitCode;
     max_term_width = 110,
     after_help = "\
 Start here:
+  gscream-vk train synthetic --preset demo         train on the built-in scene
   gscream-vk synth scene                           make a small scene with an object in it
   gscream-vk eval renders --truth scene/test_images --masks scene/test_masks
   gscream-vk devices                               what can be run on
@@ -50,6 +52,7 @@ enum Command {
     Synth(synth::Args),
     Plan(plan::Args),
     Verify(verify::Args),
+    Ablate(ablate::Args),
 }
 
 /// Runs the command.
@@ -65,6 +68,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
         Command::Synth(args) => synth::run(&args),
         Command::Plan(args) => plan::run(&args),
         Command::Verify(args) => verify::run(&args),
+        Command::Ablate(args) => ablate::run(&args),
     }
 }
 

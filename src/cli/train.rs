@@ -1,6 +1,6 @@
 //! `gscream-vk train`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -8,7 +8,11 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::folders::{MODEL, RECORD, Record, SETTINGS, TEST};
 use super::pictures;
 use super::shared::{DeviceArgs, SceneArgs, with_gpu};
+use crate::config::Settings;
+use crate::evaluate::Report;
 use crate::gpu::{Gpu, Options, Timing};
+use crate::render::view::Rendered;
+use crate::scene::Scene;
 use crate::train::run::{Observer, Progress, Run, Summary};
 
 /// Train a scene without its object
@@ -39,48 +43,20 @@ pub(super) struct Args {
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let (scene, settings) = args.scene.load()?;
     let name = args.scene.name();
-    let folder = args.out.clone().unwrap_or_else(|| {
-        let stem = PathBuf::from(&name);
-        PathBuf::from("runs").join(stem.file_name().unwrap_or(stem.as_os_str()))
-    });
+    let folder = args.out.clone().unwrap_or_else(|| default_folder(&name));
     if folder.join(RECORD).exists() && !args.overwrite {
         bail!("{}: holds a run already: choose another --out, or --overwrite", folder.display());
     }
     let options = Options { timestamps: args.profile, ..args.device.options() };
     with_gpu(&options, |gpu| {
-        std::fs::create_dir_all(&folder).with_context(|| format!("{}: cannot be made", folder.display()))?;
-        let path = folder.join(SETTINGS);
-        std::fs::write(&path, settings.to_toml()).with_context(|| format!("{}: cannot be written", path.display()))?;
-        Record::new(&gpu.info().name, &name).write(&folder)?;
         eprintln!("device: {} ({})", gpu.info().name, gpu.info().driver);
-        let mut run = Run::new(gpu, &scene, &settings)?;
-        for left in &run.step().plan.left_out {
-            eprintln!("left out: {} ({})", left.what, left.why);
-        }
-        eprintln!("anchors: {}", run.step().anchors.count);
-        let mut bar = Bar::new(settings.train.iterations);
-        let summary = run.train(&folder, &mut bar)?;
-        bar.0.finish_and_clear();
-        let mut written = vec![MODEL.to_owned(), "log.jsonl".into(), SETTINGS.into(), RECORD.into()];
-        let mut failed = None;
-        let mut keep = |view: &str, picture: &crate::render::view::Rendered| {
-            let path = pictures::path(&folder.join(TEST), view, "png");
-            if let Err(error) = pictures::write_png(&path, picture.size, &picture.rgb) {
-                failed.get_or_insert(error);
-            }
-        };
-        if let Some(report) = run.evaluate(Some(&mut keep))? {
-            if let Some(error) = failed {
-                return Err(error.into());
-            }
-            let path = folder.join("metrics.json");
-            report.write_json(&path)?;
-            written.extend([TEST.to_owned(), "metrics.json".into()]);
+        let Trained { summary, report, mut written } = train(gpu, &scene, &settings, &name, &folder)?;
+        if let Some(report) = report {
             println!("{}", report.table());
         }
         if args.profile {
-            write_trace(gpu, &summary, &folder.join("trace.json"))?;
-            written.push("trace.json".into());
+            write_trace(gpu, &summary, &folder.join(TRACE))?;
+            written.push(TRACE);
             println!("{}", summary.timings.table());
         }
         println!("{}", describe(&summary));
@@ -88,6 +64,57 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         Ok(())
     })
 }
+
+/// `runs/` and the last part of the scene's name.
+pub(super) fn default_folder(scene: &str) -> PathBuf {
+    let stem = Path::new(scene).file_name().unwrap_or(std::ffi::OsStr::new(scene));
+    Path::new("runs").join(stem)
+}
+
+/// What a finished run is.
+pub(super) struct Trained {
+    /// Speed and size.
+    pub summary: Summary,
+    /// Figures on the test views, if there are any.
+    pub report: Option<Report>,
+    /// Names of what was written into the folder.
+    pub written: Vec<&'static str>,
+}
+
+/// Trains into `folder` and evaluates, with a progress bar on stderr.
+pub(super) fn train(
+    gpu: &Gpu,
+    scene: &Scene,
+    settings: &Settings,
+    name: &str,
+    folder: &Path,
+) -> anyhow::Result<Trained> {
+    std::fs::create_dir_all(folder).with_context(|| format!("{}: cannot be made", folder.display()))?;
+    let mut run = Run::new(gpu, scene, settings)?;
+    let path = folder.join(SETTINGS);
+    std::fs::write(&path, settings.to_toml()).with_context(|| format!("{}: cannot be written", path.display()))?;
+    Record::new(&gpu.info().name, name).write(folder)?;
+    for left in &run.step().plan.left_out {
+        eprintln!("left out: {} ({})", left.what, left.why);
+    }
+    eprintln!("anchors: {}", run.step().anchors.count);
+    let mut watch = Watch { bar: bar(settings.train.iterations), pictures: folder.join(TEST), failed: None };
+    let mut summary = run.train(folder, &mut watch)?;
+    watch.bar.finish_and_clear();
+    if let Some(error) = watch.failed {
+        return Err(error.into());
+    }
+    let mut written = vec![MODEL, "log.jsonl", SETTINGS, RECORD];
+    let report = summary.report.take();
+    if let Some(report) = &report {
+        report.write_json(&folder.join(METRICS))?;
+        written.extend([TEST, METRICS]);
+    }
+    Ok(Trained { summary, report, written })
+}
+
+const METRICS: &str = "metrics.json";
+const TRACE: &str = "trace.json";
 
 fn describe(summary: &Summary) -> String {
     let Summary { steps, seconds, repeated, anchors, gaussians, pairs, peak_device_bytes, .. } = summary;
@@ -101,7 +128,7 @@ fn describe(summary: &Summary) -> String {
 }
 
 /// The last step's passes in Chrome's trace format.
-fn write_trace(gpu: &Gpu, summary: &Summary, path: &std::path::Path) -> anyhow::Result<()> {
+fn write_trace(gpu: &Gpu, summary: &Summary, path: &Path) -> anyhow::Result<()> {
     let start = summary.last.first().map_or(0.0, |t| t.start);
     let event = |t: &Timing| {
         serde_json::json!({
@@ -117,22 +144,33 @@ fn write_trace(gpu: &Gpu, summary: &Summary, path: &std::path::Path) -> anyhow::
     std::fs::write(path, text).with_context(|| format!("{}: cannot be written", path.display()))
 }
 
-struct Bar(ProgressBar);
-
-impl Bar {
-    fn new(steps: u32) -> Self {
-        let style = ProgressStyle::with_template("{bar:30} {pos}/{len}  {per_sec}  {msg}  {eta} left")
-            .expect("a valid template");
-        Self(ProgressBar::new(steps.into()).with_style(style))
-    }
+fn bar(steps: u32) -> ProgressBar {
+    let template = "{bar:30} {pos}/{len}  {per_sec}  {msg}  {eta} left";
+    let style = ProgressStyle::with_template(template).expect("a valid template");
+    ProgressBar::new(steps.into()).with_style(style)
 }
 
-impl Observer for Bar {
+/// Shows progress and keeps the test views.
+struct Watch {
+    bar: ProgressBar,
+    pictures: PathBuf,
+    failed: Option<pictures::Error>,
+}
+
+impl Observer for Watch {
     fn step(&mut self, progress: &Progress) {
-        self.0.set_position(progress.step.into());
-        self.0.set_message(format!("loss {:.4}  {} anchors", progress.loss, progress.anchors));
+        self.bar.set_position(progress.step.into());
+        self.bar.set_message(format!("loss {:.4}  {} anchors", progress.loss, progress.anchors));
     }
+
     fn say(&mut self, line: &str) {
-        self.0.suspend(|| eprintln!("{line}"));
+        self.bar.suspend(|| eprintln!("{line}"));
+    }
+
+    fn rendered(&mut self, view: &str, picture: &Rendered) {
+        let path = pictures::path(&self.pictures, view, "png");
+        if let Err(error) = pictures::write_png(&path, picture.size, &picture.rgb) {
+            self.failed.get_or_insert(error);
+        }
     }
 }

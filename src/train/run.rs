@@ -131,6 +131,8 @@ pub trait Observer {
     fn step(&mut self, _progress: &Progress) {}
     /// Something worth a line.
     fn say(&mut self, _line: &str) {}
+    /// A test view as rendered after the last step.
+    fn rendered(&mut self, _view: &str, _picture: &Rendered) {}
 }
 
 /// Watches nothing.
@@ -327,10 +329,14 @@ impl<'a> Run<'a> {
             let every = self.settings.train.eval_interval;
             let evaluate = done == iterations || (every > 0 && done.is_multiple_of(every));
             if evaluate {
-                for later in &in_flight {
-                    debug_assert!(later.step > done);
-                }
-                report = self.evaluate(None)?.or(report);
+                let last = done == iterations;
+                report = self
+                    .evaluate(|view, picture| {
+                        if last {
+                            watch.rendered(view, picture)
+                        }
+                    })?
+                    .or(report);
                 if let Some(mean) = report.as_ref().and_then(|r| r.mean.as_ref()) {
                     let mean = &mean.metrics;
                     let masked = mean.mask.as_ref().map_or(String::new(), |m| format!(", masked {:.2} dB", m.psnr));
@@ -384,11 +390,11 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// Renders every test view with the model as it is now and compares; pictures go to `keep` if given.
+    /// Renders every test view with the model as it is now, shows it to `look`, and compares.
     ///
     /// # Errors
     /// When the device has no room for a second copy of the model.
-    pub fn evaluate(&self, mut keep: Option<&mut dyn FnMut(&str, &Rendered)>) -> Result<Option<Report>, Error> {
+    pub fn evaluate(&self, mut look: impl FnMut(&str, &Rendered)) -> Result<Option<Report>, Error> {
         if self.scene.test.is_empty() {
             return Ok(None);
         }
@@ -400,9 +406,7 @@ impl<'a> Run<'a> {
             let rendered = renderer.render(&view.camera)?;
             let metrics = evaluate::compare(&rendered.to_rgb8(), &view.image, view.mask.as_ref())?;
             views.push(ViewMetrics { name: view.name.clone(), metrics });
-            if let Some(keep) = keep.as_mut() {
-                keep(&view.name, &rendered);
-            }
+            look(&view.name, &rendered);
         }
         Ok(Some(Report::new(views)))
     }
