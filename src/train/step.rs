@@ -231,7 +231,7 @@ impl Step {
         self.capacity
     }
 
-    /// The weighted loss terms of the last step by [`Term`], for pictures of this size.
+    /// The weighted loss terms of the last step by [`losses::Term`], for pictures of this size.
     pub fn terms(&self, size: [u32; 2]) -> &Buffer<f32> {
         self.canvas(size).losses.terms()
     }
