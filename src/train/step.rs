@@ -354,7 +354,9 @@ impl Step {
             rec.zero(gradient);
         }
         forward.visible.record(rec, anchors, camera, *near, limits);
-        let (feature, attended) = match self.attend.as_ref().zip(photograph) {
+        // A step may be recorded again after later ones: the stage is there then, but its time has not come.
+        let attend = self.attend.as_ref().filter(|_| step >= self.config.model.attention.start);
+        let (feature, attended) = match attend.zip(photograph) {
             Some((attend, photograph)) => attend.forward(rec, anchors, &forward.visible, photograph, *near, step),
             None => (&anchors.feature.value, None),
         };
