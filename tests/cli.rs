@@ -275,3 +275,121 @@ fn render_of_what_is_not_there() {
     let text: Vec<String> = transcript.0.lines().map(|line| listed(line).unwrap_or_else(|| line.to_owned())).collect();
     insta::assert_snapshot!("render_errors", text.join("\n"));
 }
+
+/// All files below a folder, sorted, with `/` between names.
+fn files_below(folder: &Path) -> Vec<String> {
+    let mut names = vec![];
+    let mut folders = vec![folder.to_owned()];
+    while let Some(next) = folders.pop() {
+        for entry in fs::read_dir(next).expect("a folder") {
+            let path = entry.expect("readable").path();
+            if path.is_dir() {
+                folders.push(path);
+            } else {
+                let name = path.strip_prefix(folder).expect("below it");
+                names.push(name.to_string_lossy().replace(std::path::MAIN_SEPARATOR, "/"));
+            }
+        }
+    }
+    names.sort();
+    names
+}
+
+const FEW_STEPS: &str = "--iterations 4 --set model.voxel=0 --set model.attention.start=2 --set model.attention.patch=16 \
+                         --set model.attention.tokens=32 --set model.attention.min_tokens=1 --set train.log_interval=2";
+
+#[test]
+fn train_writes_a_run_and_never_over_another() {
+    let (folder, mut transcript) = (with_scene(), Transcript::default());
+    let folder = folder.path();
+    let arguments = format!("train scene --out run --validate {FEW_STEPS}");
+    let outcome = succeeds(folder, &arguments);
+    let expected = [
+        "log.jsonl",
+        "metrics.json",
+        "model/point_cloud.ply",
+        "model/weights.safetensors",
+        "run.json",
+        "settings.toml",
+        "test/test_000.png",
+        "test/test_001.png",
+    ];
+    assert_eq!(files_below(&folder.join("run")), expected);
+    let last = outcome.stdout.lines().last().expect("lines");
+    assert_eq!(last, "wrote model, log.jsonl, settings.toml, run.json, test, metrics.json in run");
+    assert_eq!(fs::read_to_string(folder.join("run/log.jsonl")).expect("a log").lines().count(), 2);
+    let model = |run: &str| fs::read(folder.join(run).join("model/point_cloud.ply")).expect("a model");
+    let before = model("run");
+    transcript.fails(folder, 1, "train scene --out run --iterations 1");
+    assert!(model("run") == before, "the refused run left the first alone");
+
+    succeeds(folder, "render run --out drawn");
+    assert_eq!(files_below(&folder.join("drawn")).len(), 4, "two pictures, two layers of depth");
+    let drawn = image::open(folder.join("drawn/test_000.png")).expect("a picture").to_rgb8();
+    let tested = image::open(folder.join("run/test/test_000.png")).expect("a picture").to_rgb8();
+    assert!(drawn == tested, "`render` draws what `train` compared");
+
+    succeeds(folder, "train scene --out again --profile --config run/settings.toml");
+    assert!(model("again") == before, "the settings that were written repeat the run");
+    let trace = fs::read_to_string(folder.join("again/trace.json")).expect("a trace");
+    let trace: serde_json::Value = serde_json::from_str(&trace).expect("JSON");
+    assert!(trace["traceEvents"].as_array().expect("a list").len() > 50, "the last step's passes");
+    succeeds(folder, "train scene --out run --overwrite --iterations 1 --set model.voxel=0");
+    assert!(model("run") != before, "--overwrite replaces it");
+    insta::assert_snapshot!("train_again", transcript.0);
+}
+
+#[test]
+fn train_of_what_makes_no_sense_writes_nothing() {
+    let (folder, mut transcript) = (with_scene(), Transcript::default());
+    let folder = folder.path();
+    let mut refused = |code, arguments: &str| {
+        for command in ["train", "plan", "verify"] {
+            let out = if command == "train" { " --out run" } else { "" };
+            let arguments = format!("{command} {arguments}{out}");
+            if command == "train" {
+                transcript.fails(folder, code, &arguments);
+                let errors = transcript.0.lines().rev().take_while(|line| !line.starts_with('$'));
+                assert_eq!(errors.filter(|line| line.starts_with("! error")).count(), 1, "{arguments}");
+            } else {
+                let outcome = run(folder, &arguments);
+                assert_eq!((outcome.code, outcome.stdout.as_str()), (code, ""), "{arguments}: {}", outcome.stderr);
+            }
+            assert!(!folder.join("run").exists(), "{arguments} left something behind");
+        }
+    };
+    refused(2, "scene --set train.iteration=5");
+    refused(2, "scene --set train.iterations=many");
+    refused(2, "scene --set densify.until=3");
+    refused(1, "nowhere");
+    let points = folder.join("scene/sparse/0/points3D.bin");
+    let whole = fs::read(&points).expect("a model");
+    fs::write(&points, &whole[..whole.len() / 2]).expect("writable");
+    refused(1, "scene");
+    fs::write(&points, &whole).expect("writable");
+    let mask = folder.join("scene/masks/train_001.png");
+    image::GrayImage::new(31, 24).save(&mask).expect("writable");
+    refused(1, "scene");
+    fs::write(&mask, "no picture").expect("writable");
+    refused(1, "scene");
+    insta::assert_snapshot!("train_errors", transcript.0);
+}
+
+#[test]
+fn plan_and_verify_of_a_scene() {
+    let folder = with_scene();
+    let folder = folder.path();
+    let few = FEW_STEPS;
+    let plan = succeeds(folder, &format!("plan scene --step 2 --validate {few}")).stdout;
+    for part in ["step 2 (view ", "\nleft out\n", "\nbuffers\n", "    barrier: ", "model/attention_project  <"] {
+        assert!(plan.contains(part), "no {part:?} in {plan}");
+    }
+    let verify = succeeds(folder, &format!("verify scene --warm-up 2 --validate {few}")).stdout;
+    assert!(verify.starts_with("step 3, view "), "{verify}");
+    let last = verify.lines().last().expect("lines");
+    assert!(last.ends_with(" tensors compared, 0 beyond their bound"), "{last}");
+    assert!(verify.contains("model/attention_project "), "{verify}");
+    // A step before the attention's, although the warm-up went past it.
+    let early = succeeds(folder, &format!("verify scene --warm-up 3 --step 1 {few}")).stdout;
+    assert!(early.starts_with("step 1, view ") && !early.contains("model/attention"), "{early}");
+}

@@ -33,8 +33,8 @@ impl DeviceArgs {
             device: self.device.clone(),
             validate: self.validate,
             serialize: self.serialize,
-            timestamps: false,
             cache: self.cache(),
+            ..Options::default()
         }
     }
 

@@ -22,6 +22,10 @@ pub struct Options {
     pub validate: bool,
     /// A barrier after every pass.
     pub serialize: bool,
+    /// Leave out every barrier between passes although the schedule still lists it. For tests alone: such a recording
+    /// shows that synchronisation validation would notice a lost barrier, and must never be submitted.
+    #[doc(hidden)]
+    pub omit_barriers: bool,
     /// Timestamp queries around every pass.
     pub timestamps: bool,
     /// File of the pipeline cache; none is kept without it.

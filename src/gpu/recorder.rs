@@ -380,7 +380,9 @@ impl<'g> Recorder<'g> {
         let commands = context.commands;
         if !reasons.is_empty() {
             self.schedule.entries.push(Entry::Barrier { reasons });
-            barrier(inner, commands);
+            if !inner.options.omit_barriers {
+                barrier(inner, commands);
+            }
         }
         let index = self.passes.len() as u32;
         let tracked = index < MAX_PASSES;

@@ -209,7 +209,8 @@ impl Reference for attention_weight_sum::Kernel {
 
 impl Reference for attention_skip::Kernel {
     fn reference(host: attention_skip::Host<'_>, (): (), (): ()) {
-        host.skip[0] = u32::from(host.overflow[0] != 0 || host.tokens[0] == 0 || host.tokens[1] == 0);
+        let [inside, around] = [0, 1].map(|side| if host.overflow[0] != 0 { 0 } else { host.tokens[side] });
+        host.skip[..3].copy_from_slice(&[u32::from(inside == 0 || around == 0), inside, around]);
     }
 }
 
@@ -311,7 +312,7 @@ impl Attention {
                 ])?,
             ],
             partial: gpu.buffer("attention_partial", SLICES * WEIGHTS / 4)?,
-            skip: gpu.buffer("attention_skip", 1)?,
+            skip: gpu.buffer("attention_skip", 3)?,
         })
     }
 
@@ -434,8 +435,14 @@ impl Attention {
         Pair { inside: &self.sides[0].grad_feature, around: &self.sides[1].grad_feature }
     }
 
-    /// Records the flag `[1]` that the optimiser's pass over these weights takes for its overflow flag: set where the
+    /// The attended features of the last forward pass.
+    pub fn updated(&self) -> Pair<'_> {
+        Pair { inside: &self.sides[0].updated, around: &self.sides[1].updated }
+    }
+
+    /// Records the flag that the optimiser's pass over these weights takes for its overflow flag: set where the
     /// step's is, and where there are no tokens (a step without attention moves nothing, not even by momentum).
+    /// Behind it are the numbers of tokens inside and around, zero where the step's flag is set: `[3]`.
     pub fn skip(&self, rec: &mut Recorder<'_>, tokens: &Buffer<u32>, overflow: &Buffer<u32>) -> &Buffer<u32> {
         let buffers = attention_skip::Buffers { tokens, overflow, skip: &self.skip };
         rec.run(attention_skip::Kernel, buffers, (), 1u32);
@@ -608,11 +615,16 @@ mod tests {
     #[test]
     fn skip_flag() {
         let gpu = testing::gpu();
-        for (tokens, overflow, want) in [([5, 5], 0, 0), ([5, 5], 2, 1), ([0, 0], 0, 1), ([3, 0], 0, 1), ([0, 3], 1, 1)]
-        {
-            let case = attention_skip::Arrays { tokens: tokens.to_vec(), overflow: vec![overflow], skip: vec![9] };
+        for (tokens, overflow, want) in [
+            ([5, 7], 0, [0, 5, 7]),
+            ([5, 7], 2, [1, 0, 0]),
+            ([0, 0], 0, [1, 0, 0]),
+            ([3, 0], 0, [1, 3, 0]),
+            ([0, 3], 1, [1, 0, 0]),
+        ] {
+            let case = attention_skip::Arrays { tokens: tokens.to_vec(), overflow: vec![overflow], skip: vec![9; 3] };
             testing::assert_twin(attention_skip::Kernel, &gpu, case.clone(), (), 1u32);
-            assert_eq!(testing::run_once::<attention_skip::Kernel>(&gpu, &case, (), 1u32).skip, [want]);
+            assert_eq!(testing::run_once::<attention_skip::Kernel>(&gpu, &case, (), 1u32).skip, want);
         }
     }
 

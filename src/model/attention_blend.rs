@@ -173,16 +173,49 @@ impl Blend {
         self.attention.backward(rec, tokens, features, inputs.weights, grad_updated, grad_weights)
     }
 
-    /// Records the mixture into the features themselves; those inside the mask only where `reference` says that the
+    /// As [`Self::mix`] for [`Self::write_back`]: rows inside the mask are replaced only where `reference` says that the
     /// view is the reference view.
-    pub fn write_back(&self, rec: &mut Recorder<'_>, inputs: Inputs<'_>, feature: &Buffer<f32>, reference: bool) {
-        let updated = self.attend(rec, inputs, feature);
+    pub fn mix_to_write_back(
+        &self,
+        rec: &mut Recorder<'_>,
+        inputs: Inputs<'_>,
+        feature: &Buffer<f32>,
+        blended: &Buffer<f32>,
+        (anchors, reference): (usize, bool),
+    ) {
+        self.attend(rec, inputs, feature);
+        rec.copy(feature, blended, anchors * FEATURE);
+        self.scatter_updated(rec, inputs.chosen, (0, inputs.chosen.tokens), blended, reference);
+    }
+
+    /// Records the mixture of [`Self::mix_to_write_back`] into the features themselves, which are as they were then.
+    /// `skip` is that of [`Attention::skip`]: a step that overflowed is taken again and must leave them alone.
+    pub fn write_back(
+        &self,
+        rec: &mut Recorder<'_>,
+        chosen: Chosen<'_>,
+        skip: &Buffer<u32>,
+        feature: &Buffer<f32>,
+        reference: bool,
+    ) {
+        self.scatter_updated(rec, chosen, (1, skip), feature, reference);
+    }
+
+    /// `tokens` has the number inside at `first`, that around behind it.
+    fn scatter_updated(
+        &self,
+        rec: &mut Recorder<'_>,
+        chosen: Chosen<'_>,
+        (first, tokens): (u32, &Buffer<u32>),
+        to: &Buffer<f32>,
+        reference: bool,
+    ) {
         let factors = (1.0 - self.blend, self.blend);
-        let Chosen { tokens, inside, around } = inputs.chosen;
+        let updated = self.attention.updated();
         if reference {
-            self.scatter(rec, (0, tokens, inside), updated.inside, feature, factors);
+            self.scatter(rec, (first, tokens, chosen.inside), updated.inside, to, factors);
         }
-        self.scatter(rec, (1, tokens, around), updated.around, feature, factors);
+        self.scatter(rec, (first + 1, tokens, chosen.around), updated.around, to, factors);
     }
 }
 
@@ -271,11 +304,24 @@ mod tests {
         submission.differences.iter().for_each(|d| assert!(d.ok(), "{d}"));
         drop(submission);
         let written = [true, false].map(|reference| {
-            let copy = floats("feature", &case.feature);
+            let (copy, mixed) = (floats("feature", &case.feature), floats("blended", &unwritten));
+            let overflow = gpu.upload("overflow", &[1u32]).expect("memory for the test");
+            let mut rec = gpu.checked().expect("a recorder");
+            stage.mix_to_write_back(&mut rec, inputs, &copy, &mixed, (case.anchors, reference));
+            let skip = stage.attention().skip(&mut rec, &tokens, &overflow);
+            stage.write_back(&mut rec, chosen, skip, &copy, reference);
+            rec.zero(&overflow);
+            let submission = rec.submit().expect("the device runs it");
+            submission.differences.iter().for_each(|d| assert!(d.ok(), "{d}"));
+            submission.wait().expect("the device runs it");
+            assert_eq!(gpu.read(&copy).expect("readable"), case.feature, "the step overflowed");
             let mut rec = gpu.recorder().expect("a recorder");
-            stage.write_back(&mut rec, inputs, &copy, reference);
+            let skip = stage.attention().skip(&mut rec, &tokens, &overflow);
+            stage.write_back(&mut rec, chosen, skip, &copy, reference);
             rec.submit().and_then(|s| s.wait()).expect("the device runs it");
-            gpu.read(&copy).expect("readable")
+            let written = gpu.read(&copy).expect("readable");
+            assert_eq!(gpu.read(&mixed).expect("readable"), written, "what is decoded is what is written");
+            written
         });
         let read = |buffer| gpu.read(buffer).expect("readable");
         Device {

@@ -103,16 +103,28 @@ impl Attend {
         let feature = &anchors.feature.value;
         let attended = Attended { chosen, reference: photograph.reference };
         if self.config.write_back {
-            self.blend.write_back(rec, inputs, feature, attended.reference);
-            return (feature, Some(attended));
+            let which = (anchors.count as usize, attended.reference);
+            self.blend.mix_to_write_back(rec, inputs, feature, &self.blended, which);
+        } else {
+            self.blend.mix(rec, inputs, feature, &self.blended, anchors.count as usize);
         }
-        self.blend.mix(rec, inputs, feature, &self.blended, anchors.count as usize);
         (&self.blended, Some(attended))
     }
 
-    /// The flag that makes the optimiser leave the projections alone: the step overflowed, or had no tokens.
-    pub fn skip(&self, rec: &mut Recorder<'_>, attended: Attended<'_>, overflow: &Buffer<u32>) -> &Buffer<u32> {
-        self.blend.attention().skip(rec, attended.chosen.tokens, overflow)
+    /// Writes the blended features into the anchors where the settings say so, unless the step overflowed. Returns the
+    /// flag that makes the optimiser leave the projections alone: the step overflowed, or had no tokens.
+    pub fn write_back(
+        &self,
+        rec: &mut Recorder<'_>,
+        attended: Attended<'_>,
+        anchors: &Anchors,
+        overflow: &Buffer<u32>,
+    ) -> &Buffer<u32> {
+        let skip = self.blend.attention().skip(rec, attended.chosen.tokens, overflow);
+        if self.config.write_back {
+            self.blend.write_back(rec, attended.chosen, skip, &anchors.feature.value, attended.reference);
+        }
+        skip
     }
 
     /// From the gradient of the decoded features to that of the features and of the projections.

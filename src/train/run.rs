@@ -17,7 +17,7 @@ use crate::gpu::{self, Buffer, Gpu, Submission, Timing, Timings};
 use crate::losses::Term;
 use crate::model::{files, init};
 use crate::primitives::limit::{COUNTERS, Counter};
-use crate::render::view::{Rendered, Renderer};
+use crate::render::view::{Capacity, Rendered, Renderer};
 use crate::scene::Scene;
 
 /// Why a run ended early.
@@ -198,6 +198,15 @@ impl<'a> Run<'a> {
     /// The step: its plan, model and stages.
     pub fn step(&self) -> &Step {
         &self.step
+    }
+
+    /// Gives the stages room for so much, instead of the first guess; what does not fit is made room for as ever. Nothing
+    /// of the run may be in flight.
+    ///
+    /// # Errors
+    /// When the device has no room.
+    pub fn resize(&mut self, capacity: Capacity) -> Result<(), Error> {
+        Ok(self.step.resize(capacity)?)
     }
 
     /// Records one step into any recorder: for `plan` and `verify`. Returns the view's name.

@@ -354,7 +354,9 @@ impl Step {
             rec.zero(gradient);
         }
         forward.visible.record(rec, anchors, camera, *near, limits);
-        let (feature, attended) = match self.attend.as_ref().zip(photograph) {
+        // A step may be recorded again after later ones: the stage is there then, but its time has not come.
+        let attend = self.attend.as_ref().filter(|_| step >= self.config.model.attention.start);
+        let (feature, attended) = match attend.zip(photograph) {
             Some((attend, photograph)) => attend.forward(rec, anchors, &forward.visible, photograph, *near, step),
             None => (&anchors.feature.value, None),
         };
@@ -418,6 +420,10 @@ impl Step {
     fn optimize(&self, rec: &mut Recorder<'_>, attended: Option<Attended<'_>>, step: u32, rates: Rates) {
         let Self { anchors, weights, gradients, .. } = self;
         let overflow = self.limits.overflow();
+        // Before the optimiser, which goes on from the features that were decoded.
+        let attention = self.attend.as_ref().zip(attended);
+        let attention =
+            attention.map(|(attend, attended)| (attend, attend.write_back(rec, attended, anchors, overflow)));
         let mut update = |parameter: &Parameter, gradient: &Buffer<f32>, range: (u32, u32), rate: f64| {
             if rate == 0.0 {
                 return;
@@ -434,7 +440,7 @@ impl Step {
             let first = layout.head(head);
             update(weights, &gradients.weights, (first as u32, (layout.head(head + 1) - first) as u32), rate);
         }
-        if let Some((attend, attended)) = self.attend.as_ref().zip(attended) {
+        if let Some((attend, skip)) = attention {
             let weights = &attend.weights;
             let since = step + 1 - self.config.model.attention.start.max(1);
             let tensors = Tensors {
@@ -443,7 +449,6 @@ impl Step {
                 first: &weights.first,
                 root: &weights.root,
             };
-            let skip = attend.skip(rec, attended, overflow);
             adam::record(rec, &self.adam, tensors, skip, (0, weights.width), (since, rates.attention));
         }
     }

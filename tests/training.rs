@@ -1,0 +1,244 @@
+//! Whole runs: the same bytes again, room that is made, agreement with the reference path, a falling loss, real captures.
+
+#[allow(dead_code)]
+mod common;
+
+use std::path::PathBuf;
+
+use common::Watch;
+use gscream_vk::config::Settings;
+use gscream_vk::gpu::{Gpu, testing};
+use gscream_vk::model::files;
+use gscream_vk::render::view::{Capacity, Renderer};
+use gscream_vk::scene::{self, Scene};
+use gscream_vk::train::run::{Run, Summary};
+
+/// What a run ends with.
+struct Trained {
+    watch: Watch,
+    summary: Summary,
+    model: (files::Anchors, files::Weights),
+    /// The run folder's log and model, by name.
+    files: Vec<(String, Vec<u8>)>,
+}
+
+impl Trained {
+    /// Every loss of every step, bit by bit, and the counts behind it.
+    fn figures(&self) -> Vec<(u32, String, Vec<u32>, [u32; 4])> {
+        let figures = |p: &gscream_vk::train::run::Progress| {
+            let losses = p.losses.iter().map(|(_, loss)| loss.to_bits()).collect();
+            (p.step, p.view.clone(), losses, [p.anchors, p.visible, p.gaussians, p.pairs])
+        };
+        self.watch.steps.iter().map(figures).collect()
+    }
+
+    /// Panics where the two differ in any bit.
+    fn assert_same(&self, other: &Self, what: &str) {
+        for (a, b) in self.figures().into_iter().zip(other.figures()) {
+            assert_eq!(a, b, "{what}");
+        }
+        assert_eq!(self.watch.steps.len(), other.watch.steps.len(), "{what}");
+        assert_eq!(self.watch.lines, other.watch.lines, "{what}");
+        assert!(self.model == other.model, "{what}: the models differ");
+        assert!(self.files == other.files, "{what}: the models' files differ");
+    }
+}
+
+fn train(gpu: &Gpu, scene: &Scene, settings: &Settings, capacity: Option<Capacity>) -> Trained {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let mut run = Run::new(gpu, scene, settings).expect("the device has room");
+    if let Some(capacity) = capacity {
+        run.resize(Capacity { anchors: run.step().anchors.capacity, ..capacity }).expect("the device has room");
+    }
+    let mut watch = Watch::default();
+    let summary = run.train(folder.path(), &mut watch).expect("a run");
+    let read = |name: &str| {
+        (name.to_owned(), std::fs::read(folder.path().join("model").join(name)).expect("the run wrote it"))
+    };
+    let files = [files::POINT_CLOUD, files::WEIGHTS].map(read).to_vec();
+    Trained { watch, summary, model: run.step().model().expect("readable"), files }
+}
+
+/// Growth, pruning, statistics and attention all happen within these steps.
+fn scene_without_tests() -> Scene {
+    let mut scene = common::tiny();
+    scene.test.clear();
+    scene
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bytes() {
+    let gpu = testing::gpu();
+    let scene = scene_without_tests();
+    let mut settings = common::settings(13);
+    settings.train.view_order = gscream_vk::train::config::ViewOrder::Shuffled;
+    let first = train(&gpu, &scene, &settings, None);
+    assert!(first.watch.lines.len() == 5, "five changes of the anchors: {:?}", first.watch.lines);
+    assert!(first.watch.lines.iter().any(|line| !line.contains(": 0 new")), "{:?}", first.watch.lines);
+    let initial = first.watch.steps[0].anchors;
+    assert_ne!(first.summary.anchors, initial, "anchors came and went");
+    first.assert_same(&train(&gpu, &scene, &settings, None), "once more");
+    settings.train.seed = 1;
+    let other = train(&gpu, &scene, &settings, None);
+    assert!(other.model != first.model && other.figures() != first.figures(), "another seed");
+}
+
+#[test]
+fn steps_that_overflow_are_taken_again() {
+    let gpu = testing::gpu();
+    let scene = scene_without_tests();
+    for write_back in [false, true] {
+        let mut settings = common::settings(13);
+        settings.model.attention.write_back = write_back;
+        let ample = train(&gpu, &scene, &settings, Some(Capacity { anchors: 0, visible: 4096, pairs: 1 << 18 }));
+        assert_eq!(ample.summary.repeated, 0, "there was room");
+        let most = |of: fn(&gscream_vk::train::run::Progress) -> u32| ample.watch.steps.iter().map(of).max();
+        let (visible, pairs) = (most(|p| p.visible).expect("steps"), most(|p| p.pairs).expect("steps"));
+        for (what, capacity) in [
+            ("no room at all", Capacity { anchors: 0, visible: 1, pairs: 1 }),
+            ("too few anchors", Capacity { anchors: 0, visible: visible - 1, pairs: 1 << 18 }),
+            // Falls short in a late step, with attention and statistics under way.
+            ("too few pairs", Capacity { anchors: 0, visible: 4096, pairs: pairs - 1 }),
+        ] {
+            let tight = train(&gpu, &scene, &settings, Some(capacity));
+            assert!(tight.summary.repeated > 0, "{what}: it fitted");
+            tight.assert_same(&ample, &format!("{what}, write_back {write_back}"));
+        }
+    }
+}
+
+#[test]
+fn every_pass_agrees_with_its_reference() {
+    let gpu = testing::gpu();
+    let scene = common::tiny();
+    let settings = common::settings(20);
+    let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
+    let mut failed = vec![];
+    for step in 1..=6 {
+        // 1: nothing optional; 4: the reference view; 5: another view, both with statistics and attention.
+        if ![1, 4, 5].contains(&step) {
+            run.run_one(step).expect("a step");
+            continue;
+        }
+        let mut rec = gpu.checked().expect("a recorder");
+        run.record(&mut rec, step).expect("the device has room");
+        let submission = rec.submit().expect("the device runs it");
+        let differences = submission.differences.clone();
+        submission.wait().expect("the device runs it");
+        let compared = |pass: &str| differences.iter().any(|d| d.pass.starts_with(pass));
+        assert!(differences.len() > 50, "{} tensors", differences.len());
+        for pass in ["render/cull", "render/decode", "render/rasterize", "losses/depth_gradient", "optimizer/adam"] {
+            assert!(compared(pass), "step {step}: {pass} was not compared");
+        }
+        for pass in ["model/attention_forward", "model/attention_weight_backward", "densify/statistics"] {
+            assert_eq!(compared(pass), step >= 4, "step {step}: {pass}");
+        }
+        failed.extend(differences.iter().filter(|d| !d.ok()).map(|d| format!("step {step}: {d}")));
+    }
+    assert!(failed.is_empty(), "beyond their bounds:\n{}", failed.join("\n"));
+}
+
+/// The mean over a round of views: every view has losses of its own size.
+fn mean_loss(watch: &Watch, steps: std::ops::Range<usize>) -> f64 {
+    watch.steps[steps.clone()].iter().map(|p| f64::from(p.loss)).sum::<f64>() / steps.len() as f64
+}
+
+#[test]
+fn training_learns_and_what_it_saves_draws_the_same_picture() {
+    let gpu = testing::gpu();
+    let scene = common::tiny();
+    let settings = common::settings(60);
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
+    let psnr = |run: &Run<'_>| {
+        let report = run.evaluate(None).expect("an evaluation").expect("there are test views");
+        report.mean.expect("means").metrics.full.psnr
+    };
+    let untrained = psnr(&run);
+    let mut watch = Watch::default();
+    let summary = run.train(folder.path(), &mut watch).expect("a run");
+    let (before, after) = (mean_loss(&watch, 0..6), mean_loss(&watch, 54..60));
+    assert!(after < 0.5 * before, "the loss went from {before} to {after}");
+    let trained = psnr(&run);
+    assert!(trained > untrained + 3.0, "PSNR of the test views went from {untrained} to {trained} dB");
+    let reported = summary.report.and_then(|r| r.mean).expect("figures at the end").metrics.full.psnr;
+    assert_eq!(reported, trained, "the summary is of the model at the end");
+
+    let log = std::fs::read_to_string(folder.path().join("log.jsonl")).expect("a log");
+    let lines: Vec<serde_json::Value> =
+        log.lines().map(|line| serde_json::from_str(line).expect("a line of JSON")).collect();
+    assert_eq!(lines.iter().map(|l| l["step"].as_u64()).collect::<Vec<_>>(), [10, 20, 30, 40, 50, 60].map(Some));
+    let means: f64 = lines.iter().map(|l| l["mean_loss"].as_f64().expect("a number")).sum::<f64>() / 6.0;
+    let all = mean_loss(&watch, 0..60);
+    assert!((means - all).abs() < 1e-9 * all, "the lines cover every step once: {means}, {all}");
+    // The reader of JSON rounds to a neighbour at times.
+    let logged = lines[5]["psnr"].as_f64().expect("a number");
+    assert!((logged - trained).abs() < 1e-12 * trained, "{logged} in the log, {trained}");
+
+    let memory = run.step().model().expect("readable");
+    let file = files::load(&folder.path().join("model")).expect("a model that was just written");
+    assert!(memory == file, "what was saved is what was trained");
+    let pictures = |(anchors, weights): &(files::Anchors, files::Weights)| {
+        let mut renderer =
+            Renderer::new(&gpu, anchors, weights, &settings.render, [0.0; 3]).expect("the device has room");
+        let views = scene.test.iter().chain(&scene.train);
+        views.map(|view| renderer.render(&view.camera).expect("a picture")).collect::<Vec<_>>()
+    };
+    let (saved, kept) = (pictures(&file), pictures(&memory));
+    for (saved, kept) in saved.iter().zip(&kept) {
+        let bits = |rgb: &[[f32; 3]]| rgb.as_flattened().iter().map(|v| v.to_bits()).collect::<Vec<u32>>();
+        assert_eq!(bits(&saved.rgb), bits(&kept.rgb));
+        assert!(saved == kept);
+        assert!(saved.rgb.as_flattened().iter().any(|&v| v > 0.1), "the picture is not black");
+    }
+}
+
+/// A real capture, or nothing and a line that says so.
+fn capture(name: &str, config: &scene::Config) -> Option<Scene> {
+    let data = std::env::var_os("GSCREAM_DATA")
+        .map_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
+    let folder = data.join(name);
+    if !folder.is_dir() {
+        println!("skipped: no {} (GSCREAM_DATA names the folder of the captures)", folder.display());
+        return None;
+    }
+    Some(scene::load(&folder, config).expect("a readable capture"))
+}
+
+/// Three steps, with statistics and what else the capture has a use for.
+fn three_steps(scene: &Scene, voxel_factor: f64) -> gscream_vk::train::plan::Plan {
+    let gpu = testing::gpu();
+    let mut settings = common::settings(3);
+    settings.model.voxel_factor = voxel_factor;
+    settings.model.attention.start = 1;
+    settings.model.attention.patch = 64;
+    (settings.densify.statistics_from, settings.densify.from, settings.densify.every) = (1, 2, 1);
+    settings.densify.max_log_scaling = f64::INFINITY;
+    let mut scene = scene.clone();
+    scene.test.clear();
+    let trained = train(&gpu, &scene, &settings, None);
+    assert_eq!(trained.watch.steps.len(), 3);
+    for progress in &trained.watch.steps {
+        assert!(progress.loss.is_finite() && progress.loss > 0.0, "{progress:?}");
+        assert!(progress.visible > 100 && progress.gaussians > 100, "{progress:?}");
+    }
+    gscream_vk::train::plan::Plan::new(&scene, &settings)
+}
+
+#[test]
+fn three_steps_of_a_capture_with_masks() {
+    let config = scene::Config { downscale: 8, ..Default::default() };
+    let Some(scene) = capture("spin-1", &config) else { return };
+    let plan = three_steps(&scene, 12.0);
+    assert!(plan.masks && plan.depth && plan.depth_gradient && plan.attention && plan.growth, "{plan:?}");
+    assert!(plan.reference.is_some(), "{plan:?}");
+}
+
+#[test]
+fn three_steps_of_photographs_alone() {
+    let config = scene::Config { downscale: 4, ..Default::default() };
+    let Some(scene) = capture("fern", &config) else { return };
+    let plan = three_steps(&scene, 12.0);
+    assert!(!plan.masks && !plan.depth && !plan.depth_gradient && !plan.attention && plan.growth, "{plan:?}");
+    assert!(plan.reference.is_none(), "{plan:?}");
+}
