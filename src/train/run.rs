@@ -137,6 +137,9 @@ pub trait Observer {
 pub struct Silent;
 impl Observer for Silent {}
 
+/// Takes a view's name and its picture.
+pub type Keep<'k> = &'k mut dyn FnMut(&str, &Rendered);
+
 /// Buffers in host memory that the device fills at the end of a step.
 struct Mailbox {
     losses: Buffer<f32>,
@@ -397,7 +400,7 @@ impl<'a> Run<'a> {
     ///
     /// # Errors
     /// When the device has no room for a second copy of the model.
-    pub fn evaluate(&self, mut keep: Option<&mut dyn FnMut(&str, &Rendered)>) -> Result<Option<Report>, Error> {
+    pub fn evaluate(&self, mut keep: Option<Keep<'_>>) -> Result<Option<Report>, Error> {
         if self.scene.test.is_empty() {
             return Ok(None);
         }
