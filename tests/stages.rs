@@ -53,7 +53,10 @@ fn stages(plan: &Plan) -> Vec<(&'static str, bool)> {
     ]
 }
 
-const BUFFERS: [(&str, fn(&Plan) -> bool); 24] = [
+type Present = fn(&Plan) -> bool;
+
+/// Buffers that belong to stages, by name.
+const BUFFERS: [(&str, Present); 24] = [
     ("prior", |p| p.depth),
     ("depth_map", |p| p.depth),
     ("grad_depth", |p| p.depth),
@@ -125,10 +128,9 @@ fn what_is_absent_has_no_pass_and_no_buffer() {
         for name in &passes {
             let masked = name.starts_with("losses/") && (name.ends_with("_masked") || name.ends_with("_weighted"));
             assert!(plan.masks || !(masked || name.ends_with("_masked_depth")), "{wanted:?}: {name} needs a mask");
-            let picture = name.starts_with("render/rasterize") || *name == "render/project_backward_color";
-            let colour = name.ends_with("_color") || *name == "render/project_backward_color";
-            let forms = picture && *name != "render/rasterize_gather" && !name.starts_with("render/rasterize_gather");
-            assert!(!forms || colour != plan.depth, "{wanted:?}: {name} where the picture has depth: {}", plan.depth);
+            let forms = ["render/rasterize", "render/project_backward"].iter().any(|start| name.starts_with(start));
+            let depth = !name.ends_with("_color");
+            assert!(!forms || depth == plan.depth, "{wanted:?}: {name} where the picture has depth: {}", plan.depth);
         }
         assert_eq!(has("render/project_backward_color"), !plan.depth, "{wanted:?}");
         assert_eq!(plan.outputs() == Outputs::Color, !plan.depth);

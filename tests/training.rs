@@ -151,7 +151,7 @@ fn training_learns_and_what_it_saves_draws_the_same_picture() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
     let psnr = |run: &Run<'_>| {
-        let report = run.evaluate(None).expect("an evaluation").expect("there are test views");
+        let report = run.evaluate(|_, _| ()).expect("an evaluation").expect("there are test views");
         report.mean.expect("means").metrics.full.psnr
     };
     let untrained = psnr(&run);

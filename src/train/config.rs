@@ -18,8 +18,8 @@ pub struct Config {
     pub log_interval: u32,
     /// Steps between two evaluations on the test views; 0 evaluates only at the end.
     pub eval_interval: u32,
-    /// Steps between two checkpoints; 0 writes only the final one.
-    pub checkpoint_interval: u32,
+    /// Steps between two saves of the model, each in place of the one before; 0 saves only at the end.
+    pub save_interval: u32,
 }
 
 /// How the next training view is drawn.
@@ -41,7 +41,7 @@ impl Default for Config {
             background: [0.0; 3],
             log_interval: 100,
             eval_interval: 5_000,
-            checkpoint_interval: 5_000,
+            save_interval: 5_000,
         }
     }
 }

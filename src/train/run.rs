@@ -278,9 +278,13 @@ impl<'a> Run<'a> {
         let mut report = None;
         let mut since_line = (0u32, 0f64, Instant::now());
         let mut recent: VecDeque<(u32, u32)> = VecDeque::new();
+        let every =
+            |interval: u32| move |step: u32| step == iterations || (interval > 0 && step.is_multiple_of(interval));
+        let (evaluates, saves) = (every(self.settings.train.eval_interval), every(self.settings.train.save_interval));
         while done < iterations {
-            // A step that follows a change of the anchors waits until the change is made.
-            let blocked = next > done + 1 && self.step.changes_anchors(next - 1);
+            // What follows a change of the anchors, an evaluation or a save waits until it is made.
+            let pause_behind = |step: u32| self.step.changes_anchors(step) || evaluates(step) || saves(step);
+            let blocked = next > done + 1 && pause_behind(next - 1);
             if next <= iterations && in_flight.len() < DEPTH && !blocked {
                 let mailbox = (next as usize) % DEPTH;
                 in_flight.push_back(self.submit(next, mailbox)?);
@@ -335,9 +339,10 @@ impl<'a> Run<'a> {
                 watch.say(&change);
             }
             let pause = Instant::now();
-            let every = self.settings.train.eval_interval;
-            let evaluate = done == iterations || (every > 0 && done.is_multiple_of(every));
-            if evaluate {
+            if saves(done) {
+                self.save(folder)?;
+            }
+            if evaluates(done) {
                 let last = done == iterations;
                 report = self
                     .evaluate(|view, picture| {
@@ -371,8 +376,6 @@ impl<'a> Run<'a> {
             }
         }
         let seconds = started.elapsed().as_secs_f64() - paused;
-        let (anchors, weights) = self.step.model()?;
-        files::save(&folder.join("model"), &anchors, &weights)?;
         let mean = |f: &dyn Fn(&(u32, u32)) -> u32| {
             recent.iter().map(|r| f64::from(f(r))).sum::<f64>() / recent.len().max(1) as f64
         };
@@ -388,6 +391,15 @@ impl<'a> Run<'a> {
             timings,
             last: last_timings,
         })
+    }
+
+    /// Writes the model as it is now into `folder/model`, in place of the one before.
+    ///
+    /// # Errors
+    /// When it cannot be read back or written.
+    pub fn save(&self, folder: &Path) -> Result<(), Error> {
+        let (anchors, weights) = self.step.model()?;
+        Ok(files::save(&folder.join("model"), &anchors, &weights)?)
     }
 
     fn grow(&mut self, counters: &[u32]) -> Result<(), Error> {
