@@ -7,7 +7,9 @@ use atomic_write_file::AtomicWriteFile;
 use exr::prelude::{
     AnyChannel, AnyChannels, Encoding, FlatSamples, Layer, LayerAttributes, SmallVec, WritableImage as _,
 };
-use image::{ImageFormat, RgbImage};
+use image::ImageFormat;
+
+pub use crate::render::view::to_rgb8;
 
 /// A picture that cannot be written.
 #[derive(Debug, thiserror::Error)]
@@ -17,17 +19,6 @@ pub struct Error {
     pub path: PathBuf,
     /// What the system or the encoder said.
     pub source: io::Error,
-}
-
-/// Row-major \[pixel\] RGB in \[0, 1\] as 8-bit RGB: clamped, rounded to the nearest, NaN black.
-///
-/// # Panics
-/// Unless there is one colour per pixel of `size` (width, height).
-pub fn to_rgb8([width, height]: [u32; 2], rgb: &[[f32; 3]]) -> RgbImage {
-    let bytes = rgb.as_flattened().iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-    RgbImage::from_raw(width, height, bytes)
-        .filter(|image| image.as_raw().len() == 3 * rgb.len())
-        .expect("one colour per pixel")
 }
 
 /// Where a view's file goes: `FOLDER/NAME.EXTENSION`, names with `/` into folders of their own.

@@ -49,57 +49,9 @@ pub fn learning_rate(step: u32, initial: f64, last: f64, steps: u32) -> f64 {
     }
 }
 
-/// The groups of parameters that share a rate, by name.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Schedule {
-    /// Steps over which the rates fall.
-    pub steps: u32,
-    /// Name and rate, in the order of the passes.
-    pub groups: Vec<(&'static str, Rate)>,
-}
-
-impl Schedule {
-    /// The rates of the GScream release for SPIn-NeRF scenes; `radius` is 1.1 times the largest distance of a camera
-    /// from the mean camera, scene units.
-    pub fn gscream(radius: f64, steps: u32) -> Self {
-        let groups = vec![
-            ("position", Rate::constant(0.0)),
-            ("feature", Rate::constant(0.0075)),
-            ("offset", Rate::falling(0.01, 0.0001).scaled(radius)),
-            ("log_scaling", Rate::constant(0.007)),
-            ("mlp_opacity", Rate::falling(0.002, 0.00002)),
-            ("mlp_cov", Rate::constant(0.004)),
-            ("mlp_color", Rate::falling(0.008, 0.00005)),
-            ("attention", Rate::falling(0.002, 0.00002)),
-        ];
-        Self { steps, groups }
-    }
-
-    /// A group's rate at a step; `None` for a name that is not in the table.
-    pub fn at(&self, group: &str, step: u32) -> Option<f64> {
-        self.groups.iter().find(|(name, _)| *name == group).map(|(_, rate)| rate.at(step, self.steps))
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn rates_of_all_groups() {
-        let schedule = Schedule::gscream(2.5, 30_000);
-        let mut table = format!("{:<12}", "step");
-        for (name, _) in &schedule.groups {
-            table += &format!(" {name:>16}");
-        }
-        for step in [0, 1, 1500, 15_000, 30_000, 40_000] {
-            table += &format!("\n{step:<12}");
-            for (_, rate) in &schedule.groups {
-                table += &format!(" {:>16.10e}", rate.at(step, schedule.steps));
-            }
-        }
-        insta::assert_snapshot!(table);
-    }
 
     #[test]
     fn ends_are_exact() {
@@ -111,6 +63,5 @@ mod tests {
         assert_eq!(Rate::constant(0.0).at(3, 100), 0.0);
         assert_eq!(Rate::falling(0.1, 0.0).at(50, 100), 0.0);
         assert_eq!(rate.at(0, 0), 0.0001);
-        assert_eq!(Schedule::gscream(1.0, 10).at("nobody", 3), None);
     }
 }

@@ -117,10 +117,19 @@ pub struct Rendered {
 impl Rendered {
     /// The colours in 8 bits, clamped and rounded to the nearest.
     pub fn to_rgb8(&self) -> image::RgbImage {
-        let byte = |v: f32| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
-        let bytes = self.rgb.iter().flat_map(|p| p.map(byte)).collect();
-        image::RgbImage::from_raw(self.size[0], self.size[1], bytes).expect("three bytes per pixel")
+        to_rgb8(self.size, &self.rgb)
     }
+}
+
+/// Row-major \[pixel\] RGB in \[0, 1\] as 8-bit RGB: clamped, rounded to the nearest, NaN black.
+///
+/// # Panics
+/// Unless there is one colour per pixel of `size` (width, height).
+pub fn to_rgb8([width, height]: [u32; 2], rgb: &[[f32; 3]]) -> image::RgbImage {
+    let bytes = rgb.as_flattened().iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+    image::RgbImage::from_raw(width, height, bytes)
+        .filter(|image| image.as_raw().len() == 3 * rgb.len())
+        .expect("one colour per pixel")
 }
 
 /// Renders views of a model.

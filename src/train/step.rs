@@ -514,3 +514,38 @@ impl Step {
         Ok((self.anchors.read(&self.gpu)?, weights))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// GScream's published rates, for a scene of radius 2.5.
+    #[test]
+    fn rates_of_all_groups() {
+        let settings = Settings::default();
+        let mut table = String::from("step");
+        for name in ["feature", "offset", "log_scaling", "mlp_opacity", "mlp_color", "mlp_cov", "attention"] {
+            table += &format!(" {name:>16}");
+        }
+        for step in [0, 1, 1500, 15_000, 30_000, 40_000] {
+            let Rates { feature, offset, log_scaling, decoders: [opacity, color, cov], attention } =
+                Rates::at(&settings, 2.5, step);
+            table += &format!("\n{step}");
+            for rate in [feature, offset, log_scaling, opacity, color, cov, attention] {
+                table += &format!(" {rate:>16.10e}");
+            }
+        }
+        insta::assert_snapshot!(table);
+    }
+
+    #[test]
+    fn rectangles_stay_in_the_picture() {
+        for step in 0..200 {
+            let mut rng = random(3, Stream::Rectangle, step);
+            let ([x0, y0], [x1, y1]) = random_rectangle(&mut rng, [0, 10, 20, 30], [40, 32]);
+            assert!(x0 < x1 && x1 <= 40 && y0 < y1 && y1 <= 32, "{x0} {y0} {x1} {y1}");
+            // 80 % of 20 pixels, but for what is clipped and rounded away.
+            assert!(x1 - x0 <= 17 && y1 - y0 <= 17);
+        }
+    }
+}
