@@ -1,0 +1,56 @@
+//! Stiff and extreme cases: what is guaranteed where float32 is under strain, and the test that it holds.
+//!
+//! Each case states its guarantee in words; `run` fails where it does not hold. The table of all of them is a golden file
+//! (`tests/snapshots/extreme__guarantees.snap`), so that a weaker guarantee is a line of a diff.
+
+use gscream_vk::gpu::{Gpu, testing};
+use libtest_mimic::{Arguments, Trial};
+
+/// A case and what is guaranteed for it.
+pub struct Case {
+    /// Stage or command.
+    pub stage: &'static str,
+    /// What is extreme.
+    pub case: &'static str,
+    /// What holds all the same: finite, within a bound that is derived in the source, or refused in these words.
+    pub guarantee: &'static str,
+    /// Panics where the guarantee does not hold.
+    pub run: fn(&Gpu),
+}
+
+/// Every case.
+fn cases() -> Vec<&'static Case> {
+    let stages: [&[Case]; 0] = [];
+    stages.into_iter().flatten().collect()
+}
+
+fn table(cases: &[&Case]) -> String {
+    let mut text = String::from("| stage | case | guarantee |\n| --- | --- | --- |\n");
+    for Case { stage, case, guarantee, .. } in cases {
+        text.push_str(&format!("| {stage} | {case} | {guarantee} |\n"));
+    }
+    text
+}
+
+fn main() {
+    let arguments = Arguments::from_args();
+    let cases = cases();
+    let guarantees = table(&cases);
+    let mut trials: Vec<Trial> = cases
+        .into_iter()
+        .map(|case| {
+            Trial::test(format!("{}: {}", case.stage, case.case), || {
+                let gpu = testing::gpu();
+                (case.run)(&gpu);
+                Ok(())
+            })
+        })
+        .collect();
+    trials.push(Trial::test("guarantees", move || {
+        insta::with_settings!({snapshot_path => "../snapshots", prepend_module_to_snapshot => false}, {
+            insta::assert_snapshot!("extreme__guarantees", guarantees);
+        });
+        Ok(())
+    }));
+    libtest_mimic::run(&arguments, trials).exit();
+}
