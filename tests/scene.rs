@@ -208,19 +208,20 @@ fn camera_models_round_trip() {
             let (_, t) = pose(i);
             let wanted = Camera {
                 rotation: [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
-                translation: t.map(|v| v as f32),
+                translation: view.camera.translation,
                 focal: [*fx, *fy],
                 principal: [*cx, *cy],
                 distortion: [*k1, *k2, *p1, *p2],
                 size: SIZE,
             };
             let close = |a: f32, b: f32| (a - b).abs() < 1e-6;
+            assert!((0..3).all(|k| (view.camera.translation[k] - t[k]).abs() < 1e-6), "{:?}", view.camera.translation);
             for (a, b) in view.camera.rotation.iter().flatten().zip(wanted.rotation.iter().flatten()) {
                 assert!(close(*a, *b), "{:?}", view.camera.rotation);
             }
             assert_eq!(Camera { rotation: wanted.rotation, ..view.camera }, wanted);
             // By hand: R^T t for a quarter turn about z is (ty, -tx, tz).
-            let center = view.camera.center();
+            let center = view.camera.center().map(|v| v as f32);
             assert!(close(center[0], 0.25) && close(center[1], 0.5 * i as f32) && close(center[2], -2.0), "{center:?}");
         }
         let points: Vec<_> = scene.points.iter().map(|p| (p.position, p.color)).collect();

@@ -1,25 +1,30 @@
-// A camera and its lens (COLMAP's OPENCV model) on normalised coordinates. World to camera is p_camera = R p + t.
+// A camera and its lens (COLMAP's OPENCV model) on normalised coordinates. World to camera is p_camera = R (p - c).
 struct Camera {
   vec3 rotation0, rotation1, rotation2; // rows of R
-  vec3 translation;
   vec4 lens;         // fx fy cx cy, px
   vec4 distortion;   // k1 k2 p1 p2
   vec4 limits;       // lowest x y, highest x y of the point at which the Jacobian is taken
   float near;        // smallest depth
   float max_radius2; // squared radius at which the polynomial folds back
 };
-#define CAMERA(push) Camera(push.rotation0, push.rotation1, push.rotation2, push.translation, push.lens, \
+#define CAMERA(push) Camera(push.rotation0, push.rotation1, push.rotation2, push.lens, \
   push.distortion, push.limits, push.near, push.max_radius2)
 
 const float DILATION = 0.3; // px^2, the low-pass of 3DGS
 
-bool finite(float v) { return (floatBitsToUint(v) & 0x7f800000u) != 0x7f800000u; }
+// A point seen from the camera's centre c = high + low (float64, split in two): p - high is exact for points within a
+// factor of two of the centre and rounded relative to the result otherwise, so the error is at most 2^-23 |p - c|
+// wherever the scene lies. R p + t would lose 2^-24 (|p| + |t|): a tenth of a unit for a scene a million units out.
+vec3 from_center(vec3 p, vec3 high, vec3 low) {
+  precise vec3 difference = (p - high) - low;
+  return difference;
+}
 
-// `precise`: the discrete decisions below are the same on device and host.
+// Of a point seen from the camera's centre. `precise`: the discrete decisions below are the same on device and host.
 vec3 to_camera(Camera c, vec3 p) {
-  precise float x = ((c.rotation0.x * p.x + c.rotation0.y * p.y) + c.rotation0.z * p.z) + c.translation.x;
-  precise float y = ((c.rotation1.x * p.x + c.rotation1.y * p.y) + c.rotation1.z * p.z) + c.translation.y;
-  precise float z = ((c.rotation2.x * p.x + c.rotation2.y * p.y) + c.rotation2.z * p.z) + c.translation.z;
+  precise float x = (c.rotation0.x * p.x + c.rotation0.y * p.y) + c.rotation0.z * p.z;
+  precise float y = (c.rotation1.x * p.x + c.rotation1.y * p.y) + c.rotation1.z * p.z;
+  precise float z = (c.rotation2.x * p.x + c.rotation2.y * p.y) + c.rotation2.z * p.z;
   return vec3(x, y, z);
 }
 
@@ -89,4 +94,53 @@ mat3 rotation_matrix(vec4 q) {
 float three_sigma(vec3 v) {
   float half_difference = 0.5 * (v.x - v.z);
   return 3.0 * sqrt(0.5 * (v.x + v.z) + sqrt(half_difference * half_difference + v.y * v.y));
+}
+
+// The covariance on the picture, factored: C = U U^T + D I with the rows u0, u1 of U = J R Q S, as
+//   (N, k, V): V = yy the variance of y, k = xy / yy the slope of x on y, N = det C / yy the variance of x given y,
+// so that d^T C^-1 d = (dx - k dy)^2 / N + dy^2 / V, a sum of squares. The entries xx, xy, yy rounded to float32 know
+// the narrow axis only to 2^-24 of the long one: det = xx yy - xy^2 is noise for axes from 2^12 : 1 on, however
+// carefully the difference is taken. Here nothing large cancels: with m0, m1 the rows of J R Q and n = m0 x m1 (whose
+// size does not depend on S), the minors of U are n_i s_j s_k, and by Cauchy and Binet
+//   det C = |u0 x u1|^2 + D (|u0|^2 + |u1|^2) + D^2, so that N = D + (|u0 x u1|^2 + D |u0|^2) / V,
+// sums of squares: relative error some ten roundings, and of n what the angle between m0 and m1 costs. Of k the error is
+// at most some roundings of |u0| |u1| / V, which moves dx - k dy by 2^-22 of the ellipse's extent in x.
+// Quotients by V are taken before squares, so that all stays finite up to standard deviations of MAX_DEVIATION.
+const float MAX_DEVIATION = 1152921504606846976.0; // 2^60 px; also the largest coordinate of a mean
+
+struct Axes {
+  vec3 m0, m1, u0, u1, n;
+  float variance; // V, px^2
+  float slope;    // k
+};
+
+Axes axes_of(vec3 t0, vec3 t1, mat3 q, vec3 s) {
+  Axes a;
+  a.m0 = t0 * q;
+  a.m1 = t1 * q;
+  a.u0 = a.m0 * s;
+  a.u1 = a.m1 * s;
+  a.n = cross(a.m0, a.m1);
+  a.variance = dot(a.u1, a.u1) + DILATION;
+  a.slope = dot(a.u0, a.u1) / a.variance;
+  return a;
+}
+
+float narrow_variance(Axes a, vec3 s) {
+  float inverse_deviation = inversesqrt(a.variance);
+  vec3 minors = (s.yzx * s.zxy) * a.n * inverse_deviation, u0 = a.u0 * inverse_deviation;
+  return DILATION + (dot(minors, minors) + DILATION * dot(u0, u0));
+}
+
+// h = m0 - k m1, without the cancellation: (D m0 + (s^2 m1) x n) / V. The residual u0 - k u1 is s h.
+vec3 residual(Axes a, vec3 s) {
+  float inverse_deviation = inversesqrt(a.variance);
+  return (DILATION / a.variance) * a.m0 + cross((s * inverse_deviation) * (a.u1 * inverse_deviation), a.n);
+}
+
+bool representable(vec2 mean, Axes a, float narrow, float z) {
+  const float most = MAX_DEVIATION * MAX_DEVIATION;
+  // Written so that not-a-number is not representable.
+  return abs(mean.x) <= MAX_DEVIATION && abs(mean.y) <= MAX_DEVIATION && dot(a.u0, a.u0) <= most &&
+    a.variance <= most && narrow <= most && abs(a.slope) <= most && z <= most;
 }

@@ -54,3 +54,13 @@ float tanh_safe(float x) {
   float small = x * (1.0 + s * (-1.0 / 3.0 + s * (2.0 / 15.0 - s * (17.0 / 315.0))));
   return abs(x) < 0.1 ? small : sign(x) * (1.0 - t) / (1.0 + t);
 }
+// Beyond the logarithm of the largest float there is no exponential: the largest float, so that an offset or a gradient
+// of 0 times it is 0. A Gaussian of that size is absent (`project`). Not-a-number stays what it is.
+const float EXP_LIMIT = 88.72283;
+const float MAX_FLOAT = 3.4028234663852886e38;
+vec3 exp_saturated(vec3 x) { return mix(exp(x), vec3(MAX_FLOAT), greaterThan(x, vec3(EXP_LIMIT))); }
+// Length without overflow of the squares. Their underflow, below 1e-19, is of lengths that count as zero.
+float norm_of(vec4 q) {
+  float largest = max(max(abs(q.x), abs(q.y)), max(abs(q.z), abs(q.w)));
+  return largest > 1e18 ? largest * length(q / largest) : length(q);
+}

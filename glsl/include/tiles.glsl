@@ -1,7 +1,7 @@
 // Which tiles a Gaussian touches: those holding a pixel centre where its alpha can reach 1/255.
 //
-// alpha >= 1/255 is q(d) = xx dx^2 + 2 xy dx dy + yy dy^2 <= 2 ln(255 opacity) for conic (xx, xy, yy): an ellipse around
-// the mean. Per row of tiles its extent in x is found over the row's sample band; the right boundary x(dy) is concave, so
+// alpha >= 1/255 is q(d) = (dx - k dy)^2 / N + dy^2 / V <= 2 ln(255 opacity) for the factored covariance (N, k, V): an
+// ellipse around the mean. Per row of tiles its extent in x is found over the row's sample band; the right boundary x(dy) is concave, so
 // its maximum over a band lies at the ellipse's own extreme clamped into the band.
 
 // The bound on q, widened by what float32 rounding of q in the rasteriser may take away, so that culling never decides
@@ -10,19 +10,20 @@ float support_bound(float opacity) { return 2.0 * log(255.0 * opacity) * 1.0001 
 
 struct Support {
   float bound;
-  vec3 covariance;
-  float narrow;   // variance of dx given dy, px^2: det / yy = 1 / conic.x
-  vec2 half_size; // of the bounding box, px
+  vec3 covariance; // factored
+  vec2 half_size;  // of the bounding box, px
+  float tip;       // dy where dx is largest, px
   int row0, row1; // tile rows, inclusive
 };
 
-// Half the bounding box of {q <= bound} is sqrt(bound * covariance diagonal).
-Support support_of(vec2 mean, vec3 covariance, vec3 conic, float opacity, int tile, ivec2 tiles) {
+// Half the bounding box of {q <= bound} is sqrt(bound * covariance diagonal), with xx = N + k^2 V.
+Support support_of(vec2 mean, vec3 covariance, float opacity, int tile, ivec2 tiles) {
   Support s;
   s.bound = support_bound(opacity);
   s.covariance = covariance;
-  s.narrow = 1.0 / conic.x;
-  s.half_size = sqrt(max(s.bound, 0.0) * vec2(covariance.x, covariance.z));
+  float xy = covariance.y * covariance.z, xx = covariance.x + covariance.y * xy;
+  s.half_size = sqrt(max(s.bound, 0.0) * vec2(xx, covariance.z));
+  s.tip = xy / xx * s.half_size.x;
   // Tile row t holds the samples t*tile + 0.5 ... t*tile + tile - 0.5. Far-away means are clamped before the conversion
   // to int, which is undefined beyond its range.
   float low = clamp(mean.y - s.half_size.y, -1e6, 1e6), high = clamp(mean.y + s.half_size.y, -1e6, 1e6);
@@ -33,18 +34,18 @@ Support support_of(vec2 mean, vec3 covariance, vec3 conic, float opacity, int ti
 }
 
 // First and last tile column (inclusive, may be empty) of tile row `row`. Given dy, dx lies within
-// xy/yy dy +- sqrt((bound - dy^2/yy) det/yy): a form without differences of large products.
+// k dy +- sqrt((bound - dy^2 / V) N): a form without differences of large products.
 ivec2 support_columns(Support s, vec2 mean, int row, int tile, ivec2 tiles) {
   float low = float(row * tile) + 0.5 - mean.y, high = low + float(tile) - 1.0;
   low = clamp(low, -s.half_size.y, s.half_size.y);
   high = clamp(high, -s.half_size.y, s.half_size.y);
-  float slope = s.covariance.y / s.covariance.z;
-  float extreme = s.covariance.y / s.covariance.x * s.half_size.x; // dy where dx is largest
-  float at_right = clamp(extreme, low, high), at_left = clamp(-extreme, low, high);
-  float right = slope * at_right + sqrt(max(s.bound - at_right * at_right / s.covariance.z, 0.0) * s.narrow);
-  float left = slope * at_left - sqrt(max(s.bound - at_left * at_left / s.covariance.z, 0.0) * s.narrow);
-  // Near the tips the root's argument cancels to about 1e-7 bound: sqrt(1e-7) of the extent.
-  float slack = 1e-3 + 1e-3 * s.half_size.x;
+  float narrow = s.covariance.x, slope = s.covariance.y;
+  float at_right = clamp(s.tip, low, high), at_left = clamp(-s.tip, low, high);
+  float right = slope * at_right + sqrt(max(s.bound - at_right * at_right / s.covariance.z, 0.0) * narrow);
+  float left = slope * at_left - sqrt(max(s.bound - at_left * at_left / s.covariance.z, 0.0) * narrow);
+  // Near the tips the root's argument cancels to about 1e-7 bound: sqrt(1e-7) of the extent across. Along, the products
+  // with the slope, here and in the rasteriser, are rounded: some 1e-7 of the extent in x.
+  float slack = 1e-3 + 1e-3 * sqrt(max(s.bound, 0.0) * narrow) + 1e-6 * s.half_size.x;
   float x1 = clamp(mean.x + right + slack, -1e6, 1e6);
   float x0 = clamp(mean.x + left - slack, -1e6, 1e6);
   int c0 = max(int(ceil((x0 - float(tile) + 0.5) / float(tile))), 0);

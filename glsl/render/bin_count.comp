@@ -7,25 +7,16 @@ layout(local_size_x = 64) in;
 #include "thread.glsl"
 layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };       // [4] x, y, z of the dispatch; visible anchors
 layout(binding = 1, scalar) readonly buffer Mean { vec2 mean[]; };            // [slot] px
-layout(binding = 2, scalar) readonly buffer Covariance { vec3 covariance[]; }; // [slot] xx, xy, yy in px^2, 0.3 on the diagonal included
+layout(binding = 2, scalar) readonly buffer Covariance { vec3 covariance[]; }; // [slot] factored: variance of x given y, px^2; slope; variance of y, px^2
 layout(binding = 3, scalar) readonly buffer Depth { float depth[]; };         // [slot] camera z; 0 where the Gaussian does not exist
 layout(binding = 4, scalar) readonly buffer Opacity { float opacity[]; };     // [slot]
-layout(binding = 5, scalar) writeonly buffer Conic { vec3 conic[]; };         // [slot] inverse covariance xx, xy, yy in px^-2
+layout(binding = 5, scalar) writeonly buffer Conic { vec3 conic[]; };         // [slot] factored inverse: 1 / variance of x given y, px^-2; slope; 1 / variance of y, px^-2
 layout(binding = 6, scalar) writeonly buffer Tiles { uint tiles[]; };         // [slot] tiles touched
 layout(push_constant, scalar) uniform Push {
   uvec2 grid; // tiles in x and y
   uint tile;  // side of a tile, px
   uint offsets; // slots per visible anchor
 } push;
-
-// covariance = S + 0.3 I with S positive semi-definite, so det >= 0.3 (xx + yy) - 0.09: a bound that the rounded
-// difference of products can fall short of for long needles. The products' rounding errors are added back (Kahan).
-float determinant(vec3 c) {
-  precise float product = c.y * c.y;
-  precise float error = fma(-c.y, c.y, product);
-  precise float difference = fma(c.x, c.z, -product);
-  return max(difference + error, 0.3 * (c.x + c.z) - 0.09);
-}
 
 void main() {
   uint s = thread_index();
@@ -35,8 +26,9 @@ void main() {
   uint n = 0u;
   vec3 q = vec3(0.0);
   if (depth[s] > 0.0) {
-    q = vec3(c.z, -c.y, c.x) / determinant(c);
-    Support support = support_of(mean[s], c, q, o, int(push.tile), ivec2(push.grid));
+    // Both variances are at least 0.3 and at most 2^120: so are their reciprocals normal numbers.
+    q = vec3(1.0 / c.x, c.y, 1.0 / c.z);
+    Support support = support_of(mean[s], c, o, int(push.tile), ivec2(push.grid));
     for (int row = support.row0; row <= support.row1; row++) {
       ivec2 columns = support_columns(support, mean[s], row, int(push.tile), ivec2(push.grid));
       n += uint(max(columns.y - columns.x + 1, 0));

@@ -12,13 +12,12 @@ layout(binding = 2, scalar) readonly buffer Order { uint order[]; };            
 layout(binding = 3, scalar) readonly buffer RankFirst { uint rank_first[]; };   // [rank] first pair
 layout(binding = 4, scalar) readonly buffer Tiles { uint tiles[]; };            // [slot] tiles touched
 layout(binding = 5, scalar) readonly buffer Mean { vec2 mean[]; };              // [slot] px
-layout(binding = 6, scalar) readonly buffer Covariance { vec3 covariance[]; };  // [slot] px^2
-layout(binding = 7, scalar) readonly buffer Conic { vec3 conic[]; };            // [slot] px^-2
-layout(binding = 8, scalar) readonly buffer Opacity { float opacity[]; };       // [slot]
-layout(binding = 9, scalar) writeonly buffer FirstPair { uint first_pair[]; };  // [slot] first pair of a Gaussian
-layout(binding = 10, scalar) writeonly buffer PairTile { uint pair_tile[]; };   // [pair] tile, row-major
-layout(binding = 11, scalar) writeonly buffer PairIndex { uint pair_index[]; }; // [pair] the pair's own number
-layout(binding = 12, scalar) writeonly buffer PairSlot { uint pair_slot[]; };   // [pair] slot of its Gaussian
+layout(binding = 6, scalar) readonly buffer Covariance { vec3 covariance[]; };  // [slot] factored, px^2
+layout(binding = 7, scalar) readonly buffer Opacity { float opacity[]; };       // [slot]
+layout(binding = 8, scalar) writeonly buffer FirstPair { uint first_pair[]; };  // [slot] first pair of a Gaussian
+layout(binding = 9, scalar) writeonly buffer PairTile { uint pair_tile[]; };   // [pair] tile, row-major
+layout(binding = 10, scalar) writeonly buffer PairIndex { uint pair_index[]; }; // [pair] the pair's own number
+layout(binding = 11, scalar) writeonly buffer PairSlot { uint pair_slot[]; };   // [pair] slot of its Gaussian
 layout(push_constant, scalar) uniform Push {
   uvec2 grid; // tiles in x and y
   uint tile;  // side of a tile, px
@@ -30,7 +29,7 @@ void main() {
   uint p = rank_first[r];
   uint end = p + tiles[s];
   first_pair[s] = p;
-  Support support = support_of(mean[s], covariance[s], conic[s], opacity[s], int(push.tile), ivec2(push.grid));
+  Support support = support_of(mean[s], covariance[s], opacity[s], int(push.tile), ivec2(push.grid));
   for (int row = support.row0; row <= support.row1; row++) {
     ivec2 columns = support_columns(support, mean[s], row, int(push.tile), ivec2(push.grid));
     for (int column = columns.x; column <= columns.y && p < end; column++, p++) {

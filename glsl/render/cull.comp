@@ -12,7 +12,8 @@ layout(push_constant, scalar) uniform Push {
   vec3 rotation0;    // first row of R, world to camera
   vec3 rotation1;    // second row
   vec3 rotation2;    // third row
-  vec3 translation;  // t, world to camera
+  vec3 center;       // of the camera, world, rounded
+  vec3 center_low;   // the rest of it
   vec4 lens;         // fx fy cx cy, px
   vec4 distortion;   // k1 k2 p1 p2
   vec4 limits;       // lowest x y, highest x y at which the Jacobian is taken, normalised coordinates
@@ -25,7 +26,7 @@ void main() {
   uint anchor = thread_index();
   if (anchor >= push.anchors) return;
   Camera camera = CAMERA(push);
-  vec3 p = to_camera(camera, position[anchor]);
+  vec3 p = to_camera(camera, from_center(position[anchor], push.center, push.center_low));
   bool touches = in_front(camera, p);
   if (touches) {
     float inverse_z = 1.0 / p.z;

@@ -8,6 +8,7 @@ layout(constant_id = 0) const uint OFFSETS = 10u; // Gaussians per anchor
 #include "thread.glsl"
 #include "model.glsl"
 #include "decoder.glsl"
+#include "camera.glsl"
 layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };  // [4] x, y, z of the dispatch; visible anchors
 layout(binding = 1, scalar) readonly buffer Visible { uint visible[]; };                 // [V] anchors
 layout(binding = 2, scalar) readonly buffer AnchorPosition { vec3 anchor_position[]; };  // [N] world
@@ -15,12 +16,16 @@ layout(binding = 3, scalar) readonly buffer Offset { vec3 offset[]; };          
 layout(binding = 4, scalar) readonly buffer LogScaling { float log_scaling[]; };         // [N*6] of the offsets 3, of the Gaussians 3
 layout(binding = 5, scalar) readonly buffer Packed { vec4 packed[]; };                   // of decode_pack
 layout(binding = 6, scalar) readonly buffer Hidden { vec4 hidden[]; };                   // [V*24] of decode_hidden
-layout(binding = 7, scalar) writeonly buffer Position { vec3 position[]; };              // [V*K] world
+layout(binding = 7, scalar) writeonly buffer Position { vec3 position[]; };              // [V*K] seen from the camera's centre, world axes
 layout(binding = 8, scalar) writeonly buffer Opacity { float opacity[]; };               // [V*K] -1 to 1; the Gaussian exists where > 0
 layout(binding = 9, scalar) writeonly buffer Color { vec3 color[]; };                    // [V*K] 0 to 1
 layout(binding = 10, scalar) writeonly buffer Scale { vec3 scale[]; };                   // [V*K] standard deviations, world
 layout(binding = 11, scalar) writeonly buffer Rotation { vec4 rotation[]; };             // [V*K] unit quaternion w x y z
 layout(binding = 12, scalar) writeonly buffer RotationNorm { float rotation_norm[]; };   // [V*K] length of the quaternion before
+layout(push_constant, scalar) uniform Push {
+  vec3 center;     // of the camera, world, rounded
+  vec3 center_low; // the rest of it
+} push;
 float bias(uint row) {
   uint rows = head_row(3u, OFFSETS);
   return packed[FIRST_VEC4 + rows * ROW_VEC4 + row / 4u][row % 4u];
@@ -61,14 +66,15 @@ void main() {
   [[unroll]] for (uint a = 0u; a < TILE; ++a) {
     if (v + a >= n) return;
     uint slot = (v + a) * OFFSETS + k, anchor = visible[v + a], l = 6u * anchor;
-    vec3 spread = exp(vec3(log_scaling[l], log_scaling[l + 1u], log_scaling[l + 2u]));
-    vec3 size = exp(vec3(log_scaling[l + 3u], log_scaling[l + 4u], log_scaling[l + 5u]));
-    position[slot] = anchor_position[anchor] + offset[anchor * OFFSETS + k] * spread;
+    vec3 spread = exp_saturated(vec3(log_scaling[l], log_scaling[l + 1u], log_scaling[l + 2u]));
+    vec3 size = exp_saturated(vec3(log_scaling[l + 3u], log_scaling[l + 4u], log_scaling[l + 5u]));
+    // Added to the anchor as the camera sees it, an offset is not rounded to the grid of the world's coordinates.
+    position[slot] = from_center(anchor_position[anchor], push.center, push.center_low) + offset[anchor * OFFSETS + k] * spread;
     opacity[slot] = tanh_safe(o[a]);
     color[slot] = vec3(sigmoid(c[3u * a]), sigmoid(c[3u * a + 1u]), sigmoid(c[3u * a + 2u]));
     scale[slot] = size * vec3(sigmoid(q[7u * a]), sigmoid(q[7u * a + 1u]), sigmoid(q[7u * a + 2u]));
     vec4 raw = vec4(q[7u * a + 3u], q[7u * a + 4u], q[7u * a + 5u], q[7u * a + 6u]);
-    float norm = length(raw);
+    float norm = norm_of(raw);
     rotation[slot] = raw / max(norm, 1e-12); // a zero quaternion stays zero
     rotation_norm[slot] = norm;
   }

@@ -31,8 +31,8 @@ void main() {
   if (v >= groups[3]) return;
   uint anchor = visible[v], l = 6u * anchor, rows = head_row(3u, OFFSETS), to = v * (rows / 4u);
   uint color_row = head_row(1u, OFFSETS), cov_row = head_row(2u, OFFSETS);
-  vec3 spread = exp(vec3(log_scaling[l], log_scaling[l + 1u], log_scaling[l + 2u]));
-  vec3 size = exp(vec3(log_scaling[l + 3u], log_scaling[l + 4u], log_scaling[l + 5u]));
+  vec3 spread = exp_saturated(vec3(log_scaling[l], log_scaling[l + 1u], log_scaling[l + 2u]));
+  vec3 size = exp_saturated(vec3(log_scaling[l + 3u], log_scaling[l + 4u], log_scaling[l + 5u]));
   vec3 grad_spread = vec3(0.0), grad_size = vec3(0.0);
   for (uint k = 0u; k < OFFSETS; ++k) {
     uint slot = v * OFFSETS + k;

@@ -6,18 +6,17 @@ layout(local_size_x = 64) in;
 #include "thread.glsl"
 #include "camera.glsl"
 layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };            // [4] x, y, z of the dispatch; visible anchors
-layout(binding = 1, scalar) readonly buffer Position { vec3 position[]; };        // [slot] world
+layout(binding = 1, scalar) readonly buffer Position { vec3 position[]; };        // [slot] seen from the camera's centre, world axes
 layout(binding = 2, scalar) readonly buffer Scale { vec3 scale[]; };              // [slot] standard deviations, world
 layout(binding = 3, scalar) readonly buffer Rotation { vec4 rotation[]; };        // [slot] unit quaternion w x y z
 layout(binding = 4, scalar) readonly buffer Opacity { float opacity[]; };         // [slot] the Gaussian exists where > 0
 layout(binding = 5, scalar) writeonly buffer Mean { vec2 mean[]; };               // [slot] px
-layout(binding = 6, scalar) writeonly buffer Covariance { vec3 covariance[]; };   // [slot] xx xy yy, px^2, 0.3 added to xx and yy
+layout(binding = 6, scalar) writeonly buffer Covariance { vec3 covariance[]; };   // [slot] factored: variance of x given y, px^2; slope of x on y; variance of y, px^2
 layout(binding = 7, scalar) writeonly buffer Depth { float depth[]; };            // [slot] camera z; 0 where there is no Gaussian
 layout(push_constant, scalar) uniform Push {
   vec3 rotation0;    // first row of R, world to camera
   vec3 rotation1;    // second row
   vec3 rotation2;    // third row
-  vec3 translation;  // t, world to camera
   vec4 lens;         // fx fy cx cy, px
   vec4 distortion;   // k1 k2 p1 p2
   vec4 limits;       // lowest x y, highest x y at which the Jacobian is taken, normalised coordinates
@@ -42,12 +41,11 @@ void main() {
     vec3 row0, row1;
     perspective(camera, at, distort_jacobian(camera.distortion, at), row0, row1);
     mat3 q = rotation_matrix(rotation[slot]);
-    // Rows of J R Q S: the covariance is their Gram matrix, so that xx and yy are sums of squares.
-    vec3 u0 = (to_world(camera, row0 * inverse_z) * q) * scale[slot];
-    vec3 u1 = (to_world(camera, row1 * inverse_z) * q) * scale[slot];
-    v = vec3(dot(u0, u0) + DILATION, dot(u0, u1), dot(u1, u1) + DILATION);
+    vec3 s = scale[slot];
+    Axes axes = axes_of(to_world(camera, row0 * inverse_z), to_world(camera, row1 * inverse_z), q, s);
+    v = vec3(narrow_variance(axes, s), axes.slope, axes.variance);
     // Overflow and not-a-number, from the inputs or from z close to zero: no Gaussian.
-    if (!(finite(m.x) && finite(m.y) && finite(v.x) && finite(v.y) && finite(v.z) && finite(z))) {
+    if (!representable(m, axes, v.x, z)) {
       m = vec2(0.0);
       v = vec3(0.0);
       z = 0.0;

@@ -8,12 +8,12 @@ layout(local_size_x = 64) in;
 #include "thread.glsl"
 #include "camera.glsl"
 layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };                      // [4] x, y, z of the dispatch; visible anchors
-layout(binding = 1, scalar) readonly buffer Position { vec3 position[]; };                  // [slot] world
+layout(binding = 1, scalar) readonly buffer Position { vec3 position[]; };                  // [slot] seen from the camera's centre, world axes
 layout(binding = 2, scalar) readonly buffer Scale { vec3 scale[]; };                        // [slot] standard deviations, world
 layout(binding = 3, scalar) readonly buffer Rotation { vec4 rotation[]; };                  // [slot] unit quaternion w x y z
 layout(binding = 4, scalar) readonly buffer Depth { float depth[]; };                       // [slot] of `project`: 0 where there is no Gaussian
 layout(binding = 5, scalar) readonly buffer GradMean { vec2 grad_mean[]; };                 // [slot] per px
-layout(binding = 6, scalar) readonly buffer GradCovariance { vec3 grad_covariance[]; };     // [slot] of xx, xy (both entries together), yy
+layout(binding = 6, scalar) readonly buffer GradCovariance { vec3 grad_covariance[]; };     // [slot] of the factors: variance of x given y, slope, variance of y
 layout(binding = 7, scalar) writeonly buffer GradPosition { vec3 grad_position[]; };        // [slot] 0 where there is no Gaussian
 layout(binding = 8, scalar) writeonly buffer GradScale { vec3 grad_scale[]; };              // [slot] likewise
 layout(binding = 9, scalar) writeonly buffer GradRotation { vec4 grad_rotation[]; };       // [slot] of the quaternion as given, likewise
@@ -24,7 +24,6 @@ layout(push_constant, scalar) uniform Push {
   vec3 rotation0;    // first row of R, world to camera
   vec3 rotation1;    // second row
   vec3 rotation2;    // third row
-  vec3 translation;  // t, world to camera
   vec4 lens;         // fx fy cx cy, px
   vec4 distortion;   // k1 k2 p1 p2
   vec4 limits;       // lowest x y, highest x y at which the Jacobian is taken, normalised coordinates
@@ -55,11 +54,17 @@ void main() {
   vec3 t0 = to_world(camera, row0), t1 = to_world(camera, row1), s = scale[slot];
   vec4 quaternion = rotation[slot];
   mat3 q = rotation_matrix(quaternion);
-  vec3 u0 = (t0 * q) * s, u1 = (t1 * q) * s;
+  Axes axes = axes_of(t0, t1, q, s);
 
+  // With the residual r = s h = u0 - k u1: dN = 2 r (du0 - k du1) (N is the least over all slopes), V dk = u1 du0 +
+  // (r - k u1) du1. Of the scale's gradient m0 gu0 + m1 gu1 the large terms cancel on paper, not in float32.
   vec3 g = grad_covariance[slot];
-  vec3 gu0 = 2.0 * g.x * u0 + g.y * u1, gu1 = g.y * u0 + 2.0 * g.z * u1;
-  grad_scale[slot] = (t0 * q) * gu0 + (t1 * q) * gu1;
+  float g_slope = g.y / axes.variance;
+  vec3 h = residual(axes, s), r = s * h;
+  vec3 along = g_slope * r + 2.0 * g.z * axes.u1;
+  vec3 gu0 = 2.0 * g.x * r + g_slope * axes.u1, gu1 = along - axes.slope * gu0;
+  vec3 gs = 2.0 * (g.x * r * h + axes.m1 * (g_slope * r + g.z * axes.u1));
+  grad_scale[slot] = gs;
   // Column k of Q: its gradient is s_k (t0 gu0_k + t1 gu1_k).
   vec3 a = gu0 * s, b = gu1 * s;
   vec3 c0 = t0 * a.x + t1 * b.x, c1 = t0 * a.y + t1 * b.y, c2 = t0 * a.z + t1 * b.z;
@@ -75,7 +80,8 @@ void main() {
   vec3 e0 = j0 * (camera.lens.x * inverse_z), e1 = j1 * (camera.lens.y * inverse_z);
   vec3 gd = vec3(e0.x - e0.z * at.x, (e0.y - e0.z * at.y) + (e1.x - e1.z * at.x), e1.y - e1.z * at.y);
   vec2 g_at = -vec2(e0.z * d.x + e1.z * d.y, e0.z * d.y + e1.z * d.z) + distort_jacobian_backward(camera.distortion, at, gd);
-  float gz = -(dot(j0, row0) + dot(j1, row1)) * inverse_z;
+  // All rows of J are in proportion to 1/z, as is the Gaussian's size.
+  float gz = -dot(gs, s) * inverse_z;
 #ifndef COLOR_ONLY
   gz += grad_depth[slot];
 #endif

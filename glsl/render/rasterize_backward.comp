@@ -33,13 +33,13 @@ layout(binding = 0, scalar) readonly buffer Ranges { uvec2 ranges[]; };         
 layout(binding = 1, scalar) readonly buffer Sorted { uint sorted[]; };          // [pair] pair numbers by tile, nearest first
 layout(binding = 2, scalar) readonly buffer PairSlot { uint pair_slot[]; };     // [pair] slot of the Gaussian
 layout(binding = 3, scalar) readonly buffer Mean { vec2 mean[]; };              // [slot] px
-layout(binding = 4, scalar) readonly buffer Conic { vec3 conic[]; };            // [slot] px^-2
+layout(binding = 4, scalar) readonly buffer Conic { vec3 conic[]; };            // [slot] factored inverse covariance: 1/N px^-2, slope k, 1/V px^-2
 layout(binding = 5, scalar) readonly buffer Opacity { float opacity[]; };       // [slot]
 layout(binding = 6, scalar) readonly buffer Color { vec3 color[]; };            // [slot] linear rgb
 layout(binding = 7, scalar) readonly buffer Rgb { vec3 rgb[]; };                // [pixel] as rendered
 layout(binding = 8, scalar) readonly buffer GradRgb { vec3 grad_rgb[]; };       // [pixel]
 layout(binding = 9, scalar) writeonly buffer PairMean { vec2 pair_mean[]; };    // [pair] dL/d mean
-layout(binding = 10, scalar) writeonly buffer PairConic { vec3 pair_conic[]; }; // [pair] dL/d conic xx, xy, yy
+layout(binding = 10, scalar) writeonly buffer PairConic { vec3 pair_conic[]; }; // [pair] dL/d factors of the conic: 1/N, k, 1/V
 layout(binding = 11, scalar) writeonly buffer PairOpacity { float pair_opacity[]; }; // [pair] dL/d opacity
 layout(binding = 12, scalar) writeonly buffer PairColor { vec3 pair_color[]; }; // [pair] dL/d colour
 #ifdef WITH_DEPTH
@@ -64,7 +64,7 @@ float g_z[ROWS];
 bool live[ROWS];
 vec2 pixel; // centre of this thread's first pixel
 
-// Sums over this thread's pixels for one Gaussian: of gp, gp dx, gp dy, gp dx^2, gp dx dy, gp dy^2 (gp = dL/d exponent).
+// Sums over this thread's pixels for one Gaussian: of gp a, gp dy, gp a^2, gp a dy, gp dy^2 with a = dx - k dy (gp = dL/d exponent).
 struct Sums {
   vec2 first;
   vec3 second;
@@ -86,7 +86,8 @@ Sums sums_of(vec2 m, vec3 q, float o, vec3 c, float z) {
   float dx = pixel.x - m.x;
   [[unroll]] for (uint r = 0u; r < ROWS; r++) {
     float dy = pixel.y + float(r) - m.y;
-    precise float power = -0.5 * (q.x * dx * dx + q.z * dy * dy) - q.y * dx * dy;
+    precise float across = dx - q.y * dy;
+    precise float power = -0.5 * (q.x * across * across + q.z * dy * dy);
     float e = exp(power);
     float raw = o * e;
     float alpha = min(0.99, raw);
@@ -106,16 +107,19 @@ Sums sums_of(vec2 m, vec3 q, float o, vec3 c, float z) {
     g_alpha = hit && raw <= 0.99 ? g_alpha : 0.0; // the clamp at 0.99 passes no gradient
     s.opacity += g_alpha * e;
     float gp = g_alpha * raw;
-    s.first += gp * vec2(dx, dy);
-    s.second += gp * vec3(dx * dx, dx * dy, dy * dy);
+    // Squares overflow for pixels far from the largest Gaussians, where gp is 0: products from gp on.
+    vec2 gd = gp * vec2(across, dy);
+    s.first += gd;
+    s.second += vec3(gd.x * across, gd.x * dy, gd.y * dy);
     T[r] = hit ? after : T[r];
   }
   return s;
 }
 
 void write(uint p, vec3 q, Sums s) {
-  pair_mean[p] = vec2(q.x * s.first.x + q.y * s.first.y, q.y * s.first.x + q.z * s.first.y);
-  pair_conic[p] = vec3(-0.5 * s.second.x, -s.second.y, -0.5 * s.second.z);
+  float gx = q.x * s.first.x;
+  pair_mean[p] = vec2(gx, q.z * s.first.y - q.y * gx);
+  pair_conic[p] = vec3(-0.5 * s.second.x, q.x * s.second.y, -0.5 * s.second.z);
   pair_opacity[p] = s.opacity;
   pair_color[p] = s.color;
 #ifdef WITH_DEPTH

@@ -3,21 +3,21 @@
 #extension GL_GOOGLE_include_directive : require
 // variant color: COLOR_ONLY
 //
-// A Gaussian's gradients: the sum over its pairs, which lie one behind the other, and from the conic to the covariance:
-// with Q = C^-1 and G the gradient of Q (off-diagonal entry halved to make it symmetric), dL/dC = -Q G Q.
+// A Gaussian's gradients: the sum over its pairs, which lie one behind the other, and from the factors of the conic
+// (1/N, k, 1/V) to those of the covariance (N, k, V): dL/dN = -dL/d(1/N) / N^2.
 layout(local_size_x = 64) in;
 #include "thread.glsl"
 layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };       // [4] x, y, z of the dispatch; visible anchors
 layout(binding = 1, scalar) readonly buffer Tiles { uint tiles[]; };            // [slot] tiles touched
 layout(binding = 2, scalar) readonly buffer PairCount { uint pair_count[]; };   // [1] pairs; 0 when they do not fit
 layout(binding = 3, scalar) readonly buffer FirstPair { uint first_pair[]; };   // [slot] first pair
-layout(binding = 4, scalar) readonly buffer Conic { vec3 conic[]; };            // [slot] px^-2
+layout(binding = 4, scalar) readonly buffer Conic { vec3 conic[]; };            // [slot] factored inverse covariance
 layout(binding = 5, scalar) readonly buffer PairMean { vec2 pair_mean[]; };     // [pair]
 layout(binding = 6, scalar) readonly buffer PairConic { vec3 pair_conic[]; };   // [pair]
 layout(binding = 7, scalar) readonly buffer PairOpacity { float pair_opacity[]; }; // [pair]
 layout(binding = 8, scalar) readonly buffer PairColor { vec3 pair_color[]; };   // [pair]
 layout(binding = 9, scalar) writeonly buffer GradMean { vec2 grad_mean[]; };    // [slot] 1/px
-layout(binding = 10, scalar) writeonly buffer GradCovariance { vec3 grad_covariance[]; }; // [slot] of xx, the off-diagonal parameter, yy
+layout(binding = 10, scalar) writeonly buffer GradCovariance { vec3 grad_covariance[]; }; // [slot] of the factors
 layout(binding = 11, scalar) writeonly buffer GradOpacity { float grad_opacity[]; }; // [slot]
 layout(binding = 12, scalar) writeonly buffer GradColor { vec3 grad_color[]; }; // [slot]
 #ifndef COLOR_ONLY
@@ -45,12 +45,8 @@ void main() {
 #endif
   }
   vec3 q = conic[s];
-  float h = 0.5 * g.y;
-  // R = Q G, then -R Q; rows (q.x q.y; q.y q.z) and (g.x h; h g.z).
-  vec2 r0 = vec2(q.x * g.x + q.y * h, q.x * h + q.y * g.z);
-  vec2 r1 = vec2(q.y * g.x + q.z * h, q.y * h + q.z * g.z);
   grad_mean[s] = m;
-  grad_covariance[s] = -vec3(dot(r0, q.xy), dot(r0, q.yz) + dot(r1, q.xy), dot(r1, q.yz));
+  grad_covariance[s] = vec3(-(q.x * g.x) * q.x, g.y, -(q.z * g.z) * q.z);
   grad_opacity[s] = o;
   grad_color[s] = c;
 #ifndef COLOR_ONLY

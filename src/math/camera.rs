@@ -1,7 +1,12 @@
 //! Pinhole camera with COLMAP's OPENCV lens; EWA projection of a Gaussian and its gradient.
 //!
-//! World to camera is `p_camera = R p + t`; x right, y down, z forward. The covariance follows Zwicker et al. 2001
-//! ("EWA splatting"), `J R Sigma R^T J^T + 0.3 I`, with the lens in the Jacobian `J`.
+//! World to camera is `p_camera = R (p - c)`; x right, y down, z forward. The covariance follows Zwicker et al. 2001
+//! ("EWA splatting"), `C = J R Sigma R^T J^T + 0.3 I`, with the lens in the Jacobian `J`.
+//!
+//! It is kept factored, as (N, k, V): V = yy, k = xy / yy, N = det C / yy, so that
+//! `d^T C^-1 d = (dx - k dy)^2 / N + dy^2 / V`. With the rows u0, u1 of `U = J R Q S`, `det C = |u0 x u1|^2 +
+//! 0.3 (|u0|^2 + |u1|^2) + 0.09` (Cauchy and Binet), and the components of `u0 x u1` are those of `m0 x m1` times two
+//! of the three scales (m0, m1 the rows of `J R Q`): sums of squares without cancellation, whatever the axes' ratios.
 
 /// Added to the diagonal of a projected covariance, px^2: the low-pass of 3D Gaussian Splatting.
 pub const DILATION: f64 = 0.3;
@@ -44,8 +49,6 @@ impl Camera {
 pub struct Lens {
     /// World to camera, rows.
     pub rotation: [[f64; 3]; 3],
-    /// World to camera.
-    pub translation: [f64; 3],
     /// px.
     pub focal: [f64; 2],
     /// px.
@@ -65,7 +68,6 @@ impl Lens {
     pub fn new(camera: &Camera, near: f32) -> Self {
         Self {
             rotation: camera.rotation.map(|row| row.map(f64::from)),
-            translation: camera.translation.map(f64::from),
             focal: camera.focal.map(f64::from),
             principal: camera.principal.map(f64::from),
             distortion: camera.distortion.map(f64::from),
@@ -75,16 +77,16 @@ impl Lens {
         }
     }
 
-    /// `R p + t`.
+    /// `R p` of a point seen from the camera's centre.
     pub fn to_camera(&self, p: [f64; 3]) -> [f64; 3] {
-        std::array::from_fn(|i| dot(self.rotation[i], p) + self.translation[i])
+        self.rotation.map(|row| dot(row, p))
     }
 
-    /// `R p + t` in the kernels' float32 operations, for discrete decisions.
+    /// `R p` in the kernels' float32 operations, for discrete decisions.
     pub fn to_camera_f32(&self, p: [f32; 3]) -> [f32; 3] {
-        std::array::from_fn(|i| {
-            let r = self.rotation[i].map(|v| v as f32);
-            ((r[0] * p[0] + r[1] * p[1]) + r[2] * p[2]) + self.translation[i] as f32
+        self.rotation.map(|row| {
+            let r = row.map(|v| v as f32);
+            (r[0] * p[0] + r[1] * p[1]) + r[2] * p[2]
         })
     }
 
@@ -154,8 +156,23 @@ impl Lens {
     }
 }
 
+/// A point seen from the camera's centre, given as its rounded value and the rest, in the kernels' float32 operations.
+pub fn from_center(p: [f32; 3], [high, low]: [[f32; 3]; 2]) -> [f32; 3] {
+    std::array::from_fn(|i| (p[i] - high[i]) - low[i])
+}
+
+/// A float64 vector as its rounded value and the (rounded) rest.
+pub fn split(v: [f64; 3]) -> [[f32; 3]; 2] {
+    let high = v.map(|v| v as f32);
+    [high, std::array::from_fn(|i| (v[i] - f64::from(high[i])) as f32)]
+}
+
 fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
 /// A Gaussian on the picture.
@@ -163,10 +180,47 @@ fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
 pub struct Splat {
     /// px.
     pub mean: [f64; 2],
-    /// xx, xy, yy in px^2, [`DILATION`] included.
+    /// Factored, [`DILATION`] included: variance of x given y in px^2, slope of x on y, variance of y in px^2.
     pub covariance: [f64; 3],
     /// Camera z.
     pub depth: f64,
+}
+
+/// A factored covariance's entries xx, xy, yy.
+pub fn entries([narrow, slope, variance]: [f64; 3]) -> [f64; 3] {
+    [narrow + slope * slope * variance, slope * variance, variance]
+}
+
+/// The factors (N, k, V) of a covariance with the entries xx, xy, yy.
+pub fn factors([xx, xy, yy]: [f64; 3]) -> [f64; 3] {
+    [xx - xy * xy / yy, xy / yy, yy]
+}
+
+/// Gradient to the factors, given those of the entries xx, xy (both off-diagonal ones together), yy.
+pub fn entries_backward([_, slope, variance]: [f64; 3], [gxx, gxy, gyy]: [f64; 3]) -> [f64; 3] {
+    [gxx, 2.0 * slope * variance * gxx + variance * gxy, slope * slope * gxx + slope * gxy + gyy]
+}
+
+/// Gradient to the entries xx, xy (both together), yy, given those of the [`factors`].
+pub fn factors_backward([_, slope, variance]: [f64; 3], [gn, gk, gv]: [f64; 3]) -> [f64; 3] {
+    [gn, -2.0 * slope * gn + gk / variance, slope * slope * gn - slope * gk / variance + gv]
+}
+
+/// Largest standard deviation of a Gaussian on the picture and largest coordinate of its mean, px (2^60): there squares
+/// and quotients in float32 are finite. What is larger is absent.
+pub const MAX_DEVIATION: f64 = (1u64 << 60) as f64;
+
+impl Splat {
+    /// Within [`MAX_DEVIATION`], and all a number.
+    pub fn representable(&self) -> bool {
+        let [xx, _, yy] = entries(self.covariance);
+        let most = MAX_DEVIATION * MAX_DEVIATION;
+        self.mean.iter().all(|m| m.abs() <= MAX_DEVIATION)
+            && xx <= most
+            && yy <= most
+            && self.covariance[1].abs() <= most
+            && self.depth <= most
+    }
 }
 
 /// A Gaussian's gradients.
@@ -201,7 +255,43 @@ pub fn rotation_matrix_backward([w, x, y, z]: [f64; 4], g: [[f64; 3]; 3]) -> [f6
     ]
 }
 
-/// EWA projection. `bounds` are the clamped coordinates of the point at which the Jacobian is taken.
+/// A Gaussian's axes on the picture.
+struct Axes {
+    /// Rows of `J R Q`.
+    m: [[f64; 3]; 2],
+    /// Rows of `J R Q S`.
+    u: [[f64; 3]; 2],
+    /// `m0 x m1`.
+    n: [f64; 3],
+    variance: f64,
+    slope: f64,
+}
+
+impl Axes {
+    /// From the rows of `J R`.
+    fn new(t: [[f64; 3]; 2], q: &[[f64; 3]; 3], s: [f64; 3]) -> Self {
+        let m: [[f64; 3]; 2] = t.map(|t| std::array::from_fn(|k| (0..3).map(|i| t[i] * q[i][k]).sum()));
+        let u = m.map(|m| std::array::from_fn(|k| m[k] * s[k]));
+        let variance = dot(u[1], u[1]) + DILATION;
+        Self { m, u, n: cross(m[0], m[1]), variance, slope: dot(u[0], u[1]) / variance }
+    }
+
+    /// Variance of x given y.
+    fn narrow(&self, s: [f64; 3]) -> f64 {
+        let deviation = self.variance.sqrt();
+        let minors: [f64; 3] = std::array::from_fn(|i| s[(i + 1) % 3] * s[(i + 2) % 3] * self.n[i] / deviation);
+        DILATION + dot(minors, minors) + DILATION * dot(self.u[0], self.u[0]) / self.variance
+    }
+
+    /// `m0 - k m1 = (0.3 m0 + (s^2 m1) x n) / V`, without the cancellation.
+    fn residual(&self, s: [f64; 3]) -> [f64; 3] {
+        let turned = cross(std::array::from_fn(|i| s[i] * (self.u[1][i] / self.variance)), self.n);
+        std::array::from_fn(|i| DILATION / self.variance * self.m[0][i] + turned[i])
+    }
+}
+
+/// EWA projection of a Gaussian seen from the camera's centre. `bounds` are the clamped coordinates of the point at
+/// which the Jacobian is taken.
 pub fn project(
     lens: &Lens,
     position: [f64; 3],
@@ -214,10 +304,10 @@ pub fn project(
     let pixel = lens.distort(xy);
     let at = [bounds[0].unwrap_or(xy[0]), bounds[1].unwrap_or(xy[1])];
     let q = rotation_matrix(rotation);
-    let u = lens.jacobian(at, p[2]).map(|row| axes(lens.world_row(row), &q, scale));
+    let axes = Axes::new(lens.jacobian(at, p[2]).map(|row| lens.world_row(row)), &q, scale);
     Splat {
         mean: std::array::from_fn(|i| pixel[i] * lens.focal[i] + lens.principal[i]),
-        covariance: [dot(u[0], u[0]) + DILATION, dot(u[0], u[1]), dot(u[1], u[1]) + DILATION],
+        covariance: [axes.narrow(scale), axes.slope, axes.variance],
         depth: p[2],
     }
 }
@@ -227,12 +317,7 @@ pub fn three_sigma([xx, xy, yy]: [f64; 3]) -> f64 {
     3.0 * (0.5 * (xx + yy) + (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt()).sqrt()
 }
 
-/// `t Q diag(s)`.
-fn axes(t: [f64; 3], q: &[[f64; 3]; 3], s: [f64; 3]) -> [f64; 3] {
-    std::array::from_fn(|k| (0..3).map(|i| t[i] * q[i][k]).sum::<f64>() * s[k])
-}
-
-/// Gradient of [`project`]; `grad.covariance[1]` is that of both off-diagonal entries together.
+/// Gradient of [`project`]; `grad.covariance` is that of the factors.
 pub fn project_backward(
     lens: &Lens,
     position: [f64; 3],
@@ -246,18 +331,22 @@ pub fn project_backward(
     let xy = [p[0] / z, p[1] / z];
     let at = [bounds[0].unwrap_or(xy[0]), bounds[1].unwrap_or(xy[1])];
     let q = rotation_matrix(rotation);
-    let rows = lens.jacobian(at, z);
-    let t = rows.map(|row| lens.world_row(row));
-    let u = t.map(|row| axes(row, &q, scale));
-    let [gxx, gxy, gyy] = grad.covariance;
-    let gu: [[f64; 3]; 2] = [
-        std::array::from_fn(|k| 2.0 * gxx * u[0][k] + gxy * u[1][k]),
-        std::array::from_fn(|k| gxy * u[0][k] + 2.0 * gyy * u[1][k]),
-    ];
+    let t = lens.jacobian(at, z).map(|row| lens.world_row(row));
+    let axes = Axes::new(t, &q, scale);
+    let ([_, m1], [_, u1]) = (axes.m, axes.u);
+    // With r = u0 - k u1 = s h: dN = 2 r (du0 - k du1), V dk = u1 du0 + (r - k u1) du1.
+    let h = axes.residual(scale);
+    let r: [f64; 3] = std::array::from_fn(|k| scale[k] * h[k]);
+    let [g_narrow, g_slope, g_variance] = [grad.covariance[0], grad.covariance[1] / axes.variance, grad.covariance[2]];
+    let gu0: [f64; 3] = std::array::from_fn(|k| 2.0 * g_narrow * r[k] + g_slope * u1[k]);
+    let gu1 = std::array::from_fn(|k| g_slope * r[k] + 2.0 * g_variance * u1[k] - axes.slope * gu0[k]);
+    let gu = [gu0, gu1];
+    // m0 gu0 + m1 gu1, whose large terms cancel.
+    let grad_scale: [f64; 3] =
+        std::array::from_fn(|k| 2.0 * (g_narrow * r[k] * h[k] + m1[k] * (g_slope * r[k] + g_variance * u1[k])));
     // M = Q diag(s), u = t M.
     let grad_m: [[f64; 3]; 3] =
         std::array::from_fn(|i| std::array::from_fn(|k| t[0][i] * gu[0][k] + t[1][i] * gu[1][k]));
-    let grad_scale = std::array::from_fn(|k| (0..3).map(|i| grad_m[i][k] * q[i][k]).sum());
     let grad_q = grad_m.map(|row| std::array::from_fn(|k| row[k] * scale[k]));
     let grad_rows: [[f64; 3]; 2] = gu.map(|g| {
         let grad_t: [f64; 3] = std::array::from_fn(|i| (0..3).map(|k| g[k] * scale[k] * q[i][k]).sum());
@@ -274,8 +363,9 @@ pub fn project_backward(
             grad_d[i][j] = e[j] - e[2] * at[j];
             grad_at[j] -= e[2] * d[i][j];
         }
-        grad_z -= dot(grad_rows[i], rows[i]) / z;
     }
+    // All rows of J are in proportion to 1/z, as is the Gaussian's size.
+    grad_z -= dot(grad_scale, scale) / z;
     let through = lens.distort_jacobian_backward(at, [grad_d[0][0], grad_d[0][1] + grad_d[1][0], grad_d[1][1]]);
     let m = lens.distort_jacobian(xy);
     let gm = [grad.mean[0] * lens.focal[0], grad.mean[1] * lens.focal[1]];

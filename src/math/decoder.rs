@@ -78,9 +78,9 @@ impl Layout {
     }
 }
 
-/// The decoder's input: unit view direction and distance behind the feature. Without a distance there is no direction.
-pub fn input(feature: [f64; FEATURE], anchor: [f64; 3], center: [f64; 3]) -> [f64; INPUT] {
-    let view: [f64; 3] = std::array::from_fn(|i| anchor[i] - center[i]);
+/// The decoder's input: unit view direction and distance behind the feature, of an anchor seen from the camera's centre.
+/// Without a distance there is no direction.
+pub fn input(feature: [f64; FEATURE], view: [f64; 3]) -> [f64; INPUT] {
     let distance = view.iter().map(|v| v * v).sum::<f64>().sqrt();
     std::array::from_fn(|i| match i {
         0..32 => feature[i],
@@ -96,7 +96,7 @@ pub type Raw = [f64; 11];
 /// A neural Gaussian.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Gaussian {
-    /// World.
+    /// Seen from where the anchor is seen from.
     pub position: [f64; 3],
     /// -1 to 1; it exists where > 0.
     pub opacity: f64,
@@ -114,15 +114,23 @@ fn sigmoid(x: f64) -> f64 {
     1.0 / (1.0 + (-x).exp())
 }
 
+/// Logarithm of the largest float32: beyond it the kernels' exponential is that float.
+pub const EXP_LIMIT: f64 = 88.72283;
+
+/// The kernels' exponential of a log-scale: saturated at the largest float32, so that 0 times it is 0.
+pub fn exp_saturated(x: f64) -> f64 {
+    if x > EXP_LIMIT { f64::from(f32::MAX) } else { x.exp() }
+}
+
 /// The activations.
 pub fn activate(raw: Raw, anchor: [f64; 3], offset: [f64; 3], log_scaling: [f64; 6]) -> Gaussian {
     let q = [raw[7], raw[8], raw[9], raw[10]];
     let norm = q.iter().map(|v| v * v).sum::<f64>().sqrt();
     Gaussian {
-        position: std::array::from_fn(|i| anchor[i] + offset[i] * log_scaling[i].exp()),
+        position: std::array::from_fn(|i| anchor[i] + offset[i] * exp_saturated(log_scaling[i])),
         opacity: raw[0].tanh(),
         color: std::array::from_fn(|i| sigmoid(raw[1 + i])),
-        scale: std::array::from_fn(|i| log_scaling[3 + i].exp() * sigmoid(raw[4 + i])),
+        scale: std::array::from_fn(|i| exp_saturated(log_scaling[3 + i]) * sigmoid(raw[4 + i])),
         rotation: q.map(|v| v / norm.max(NORM_EPSILON)),
         norm,
     }
@@ -149,12 +157,12 @@ pub fn activate_backward(
     let mut g = ActivationGradient::default();
     g.raw[0] = grad.opacity * (1.0 - of.opacity * of.opacity);
     for i in 0..3 {
-        g.offset[i] = grad.position[i] * log_scaling[i].exp();
+        g.offset[i] = grad.position[i] * exp_saturated(log_scaling[i]);
         g.log_scaling[i] = g.offset[i] * offset[i];
         g.raw[1 + i] = grad.color[i] * of.color[i] * (1.0 - of.color[i]);
         g.log_scaling[3 + i] = grad.scale[i] * of.scale[i];
         // The sigmoid is scale / size; where the size underflowed to 0, so did the scale and its gradient.
-        let size = log_scaling[3 + i].exp().max(1e-37);
+        let size = exp_saturated(log_scaling[3 + i]).max(1e-37);
         g.raw[4 + i] = grad.scale[i] * of.scale[i] * (1.0 - of.scale[i] / size);
     }
     let along: f64 = (0..4).map(|i| of.rotation[i] * grad.rotation[i]).sum();
@@ -291,7 +299,7 @@ mod tests {
             .collect();
         let anchor = [0.3, -0.4, 0.5];
         let split = |rest: &[f64]| {
-            let x = input(std::array::from_fn(|i| rest[i]), anchor, [0.0, 0.2, -3.0]);
+            let x = input(std::array::from_fn(|i| rest[i]), [0.3, -0.6, 3.5]);
             let offset: Vec<[f64; 3]> = rest[32..41].chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect();
             (x, offset, std::array::from_fn(|i| rest[41 + i]))
         };

@@ -6,8 +6,8 @@
 pub struct Support {
     bound: f32,
     covariance: [f32; 3],
-    narrow: f32,
     half_size: [f32; 2],
+    tip: f32,
     /// First tile row.
     pub row0: i32,
     /// Last tile row; before the first when there is none.
@@ -19,31 +19,21 @@ pub fn support_bound(opacity: f32) -> f32 {
     2.0 * (255.0 * opacity).ln() * 1.0001 + 1e-3
 }
 
-/// Determinant of a covariance xx, xy, yy whose diagonal includes 0.3: at least 0.3 (xx + yy) - 0.09.
-pub fn determinant(c: [f32; 3]) -> f32 {
-    let product = c[1] * c[1];
-    let error = (-c[1]).mul_add(c[1], product);
-    (c[0].mul_add(c[2], -product) + error).max(0.3 * (c[0] + c[2]) - 0.09)
-}
-
-/// Inverse covariance xx, xy, yy.
-pub fn conic(c: [f32; 3]) -> [f32; 3] {
-    let det = determinant(c);
-    [c[2] / det, -c[1] / det, c[0] / det]
-}
-
 impl Support {
-    /// Of a Gaussian (mean px, covariance px^2, conic px^-2) on a grid of square tiles.
-    pub fn new(mean: [f32; 2], covariance: [f32; 3], conic: [f32; 3], opacity: f32, tile: u32, grid: [u32; 2]) -> Self {
+    /// Of a Gaussian (mean px, factored covariance px^2) on a grid of square tiles.
+    pub fn new(mean: [f32; 2], covariance: [f32; 3], opacity: f32, tile: u32, grid: [u32; 2]) -> Self {
         let bound = support_bound(opacity);
-        let half_size = [covariance[0], covariance[2]].map(|v| (bound.max(0.0) * v).sqrt());
+        let [narrow, slope, variance] = covariance;
+        let xy = slope * variance;
+        let xx = narrow + slope * xy;
+        let half_size = [xx, variance].map(|v| (bound.max(0.0) * v).sqrt());
         let side = tile as f32;
         let low = (mean[1] - half_size[1]).clamp(-1e6, 1e6);
         let high = (mean[1] + half_size[1]).clamp(-1e6, 1e6);
         let row0 = (((low - side + 0.5) / side).ceil() as i32).max(0);
         let row1 = (((high - 0.5) / side).floor() as i32).min(grid[1] as i32 - 1);
         let row1 = if bound >= 0.0 { row1 } else { row0 - 1 };
-        Self { bound, covariance, narrow: 1.0 / conic[0], half_size, row0, row1 }
+        Self { bound, covariance, half_size, tip: xy / xx * half_size[0], row0, row1 }
     }
 
     /// First and last tile column of a tile row.
@@ -53,13 +43,12 @@ impl Support {
         let high = low + side - 1.0;
         let [hx, hy] = self.half_size;
         let (low, high) = (low.max(-hy).min(hy), high.max(-hy).min(hy));
-        let [xx, xy, yy] = self.covariance;
-        let extreme = xy / xx * hx;
-        let (at_right, at_left) = (extreme.max(low).min(high), (-extreme).max(low).min(high));
-        let root = |at: f32| ((self.bound - at * at / yy).max(0.0) * self.narrow).sqrt();
-        let right = xy / yy * at_right + root(at_right);
-        let left = xy / yy * at_left - root(at_left);
-        let slack = 1e-3 + 1e-3 * hx;
+        let [narrow, slope, variance] = self.covariance;
+        let (at_right, at_left) = (self.tip.max(low).min(high), (-self.tip).max(low).min(high));
+        let root = |at: f32| ((self.bound - at * at / variance).max(0.0) * narrow).sqrt();
+        let right = slope * at_right + root(at_right);
+        let left = slope * at_left - root(at_left);
+        let slack = 1e-3 + 1e-3 * (self.bound.max(0.0) * narrow).sqrt() + 1e-6 * hx;
         let x1 = (mean[0] + right + slack).clamp(-1e6, 1e6);
         let x0 = (mean[0] + left - slack).clamp(-1e6, 1e6);
         let c0 = (((x0 - side + 0.5) / side).ceil() as i32).max(0);
@@ -81,6 +70,7 @@ impl Support {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::math::camera::factors;
     use proptest::prelude::*;
 
     proptest! {
@@ -93,14 +83,16 @@ mod tests {
             let (s, c) = angle.sin_cos();
             let (a2, b2) = (a * a, b * b);
             let covariance = [c * c * a2 + s * s * b2 + 0.3, c * s * (a2 - b2), s * s * a2 + c * c * b2 + 0.3];
-            let q = conic(covariance);
+            let covariance = factors(covariance.map(f64::from)).map(|v| v as f32);
+            let [narrow, slope, variance] = covariance;
             let size = [97u32, 83];
             let grid = size.map(|n| n.div_ceil(tile));
-            let found = Support::new([mx, my], covariance, q, opacity, tile, grid).tiles([mx, my], tile, grid);
+            let found = Support::new([mx, my], covariance, opacity, tile, grid).tiles([mx, my], tile, grid);
             for y in 0..grid[1] * tile {
                 for x in 0..grid[0] * tile {
                     let (dx, dy) = (x as f32 + 0.5 - mx, y as f32 + 0.5 - my);
-                    let power = -0.5 * (q[0] * dx * dx + q[2] * dy * dy) - q[1] * dx * dy;
+                    let across = dx - slope * dy;
+                    let power = -0.5 * (across * across / narrow + dy * dy / variance);
                     if opacity * power.exp() >= 1.0 / 255.0 {
                         let t = y / tile * grid[0] + x / tile;
                         prop_assert!(found.contains(&t), "pixel {x},{y} of tile {t} is missed by {found:?}");

@@ -6,7 +6,7 @@
 use super::rasterize::Projected;
 use crate::gpu::kernels::render::{bin_count, bin_depth_keys, bin_expand, bin_ranges, bin_rank};
 use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
-use crate::math::tiles::{Support, conic};
+use crate::math::tiles::Support;
 use crate::primitives::compact::Compact;
 use crate::primitives::limit::{Counter, Limits};
 use crate::primitives::scan::Scan;
@@ -18,9 +18,8 @@ impl Reference for bin_count::Kernel {
         for s in 0..(host.groups[3] * push.offsets) as usize {
             (host.conic[s], host.tiles[s]) = if host.depth[s] > 0.0 {
                 let (m, c) = (host.mean[s], host.covariance[s]);
-                let q = conic(c);
-                let support = Support::new(m, c, q, host.opacity[s], push.tile, push.grid);
-                (q, support.tiles(m, push.tile, push.grid).len() as u32)
+                let support = Support::new(m, c, host.opacity[s], push.tile, push.grid);
+                ([1.0 / c[0], c[1], 1.0 / c[2]], support.tiles(m, push.tile, push.grid).len() as u32)
             } else {
                 ([0.0; 3], 0)
             };
@@ -59,8 +58,7 @@ impl Reference for bin_expand::Kernel {
         for r in 0..host.drawn_count[0] as usize {
             let slot = host.order[r];
             let s = slot as usize;
-            let support =
-                Support::new(host.mean[s], host.covariance[s], host.conic[s], host.opacity[s], push.tile, push.grid);
+            let support = Support::new(host.mean[s], host.covariance[s], host.opacity[s], push.tile, push.grid);
             let found = support.tiles(host.mean[s], push.tile, push.grid);
             let first = host.rank_first[r];
             host.first_pair[s] = first;
@@ -129,7 +127,7 @@ impl Tiling {
 /// The lists of a picture's tiles.
 #[derive(Clone, Copy)]
 pub struct Binned<'a> {
-    /// `[slot]` inverse covariance, px^-2.
+    /// `[slot]` factored inverse covariance: 1 / variance of x given y, slope, 1 / variance of y.
     pub conic: &'a Buffer<[f32; 3]>,
     /// `[slot]` tiles touched.
     pub tiles: &'a Buffer<u32>,
@@ -262,7 +260,6 @@ impl Bin {
             tiles,
             mean,
             covariance,
-            conic,
             opacity,
             first_pair,
             pair_tile,

@@ -8,23 +8,26 @@
 use super::project::{camera_push, lens};
 use crate::gpu::kernels::render::cull;
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
-use crate::math::camera::{Camera, Lens, project, three_sigma};
+use crate::math::camera::{Camera, Lens, entries, from_center, project, split, three_sigma};
 
 /// Push constants of `cull` for so many anchors.
 pub fn push(camera: &Camera, near: f32, anchors: u32) -> cull::Push {
-    camera_push!(cull::Push, camera, near, size: camera.size, anchors: anchors)
+    let [center, center_low] = split(camera.center());
+    camera_push!(
+        cull::Push, camera, near, center: center, center_low: center_low, size: camera.size, anchors: anchors
+    )
 }
 
 impl Reference for cull::Kernel {
     fn reference(host: cull::Host<'_>, push: cull::Push, (): ()) {
         let lens: Lens = lens!(push);
         for anchor in 0..push.anchors as usize {
-            let p = lens.to_camera_f32(host.position[anchor]);
+            let seen = from_center(host.position[anchor], [push.center, push.center_low]);
+            let p = lens.to_camera_f32(seen);
             let touches = lens.in_front(p) && {
                 let scale = std::array::from_fn(|i| f64::from(host.log_scaling[6 * anchor + i]).exp());
-                let position = host.position[anchor].map(f64::from);
-                let splat = project(&lens, position, scale, [1.0, 0.0, 0.0, 0.0], lens.bounds(p));
-                let radius = three_sigma(splat.covariance);
+                let splat = project(&lens, seen.map(f64::from), scale, [1.0, 0.0, 0.0, 0.0], lens.bounds(p));
+                let radius = three_sigma(entries(splat.covariance));
                 (0..2).all(|i| {
                     let beyond = splat.mean[i] + radius < 0.0 || splat.mean[i] - radius > f64::from(push.size[i]);
                     !beyond

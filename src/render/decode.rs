@@ -14,6 +14,7 @@ use crate::gpu::kernels::render::{
     decode_backward_second, decode_backward_weights, decode_hidden, decode_input, decode_pack,
 };
 use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
+use crate::math::camera::{from_center, split};
 use crate::math::decoder::{
     FEATURE, Gaussian, HEADS, HIDDEN, INPUT, Layout, activate, activate_backward, input, outputs_of,
 };
@@ -97,7 +98,8 @@ impl Reference for decode_input::Kernel {
         for v in 0..host.groups[3] as usize {
             let anchor = host.visible[v] as usize;
             let feature = std::array::from_fn(|i| host.feature[FEATURE * anchor + i].into());
-            let x = input(feature, wide(host.position[anchor]), wide(push.center));
+            let seen = from_center(host.position[anchor], [push.center, push.center_low]);
+            let x = input(feature, wide(seen));
             let to = &mut host.inputs.as_flattened_mut()[v * Layout::PADDED_INPUT..][..Layout::PADDED_INPUT];
             to.fill(0.0);
             to[..INPUT].copy_from_slice(&narrow(x));
@@ -126,12 +128,13 @@ impl Reference for decode_hidden::Kernel {
 }
 
 impl Reference for decode::Kernel {
-    fn reference(host: decode::Host<'_>, (): (), constants: decode::Constants) {
+    fn reference(host: decode::Host<'_>, push: decode::Push, constants: decode::Constants) {
         let layout = Layout { offsets: constants.offsets as usize };
         let (packed, hidden) = (host.packed.as_flattened(), host.hidden.as_flattened());
         let second = 4 * FIRST_VEC4;
         for v in 0..host.groups[3] as usize {
             let anchor = host.visible[v] as usize;
+            let seen = from_center(host.anchor_position[anchor], [push.center, push.center_low]);
             for k in 0..layout.offsets {
                 let mut raw = [0.0; 11];
                 for (at, (head, output)) in outputs_of(k).enumerate() {
@@ -145,7 +148,7 @@ impl Reference for decode::Kernel {
                 }
                 let slot = v * layout.offsets + k;
                 let offset = wide(host.offset[anchor * layout.offsets + k]);
-                let g = activate(raw, wide(host.anchor_position[anchor]), offset, six(host.log_scaling, anchor));
+                let g = activate(raw, wide(seen), offset, six(host.log_scaling, anchor));
                 host.position[slot] = narrow(g.position);
                 host.opacity[slot] = g.opacity as f32;
                 host.color[slot] = narrow(g.color);
@@ -377,7 +380,7 @@ pub struct AnchorGradients<'a> {
 /// The forward stage. Slot `s = v K + k` is Gaussian `k` of visible anchor `v`.
 #[derive(Debug)]
 pub struct Decode {
-    /// World, \[slot\].
+    /// Seen from the camera's centre, world axes, \[slot\].
     pub position: Buffer<[f32; 3]>,
     /// -1 to 1; the Gaussian exists where > 0, \[slot\].
     pub opacity: Buffer<f32>,
@@ -441,7 +444,8 @@ impl Decode {
 
     /// Records the decoding of the first `visible_count` anchors of the visible list for a camera centre (world).
     /// More than the capacity are not decoded.
-    pub fn record(&self, rec: &mut Recorder<'_>, anchors: Anchors<'_>, visible_count: &Buffer<u32>, center: [f32; 3]) {
+    pub fn record(&self, rec: &mut Recorder<'_>, anchors: Anchors<'_>, visible_count: &Buffer<u32>, center: [f64; 3]) {
+        let [center, center_low] = split(center);
         for counted in [&self.per_anchor, &self.per_tile] {
             counted.record(rec, visible_count, self.capacity);
         }
@@ -456,7 +460,7 @@ impl Decode {
             feature: anchors.feature,
             inputs: &self.inputs,
         };
-        rec.run(decode_input::Kernel, buffers, decode_input::Push { center }, groups);
+        rec.run(decode_input::Kernel, buffers, decode_input::Push { center, center_low }, groups);
         let groups = &self.per_tile.groups;
         let buffers = decode_hidden::Buffers {
             groups: &groups.buffer,
@@ -480,7 +484,13 @@ impl Decode {
             rotation: &self.rotation,
             rotation_norm: &self.rotation_norm,
         };
-        rec.run_with(decode::Kernel, decode::Constants { offsets }, buffers, (), groups);
+        rec.run_with(
+            decode::Kernel,
+            decode::Constants { offsets },
+            buffers,
+            decode::Push { center, center_low },
+            groups,
+        );
     }
 }
 
@@ -602,7 +612,7 @@ mod tests {
         log_scaling: Vec<f32>,
         weights: Vec<f32>,
         visible: Vec<u32>,
-        center: [f32; 3],
+        center: [f64; 3],
     }
 
     fn random<const C: usize>(rng: &mut Pcg64, n: usize, low: f32, high: f32) -> Vec<[f32; C]> {
@@ -679,7 +689,8 @@ mod tests {
                 feature: m.feature.clone(),
                 inputs: unwritten(count * INPUT_VEC4 + 3),
             };
-            let push = decode_input::Push { center: m.center };
+            let [center, center_low] = split(m.center);
+            let push = decode_input::Push { center, center_low };
             let inputs = twin(decode_input::Kernel, &gpu, (), case, push, count).inputs;
             let case = decode_hidden::Arrays {
                 groups: m.counted(),
@@ -705,7 +716,14 @@ mod tests {
                 rotation_norm: vec![testing::UNWRITTEN; slots + 3],
             };
             let constants = decode::Constants { offsets: k };
-            let forward = twin(decode::Kernel, &gpu, constants, case, (), count.div_ceil(8) * offsets);
+            let forward = twin(
+                decode::Kernel,
+                &gpu,
+                constants,
+                case,
+                decode::Push { center, center_low },
+                count.div_ceil(8) * offsets,
+            );
 
             let case = decode_backward::Arrays {
                 groups: m.counted(),
@@ -910,8 +928,9 @@ mod tests {
             for (v, &anchor) in m.visible.iter().enumerate() {
                 let a = anchor as usize;
                 let row: [f64; FEATURE] = std::array::from_fn(|i| m.feature[FEATURE * a + i].into());
-                let (at, ls) = (wide(m.position[a]), six(&m.log_scaling, a));
-                let x = input(row, at, wide(m.center));
+                let at: [f64; 3] = std::array::from_fn(|i| f64::from(m.position[a][i]) - m.center[i]);
+                let ls = six(&m.log_scaling, a);
+                let x = input(row, at);
                 let o: Vec<[f64; 3]> = m.offset[a * offsets..][..offsets].iter().map(|o| wide(*o)).collect();
                 for g in decoder::decode(layout, &weights, &x, at, &o, ls) {
                     outputs[0].extend(g.position);
@@ -968,10 +987,11 @@ mod tests {
     fn a_camera_on_an_anchor_sees_no_direction() {
         let gpu = testing::gpu();
         let mut m = model(&mut Pcg64::seed_from_u64(7), 2, 10);
-        m.position[m.visible[1] as usize] = m.center;
+        m.center = m.center.map(|v| (v as f32).into());
+        m.position[m.visible[1] as usize] = m.center.map(|v| v as f32);
         let results = run(&gpu, &m, &mut Pcg64::seed_from_u64(8), 2, 0.0, None);
         assert!(results.outputs.iter().chain(&results.gradients).all(|(_, v)| v.iter().all(|x| x.is_finite())));
-        let x = input([0.5; FEATURE], [1.0; 3], [1.0; 3]);
+        let x = input([0.5; FEATURE], [0.0; 3]);
         assert_eq!(x[32..], [0.0; 4]);
     }
 

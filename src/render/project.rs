@@ -2,7 +2,9 @@
 //!
 //! A Gaussian is absent (depth 0, everything else 0) where its opacity is not positive, where it is not beyond the
 //! near plane, where its centre lies beyond the radius at which the lens polynomial folds back
-//! ([`Camera::max_radius2`]), or where the result is not finite.
+//! ([`Camera::max_radius2`]), or where the result is not a number or beyond [`MAX_DEVIATION`](crate::math::camera::MAX_DEVIATION).
+//!
+//! Positions are seen from the camera's centre, covariances are factored: see [`crate::math::camera`].
 
 use crate::gpu::kernels::render::{project, project_backward, project_backward_color};
 use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
@@ -22,7 +24,6 @@ macro_rules! camera_push {
             rotation0: camera.rotation[0],
             rotation1: camera.rotation[1],
             rotation2: camera.rotation[2],
-            translation: camera.translation,
             lens: [fx, fy, cx, cy],
             distortion: camera.distortion,
             limits: camera.limits(),
@@ -40,7 +41,6 @@ macro_rules! lens {
         let [fx, fy, cx, cy] = push.lens.map(f64::from);
         $crate::math::camera::Lens {
             rotation: [push.rotation0, push.rotation1, push.rotation2].map(|row| row.map(f64::from)),
-            translation: push.translation.map(f64::from),
             focal: [fx, fy],
             principal: [cx, cy],
             distortion: push.distortion.map(f64::from),
@@ -82,8 +82,7 @@ impl Reference for project::Kernel {
                 let [scale, at] = [host.scale[s], position].map(|v| v.map(f64::from));
                 splat = project_one(&lens, at, scale, host.rotation[s].map(f64::from), lens.bounds(p));
             }
-            let numbers = splat.mean.into_iter().chain(splat.covariance).chain([splat.depth]);
-            if !numbers.into_iter().all(|v| (v as f32).is_finite()) {
+            if !splat.representable() {
                 splat = Splat::default();
             }
             host.mean[s] = splat.mean.map(|v| v as f32);
@@ -134,7 +133,7 @@ backward_twin!(project_backward_color);
 /// What [`Project::record`] reads: one element per slot.
 #[derive(Clone, Copy)]
 pub struct Gaussians<'a> {
-    /// World.
+    /// Seen from the camera's centre, world axes.
     pub position: &'a Buffer<[f32; 3]>,
     /// Standard deviations, world.
     pub scale: &'a Buffer<[f32; 3]>,
@@ -149,7 +148,7 @@ pub struct Gaussians<'a> {
 pub struct SplatGradients<'a> {
     /// Per px.
     pub mean: &'a Buffer<[f32; 2]>,
-    /// xx, xy (both entries together), yy; per px^2.
+    /// Of the factors of the covariance: variance of x given y, slope, variance of y.
     pub covariance: &'a Buffer<[f32; 3]>,
     /// Per scene unit; without losses that look at depth there is none.
     pub depth: Option<&'a Buffer<f32>>,
@@ -160,7 +159,7 @@ pub struct SplatGradients<'a> {
 pub struct Project {
     /// px, \[slot\].
     pub mean: Buffer<[f32; 2]>,
-    /// xx xy yy, px^2, \[slot\].
+    /// Factored: variance of x given y in px^2, slope of x on y, variance of y in px^2, \[slot\].
     pub covariance: Buffer<[f32; 3]>,
     /// Camera z; 0 where there is no Gaussian, \[slot\].
     pub depth: Buffer<f32>,
@@ -290,6 +289,9 @@ mod tests {
     /// Gaussians around the view, some behind the camera, some beyond the limits; every seventh without opacity.
     fn case(rng: &mut Pcg64, slots: usize, spare: usize) -> project::Arrays {
         let n = slots + spare;
+        // World coordinates around the origin, as the camera sees them.
+        let center = camera([0.0; 4]).center();
+        let seen = |p: [f32; 3]| std::array::from_fn(|i| (f64::from(p[i]) - center[i]) as f32);
         let vec3 =
             |rng: &mut Pcg64, low: f32, high: f32| -> [f32; 3] { std::array::from_fn(|_| uniform(rng, low, high)) };
         let quaternion = |rng: &mut Pcg64| {
@@ -299,7 +301,7 @@ mod tests {
         };
         project::Arrays {
             groups: vec![1, 1, 1, slots as u32],
-            position: (0..n).map(|_| vec3(rng, -3.0, 3.0)).collect(),
+            position: (0..n).map(|_| seen(vec3(rng, -3.0, 3.0))).collect(),
             scale: (0..n).map(|_| vec3(rng, -12.0, 1.5).map(f32::exp)).collect(),
             rotation: (0..n).map(|_| quaternion(rng)).collect(),
             opacity: (0..n).map(|i| if i % 7 == 3 { -0.1 } else { 0.5 }).collect(),

@@ -1,6 +1,7 @@
 //! Rasterisation: tiles of Gaussians blended front to back, and back again.
 //!
-//! alpha = min(0.99, opacity exp(-1/2 d^T Q d)); a sample with alpha < 1/255 is skipped; a pixel is finished before the
+//! alpha = min(0.99, opacity exp(-1/2 d^T C^-1 d)), with `d^T C^-1 d = (dx - k dy)^2 / N + dy^2 / V` from the factored
+//! covariance; a sample with alpha < 1/255 is skipped; a pixel is finished before the
 //! Gaussian that would bring its transmittance below 1e-4 (3D Gaussian Splatting, section 4). Depth is the sum of
 //! z alpha T, not divided by coverage. The support of a Gaussian is exactly {alpha >= 1/255}, so the picture does not
 //! depend on the tiles.
@@ -22,7 +23,8 @@ pub const TRANSMITTANCE_MIN: f64 = 1e-4;
 
 /// One sample of a Gaussian at a pixel: what forward and backward twins share. The decisions are float32 operations.
 struct Sample {
-    dx: f64,
+    /// dx - k dy.
+    across: f64,
     dy: f64,
     exponential: f64,
     raw: f64,
@@ -32,13 +34,15 @@ struct Sample {
 
 fn sample(pixel: [f32; 2], mean: [f32; 2], conic: [f32; 3], opacity: f32) -> Sample {
     let (dx, dy) = (pixel[0] - mean[0], pixel[1] - mean[1]);
-    let power = -0.5 * (conic[0] * dx * dx + conic[2] * dy * dy) - conic[1] * dx * dy;
+    let across = dx - conic[1] * dy;
+    let power = -0.5 * (conic[0] * across * across + conic[2] * dy * dy);
     let visible = (opacity * power.exp()).min(0.99) >= 1.0 / 255.0;
-    let [xx, xy, yy] = conic.map(f64::from);
+    let [inverse_narrow, slope, inverse_variance] = conic.map(f64::from);
     let (dx, dy) = (f64::from(pixel[0]) - f64::from(mean[0]), f64::from(pixel[1]) - f64::from(mean[1]));
-    let exponential = (-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy).exp();
+    let across = dx - slope * dy;
+    let exponential = (-0.5 * (inverse_narrow * across * across + inverse_variance * dy * dy)).exp();
     let raw = f64::from(opacity) * exponential;
-    Sample { dx, dy, exponential, raw, alpha: raw.min(ALPHA_MAX), visible }
+    Sample { across, dy, exponential, raw, alpha: raw.min(ALPHA_MAX), visible }
 }
 
 /// The Gaussians in screen space and their lists, as a twin sees them.
@@ -173,11 +177,12 @@ fn backward(
                 let alpha = if s.raw <= ALPHA_MAX { before * v - remaining / (1.0 - s.alpha) } else { 0.0 };
                 pair.opacity += alpha * s.exponential;
                 let power = alpha * s.raw;
-                let [xx, xy, yy] = splats.conic[slot].map(f64::from);
-                pair.mean[0] += power * (xx * s.dx + xy * s.dy);
-                pair.mean[1] += power * (xy * s.dx + yy * s.dy);
-                pair.conic[0] -= 0.5 * power * s.dx * s.dx;
-                pair.conic[1] -= power * s.dx * s.dy;
+                let [inverse_narrow, slope, inverse_variance] = splats.conic[slot].map(f64::from);
+                let g_across = power * inverse_narrow * s.across;
+                pair.mean[0] += g_across;
+                pair.mean[1] += power * inverse_variance * s.dy - slope * g_across;
+                pair.conic[0] -= 0.5 * power * s.across * s.across;
+                pair.conic[1] += g_across * s.dy;
                 pair.conic[2] -= 0.5 * power * s.dy * s.dy;
             });
         }
@@ -244,14 +249,9 @@ macro_rules! gather_twin {
                     let pairs = first..first + n;
                     let sum = |f: &dyn Fn(usize) -> f32| pairs.clone().map(|p| f64::from(f(p))).sum::<f64>();
                     let g: [f64; 3] = std::array::from_fn(|c| sum(&|p| host.pair_conic[p][c]));
-                    let [xx, xy, yy] = host.conic[s].map(f64::from);
-                    let q = [[xx, xy], [xy, yy]];
-                    let g = [[g[0], 0.5 * g[1]], [0.5 * g[1], g[2]]];
-                    let at = |i: usize, j: usize| -> f64 {
-                        -(0..2).flat_map(|a| (0..2).map(move |b| (a, b))).map(|(a, b)| q[i][a] * g[a][b] * q[b][j]).sum::<f64>()
-                    };
+                    let [a, _, b] = host.conic[s].map(f64::from);
                     host.grad_mean[s] = std::array::from_fn(|c| sum(&|p| host.pair_mean[p][c]) as f32);
-                    host.grad_covariance[s] = [at(0, 0) as f32, (at(0, 1) + at(1, 0)) as f32, at(1, 1) as f32];
+                    host.grad_covariance[s] = [(-a * a * g[0]) as f32, g[1] as f32, (-b * b * g[2]) as f32];
                     host.grad_opacity[s] = sum(&|p| host.pair_opacity[p]) as f32;
                     host.grad_color[s] = std::array::from_fn(|c| sum(&|p| host.pair_color[p][c]) as f32);
                     $(host.$depth[s] = sum(&|p| host.pair_depth[p]) as f32;)?
@@ -276,7 +276,7 @@ pub struct Projected<'a> {
     pub offsets: u32,
     /// `[slot]` px.
     pub mean: &'a Buffer<[f32; 2]>,
-    /// `[slot]` xx, xy, yy in px^2.
+    /// `[slot]` factored: variance of x given y in px^2, slope of x on y, variance of y in px^2.
     pub covariance: &'a Buffer<[f32; 3]>,
     /// `[slot]` camera z, 0 where there is no Gaussian.
     pub depth: &'a Buffer<f32>,
@@ -517,7 +517,8 @@ impl Backward {
 mod tests {
     use super::*;
     use crate::gpu::testing::{self, UNWRITTEN};
-    use crate::math::tiles::{Support, conic};
+    use crate::math::camera::factors;
+    use crate::math::tiles::Support;
     use rand::{RngExt, SeedableRng};
 
     /// Random Gaussians in screen space, binned on the host.
@@ -545,11 +546,9 @@ mod tests {
                 (rng.random_range(0f32..3.2), rng.random_range(0.3..largest), rng.random_range(0.3..largest));
             let (sin, cos) = angle.sin_cos();
             let (a, b) = (a * a, b * b);
-            s.covariance.push([
-                cos * cos * a + sin * sin * b + 0.3,
-                cos * sin * (a - b),
-                sin * sin * a + cos * cos * b + 0.3,
-            ]);
+            let entries =
+                [cos * cos * a + sin * sin * b + 0.3, cos * sin * (a - b), sin * sin * a + cos * cos * b + 0.3];
+            s.covariance.push(factors(entries.map(f64::from)).map(|v| v as f32));
             s.mean.push(std::array::from_fn(|i| rng.random_range(-4.0..size[i] as f32 + 4.0)));
             s.opacity.push(rng.random_range(0.05..0.999));
             s.color.push(std::array::from_fn(|_| rng.random_range(0.0..1.0)));
@@ -558,11 +557,10 @@ mod tests {
         let mut order: Vec<usize> = (0..n).collect();
         order.sort_by(|&a, &b| s.depth[a].total_cmp(&s.depth[b]));
         (s.tiles, s.first_pair) = (vec![0; n], vec![0; n]);
-        s.conic = s.covariance.iter().map(|&c| conic(c)).collect();
+        s.conic = s.covariance.iter().map(|&[n, k, v]| [1.0 / n, k, 1.0 / v]).collect();
         let mut pairs = vec![];
         for slot in order {
-            let support =
-                Support::new(s.mean[slot], s.covariance[slot], s.conic[slot], s.opacity[slot], tiling.side(), grid);
+            let support = Support::new(s.mean[slot], s.covariance[slot], s.opacity[slot], tiling.side(), grid);
             let found = support.tiles(s.mean[slot], tiling.side(), grid);
             s.first_pair[slot] = pairs.len() as u32;
             s.tiles[slot] = found.len() as u32;

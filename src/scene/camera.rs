@@ -9,8 +9,8 @@
 pub struct Camera {
     /// R, row-major: `rotation[i]` is the i-th camera axis in world coordinates.
     pub rotation: [[f32; 3]; 3],
-    /// t.
-    pub translation: [f32; 3],
+    /// t, in float64: the centre of a camera far from the world's origin must not be rounded to float32.
+    pub translation: [f64; 3],
     /// fx, fy in pixels.
     pub focal: [f32; 2],
     /// cx, cy in pixels.
@@ -22,10 +22,22 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// The camera's position in the world, `-R^T t`.
-    pub fn center(&self) -> [f32; 3] {
-        let (r, t) = (&self.rotation, &self.translation);
-        std::array::from_fn(|i| -(0..3).map(|k| f64::from(r[k][i]) * f64::from(t[k])).sum::<f64>() as f32)
+    /// The camera's position c in the world: `R c + t = 0` for the rotation as it is, whose float32 rows are orthogonal
+    /// only to 2^-24. `-R^T t` would be off by that much of `|t|`.
+    pub fn center(&self) -> [f64; 3] {
+        let [a, b, c] = self.rotation.map(|row| row.map(f64::from));
+        let cross = |a: [f64; 3], b: [f64; 3]| {
+            [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+        };
+        // The inverse of a matrix with rows a, b, c has the columns b x c, c x a, a x b over their triple product.
+        let columns = [cross(b, c), cross(c, a), cross(a, b)];
+        let triple: f64 = (0..3).map(|i| a[i] * columns[0][i]).sum();
+        std::array::from_fn(|i| -(0..3).map(|k| columns[k][i] * self.translation[k]).sum::<f64>() / triple)
+    }
+
+    /// The translation that puts a camera with such a (rounded) rotation at `center`.
+    pub fn translation_to(rotation: &[[f32; 3]; 3], center: [f64; 3]) -> [f64; 3] {
+        rotation.map(|row| -(0..3).map(|k| f64::from(row[k]) * center[k]).sum::<f64>())
     }
 
     /// The same camera for the same picture resampled to `to` = (width, height): focal lengths and principal point are
@@ -39,7 +51,7 @@ impl Camera {
     /// World to camera coordinates; the last component is the depth z.
     pub fn to_camera(&self, point: [f64; 3]) -> [f64; 3] {
         std::array::from_fn(|i| {
-            f64::from(self.translation[i]) + (0..3).map(|k| f64::from(self.rotation[i][k]) * point[k]).sum::<f64>()
+            self.translation[i] + (0..3).map(|k| f64::from(self.rotation[i][k]) * point[k]).sum::<f64>()
         })
     }
 

@@ -405,7 +405,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
 
 /// 1.1 x the largest distance of a camera from the mean camera; `None` if they all coincide.
 fn radius(train: &[View]) -> Option<f32> {
-    let centers: Vec<[f64; 3]> = train.iter().map(|v| v.camera.center().map(f64::from)).collect();
+    let centers: Vec<[f64; 3]> = train.iter().map(|v| v.camera.center()).collect();
     let mean: [f64; 3] = std::array::from_fn(|i| centers.iter().map(|c| c[i]).sum::<f64>() / centers.len() as f64);
     let distance = |c: &[f64; 3]| (0..3).map(|i| (c[i] - mean[i]).powi(2)).sum::<f64>().sqrt();
     let largest = 1.1 * centers.iter().map(distance).fold(0.0, f64::max);
@@ -568,9 +568,12 @@ impl Reader<'_> {
             Some((path, kind)) => Some(priors::read(path, *kind, picture, size)?),
         };
         let ratio: [f64; 2] = std::array::from_fn(|i| f64::from(size[i]) / f64::from(intrinsics.size[i]));
+        // The centre is kept, not the translation: rounding the rotation must not move a camera far from the origin.
+        let rotation = pose.rotation.map(|row| row.map(|v| v as f32));
+        let center = std::array::from_fn(|i| -(0..3).map(|k| pose.rotation[k][i] * pose.translation[k]).sum::<f64>());
         let camera = Camera {
-            rotation: pose.rotation.map(|row| row.map(|v| v as f32)),
-            translation: pose.translation.map(|v| v as f32),
+            rotation,
+            translation: Camera::translation_to(&rotation, center),
             focal: std::array::from_fn(|i| (intrinsics.focal[i] * ratio[i]) as f32),
             principal: std::array::from_fn(|i| (intrinsics.principal[i] * ratio[i]) as f32),
             distortion: intrinsics.distortion.map(|v| v as f32),

@@ -123,7 +123,7 @@ impl Average {
 }
 
 fn center(camera: &Camera) -> DVec3 {
-    DVec3::from_array(camera.center().map(f64::from))
+    DVec3::from_array(camera.center())
 }
 
 fn direction(camera: &Camera) -> DVec3 {
@@ -143,12 +143,11 @@ fn upright(ahead: DVec3, up: DVec3) -> DMat3 {
 
 fn look(eye: DVec3, focus: DVec3, up: DVec3, lens: &Camera) -> Camera {
     let axes = upright((focus - eye).normalize_or(DVec3::Z), up);
-    let rotation = axes.transpose();
-    let translation = -(rotation * eye);
     let row = |axis: DVec3| axis.to_array().map(|v| v as f32);
+    let rotation = [row(axes.x_axis), row(axes.y_axis), row(axes.z_axis)];
     Camera {
-        rotation: [row(axes.x_axis), row(axes.y_axis), row(axes.z_axis)],
-        translation: translation.to_array().map(|v| v as f32),
+        rotation,
+        translation: Camera::translation_to(&rotation, eye.to_array()),
         focal: lens.focal,
         principal: lens.size.map(|side| side as f32 / 2.0),
         distortion: [0.0; 4],

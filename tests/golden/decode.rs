@@ -24,7 +24,7 @@ fn decode() {
         let flat = gpu.upload("weights", &flat).expect(fine);
         let visible = gpu.upload("visible", &(0..n as u32).collect::<Vec<_>>()).expect(fine);
         let count = gpu.upload("visible_count", &[n as u32]).expect(fine);
-        let center: [f32; 3] = case.vectors("camera_center")[0];
+        let center = case.vectors::<3>("camera_center")[0].map(f64::from);
         let grad = (
             upload3("upstream position", "upstream.position"),
             upload("upstream opacity", "upstream.opacity"),
@@ -70,7 +70,10 @@ fn decode() {
         let check = Check { relative: bound, absolute: bound, band: 0.0 };
         let read3 = |b: &Buffer<[f32; 3]>| gpu.read(b).expect(fine).into_flattened();
         let read = |b: &Buffer<f32>| gpu.read(b).expect(fine);
-        case.compare("position", &read3(&forward.position), check);
+        // The decoder's positions are seen from the camera.
+        let seen: Vec<f64> =
+            case.f64("position").chunks_exact(3).flat_map(|p| [0, 1, 2].map(|i| p[i] - center[i])).collect();
+        case.compare_with("position", &read3(&forward.position), &seen, check);
         case.compare("opacity", &read(&forward.opacity), check);
         case.compare("color", &read3(&forward.color), check);
         case.compare("scale", &read3(&forward.scale), check);

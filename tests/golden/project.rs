@@ -2,7 +2,7 @@
 
 use gscream_vk::gpu::kernels::render::{project, project_backward};
 use gscream_vk::gpu::{Check, testing};
-use gscream_vk::math::camera::Camera;
+use gscream_vk::math::camera::{Camera, entries, entries_backward};
 use gscream_vk::render::project as stage;
 
 use crate::support::{Case, cases};
@@ -13,7 +13,7 @@ pub fn camera(case: &Case, prefix: &str) -> Camera {
     let t = case.vectors::<3>(&format!("{prefix}.t"));
     Camera {
         rotation: [r[0], r[1], r[2]],
-        translation: t[0],
+        translation: t[0].map(f64::from),
         focal: [i[0], i[1]],
         principal: [i[2], i[3]],
         distortion: [i[4], i[5], i[6], i[7]],
@@ -26,14 +26,23 @@ fn symmetric(flat: &[f64], sum: bool) -> Vec<f64> {
     flat.chunks_exact(4).flat_map(|m| [m[0], if sum { m[1] + m[2] } else { m[1] }, m[3]]).collect()
 }
 
+fn narrow(v: [f64; 3]) -> [f32; 3] {
+    v.map(|v| v as f32)
+}
+
 #[test]
 fn project() {
     let gpu = testing::gpu();
     for case in cases("project") {
         let (camera, n) = (camera(&case, "camera"), case.shape("position")[0]);
+        let center = camera.center();
         let arrays = project::Arrays {
             groups: vec![1, 1, 1, n as u32],
-            position: case.vectors("position"),
+            position: case
+                .vectors::<3>("position")
+                .into_iter()
+                .map(|p| std::array::from_fn(|i| (f64::from(p[i]) - center[i]) as f32))
+                .collect(),
             scale: case.vectors("scale"),
             rotation: case.vectors("rotation"),
             opacity: vec![1.0; n],
@@ -47,12 +56,8 @@ fn project() {
         let check = |binding| <project::Kernel as gscream_vk::gpu::Reference>::check(binding);
         let backward_check = |binding| <project_backward::Kernel as gscream_vk::gpu::Reference>::check(binding);
         case.compare("mean", forward.mean.as_flattened(), check("mean"));
-        case.compare_with(
-            "covariance",
-            forward.covariance.as_flattened(),
-            &symmetric(&case.f64("covariance"), false),
-            check("covariance"),
-        );
+        let covariance: Vec<f32> = forward.covariance.iter().flat_map(|c| narrow(entries(c.map(f64::from)))).collect();
+        case.compare_with("covariance", &covariance, &symmetric(&case.f64("covariance"), false), check("covariance"));
         case.compare("depth", &forward.depth, check("depth"));
         let upstream = symmetric(&case.f64("upstream.covariance"), true);
         let arrays = project_backward::Arrays {
@@ -62,7 +67,11 @@ fn project() {
             rotation: arrays.rotation,
             depth: forward.depth,
             grad_mean: case.vectors("upstream.mean"),
-            grad_covariance: upstream.chunks_exact(3).map(|c| [c[0] as f32, c[1] as f32, c[2] as f32]).collect(),
+            grad_covariance: upstream
+                .chunks_exact(3)
+                .zip(&forward.covariance)
+                .map(|(g, c)| narrow(entries_backward(c.map(f64::from), [g[0], g[1], g[2]])))
+                .collect(),
             grad_depth: case.f32("upstream.depth"),
             grad_position: vec![[testing::UNWRITTEN; 3]; n],
             grad_scale: vec![[testing::UNWRITTEN; 3]; n],

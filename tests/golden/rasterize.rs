@@ -1,6 +1,7 @@
 //! Golden cases of kind `rasterize`: binning, blending and its gradients, on every tiling the device can run.
 
 use gscream_vk::gpu::{Check, testing};
+use gscream_vk::math::camera::{factors, factors_backward};
 use gscream_vk::primitives::dispatch;
 use gscream_vk::primitives::limit::Limits;
 use gscream_vk::render::bin::{Bin, Tiling};
@@ -63,6 +64,10 @@ fn compare(case: &Case, tensor: &str, got: &[f32], want: &[f64], band: &[bool], 
     case.compare_with(tensor, &got, &want, check);
 }
 
+fn narrow(v: [f64; 3]) -> [f32; 3] {
+    v.map(|v| v as f32)
+}
+
 #[test]
 fn rasterize() {
     let gpu = testing::gpu();
@@ -74,8 +79,12 @@ fn rasterize() {
             let pixels = (size[0] * size[1]) as usize;
             let mean = gpu.upload("mean", &case.vectors::<2>("mean")).unwrap();
             let n = mean.len() as u32;
-            let covariance: Vec<[f32; 3]> =
-                case.vectors::<4>("covariance").into_iter().map(|[a, b, _, c]| [a, b, c]).collect();
+            let covariance: Vec<[f32; 3]> = case
+                .vectors::<4>("covariance")
+                .into_iter()
+                .map(|[a, b, _, c]| narrow(factors([a, b, c].map(f64::from))))
+                .collect();
+            let factored = covariance.clone();
             let covariance = gpu.upload("covariance", &covariance).unwrap();
             let depth = gpu.upload("depth", &case.f32("depth")).unwrap();
             let opacity = gpu.upload("opacity", &case.f32("opacity")).unwrap();
@@ -131,6 +140,11 @@ fn rasterize() {
             let want: Vec<f64> =
                 case.f64("grad.covariance").chunks_exact(4).flat_map(|c| [c[0], c[1] + c[2], c[3]]).collect();
             let got = gpu.read(&backward.grad_covariance).unwrap();
+            let got: Vec<[f32; 3]> = got
+                .iter()
+                .zip(&factored)
+                .map(|(g, c)| narrow(factors_backward(c.map(f64::from), g.map(f64::from))))
+                .collect();
             compare(&case, "grad.covariance", got.as_flattened(), &want, &touched, check);
             let got = gpu.read(&backward.grad_opacity).unwrap();
             compare(&case, "grad.opacity", &got, &case.f64("grad.opacity"), &touched, check);

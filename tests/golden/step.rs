@@ -15,7 +15,7 @@ fn camera(case: &Case, view: usize) -> Camera {
     let [rotation, intrinsics] = [at("R"), at("intrinsics")];
     Camera {
         rotation: std::array::from_fn(|i| std::array::from_fn(|j| rotation[3 * i + j])),
-        translation: at("t").try_into().expect("three components"),
+        translation: std::array::from_fn(|i| f64::from(at("t")[i])),
         focal: [intrinsics[0], intrinsics[1]],
         principal: [intrinsics[2], intrinsics[3]],
         distortion: std::array::from_fn(|i| intrinsics[4 + i]),
