@@ -3,6 +3,8 @@
 //! Each case states its guarantee in words; `run` fails where it does not hold. The table of all of them is a golden file
 //! (`tests/snapshots/extreme__guarantees.snap`), so that a weaker guarantee is a line of a diff.
 
+mod project;
+
 use gscream_vk::gpu::{Gpu, testing};
 use libtest_mimic::{Arguments, Trial};
 
@@ -20,7 +22,7 @@ pub struct Case {
 
 /// Every case.
 fn cases() -> Vec<&'static Case> {
-    let stages: [&[Case]; 0] = [];
+    let stages: [&[Case]; _] = [project::CASES];
     stages.into_iter().flatten().collect()
 }
 
