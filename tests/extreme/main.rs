@@ -4,6 +4,7 @@
 //! (`tests/snapshots/extreme__guarantees.snap`), so that a weaker guarantee is a line of a diff.
 
 mod project;
+mod screen;
 
 use gscream_vk::gpu::{Gpu, testing};
 use libtest_mimic::{Arguments, Trial};
@@ -22,7 +23,7 @@ pub struct Case {
 
 /// Every case.
 fn cases() -> Vec<&'static Case> {
-    let stages: [&[Case]; _] = [project::CASES];
+    let stages: [&[Case]; _] = [project::CASES, screen::CASES];
     stages.into_iter().flatten().collect()
 }
 
