@@ -36,9 +36,10 @@ void main() {
   vec3 grad_spread = vec3(0.0), grad_size = vec3(0.0);
   for (uint k = 0u; k < OFFSETS; ++k) {
     uint slot = v * OFFSETS + k;
-    vec3 along = grad_position[slot] * spread;
-    grad_offset[anchor * OFFSETS + k] = along;
-    grad_spread += along * offset[anchor * OFFSETS + k];
+    vec3 gp = grad_position[slot];
+    grad_offset[anchor * OFFSETS + k] = gp * spread;
+    // By the displacement, which is finite where there is a Gaussian: the gradient of an offset of 0 may overflow, this not.
+    grad_spread += gp * (offset[anchor * OFFSETS + k] * spread);
     float o = opacity[slot];
     put(to, k, grad_opacity[slot] * ((1.0 - o) * (1.0 + o)));
     vec3 c = color[slot], gc = grad_color[slot] * c * (1.0 - c);

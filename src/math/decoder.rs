@@ -157,8 +157,9 @@ pub fn activate_backward(
     let mut g = ActivationGradient::default();
     g.raw[0] = grad.opacity * (1.0 - of.opacity * of.opacity);
     for i in 0..3 {
-        g.offset[i] = grad.position[i] * exp_saturated(log_scaling[i]);
-        g.log_scaling[i] = g.offset[i] * offset[i];
+        let spread = exp_saturated(log_scaling[i]);
+        g.offset[i] = grad.position[i] * spread;
+        g.log_scaling[i] = grad.position[i] * (offset[i] * spread);
         g.raw[1 + i] = grad.color[i] * of.color[i] * (1.0 - of.color[i]);
         g.log_scaling[3 + i] = grad.scale[i] * of.scale[i];
         // The sigmoid is scale / size; where the size underflowed to 0, so did the scale and its gradient.

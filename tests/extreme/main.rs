@@ -3,6 +3,8 @@
 //! Each case states its guarantee in words; `run` fails where it does not hold. The table of all of them is a golden file
 //! (`tests/snapshots/extreme__guarantees.snap`), so that a weaker guarantee is a line of a diff.
 
+mod decode;
+mod picture;
 mod project;
 mod screen;
 
@@ -23,7 +25,7 @@ pub struct Case {
 
 /// Every case.
 fn cases() -> Vec<&'static Case> {
-    let stages: [&[Case]; _] = [project::CASES, screen::CASES];
+    let stages: [&[Case]; _] = [project::CASES, screen::CASES, decode::CASES, picture::CASES];
     stages.into_iter().flatten().collect()
 }
 

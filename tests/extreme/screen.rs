@@ -77,13 +77,13 @@ pub const CASES: &[Case] = &[
 
 /// Gaussians in screen space.
 #[derive(Clone, Default)]
-struct Splats {
-    mean: Vec<[f32; 2]>,
+pub struct Splats {
+    pub mean: Vec<[f32; 2]>,
     /// Factored.
-    covariance: Vec<[f32; 3]>,
-    depth: Vec<f32>,
-    opacity: Vec<f32>,
-    color: Vec<[f32; 3]>,
+    pub covariance: Vec<[f32; 3]>,
+    pub depth: Vec<f32>,
+    pub opacity: Vec<f32>,
+    pub color: Vec<[f32; 3]>,
 }
 
 impl Splats {
@@ -102,7 +102,7 @@ impl Splats {
     }
 }
 
-const BACKGROUND: [f32; 3] = [0.1, 0.7, 0.4];
+pub const BACKGROUND: [f32; 3] = [0.1, 0.7, 0.4];
 
 /// Upstream gradient of a pixel: of colour, depth and transmittance, each at most 1 but for the depth's, which is in
 /// units of the depth.
@@ -126,7 +126,7 @@ struct Drawn {
     lists: Vec<Vec<u32>>,
 }
 
-fn tilings(gpu: &Gpu) -> &'static [Tiling] {
+pub fn tilings(gpu: &Gpu) -> &'static [Tiling] {
     if gpu.info().subgroup_size == 8 { &[Tiling::Wide, Tiling::Narrow] } else { &[Tiling::Wide] }
 }
 
@@ -214,7 +214,7 @@ impl Sum {
 /// A Gaussian's gradients: mean 2, covariance 3, opacity, color 3, depth.
 type Gradients = [Sum; 10];
 
-struct Exact {
+pub struct Exact {
     /// Per pixel: rgb 3, depth in units of the farthest, transmittance.
     values: Vec<[f64; 5]>,
     bounds: Vec<f64>,
@@ -235,7 +235,7 @@ struct Sample {
     dy: f64,
 }
 
-fn exact(size: [u32; 2], splats: &Splats) -> Exact {
+pub fn exact(size: [u32; 2], splats: &Splats) -> Exact {
     let order = splats.order();
     let farthest = splats.depth.iter().fold(1f32, |m, v| m.max(*v));
     let mut gradients: Vec<Option<Gradients>> = vec![Some(Gradients::default()); splats.mean.len()];
@@ -364,17 +364,29 @@ fn exact(size: [u32; 2], splats: &Splats) -> Exact {
     Exact { values, bounds, gradients, blended }
 }
 
-/// Compares a drawing with the exact one; returns the share of Gaussians whose gradients were compared.
-fn assert_close(got: &Drawn, want: &Exact, splats: &Splats, what: &str) -> f64 {
+/// Compares a picture with the exact one.
+pub fn assert_pixels(
+    rgb: &[[f32; 3]],
+    depth: &[f32],
+    transmittance: &[f32],
+    want: &Exact,
+    splats: &Splats,
+    what: &str,
+) {
     let farthest = f64::from(splats.depth.iter().fold(1f32, |m, v| m.max(*v)));
     for (p, (value, bound)) in want.values.iter().zip(&want.bounds).enumerate() {
-        let [r, g, b] = got.rgb[p].map(f64::from);
-        let found = [r, g, b, f64::from(got.depth[p]) / farthest, got.transmittance[p].into()];
+        let [r, g, b] = rgb[p].map(f64::from);
+        let found = [r, g, b, f64::from(depth[p]) / farthest, transmittance[p].into()];
         for (found, value) in found.iter().zip(value) {
             let error = (found - value).abs();
             assert!(error <= *bound, "{what}: pixel {p}: {found} instead of {value}, beyond {bound:e}");
         }
     }
+}
+
+/// Compares a drawing with the exact one; returns the share of Gaussians whose gradients were compared.
+fn assert_close(got: &Drawn, want: &Exact, splats: &Splats, what: &str) -> f64 {
+    assert_pixels(&got.rgb, &got.depth, &got.transmittance, want, splats, what);
     let mut compared = 0;
     for (s, gradients) in want.gradients.iter().enumerate() {
         let (m, c, k) = (got.grad_mean[s], got.grad_covariance[s], got.grad_color[s]);
