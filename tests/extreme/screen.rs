@@ -408,6 +408,15 @@ fn assert_close(got: &Drawn, want: &Exact, splats: &Splats, what: &str) -> f64 {
     compared as f64 / want.gradients.len().max(1) as f64
 }
 
+/// A support that ends too early would show as a tile's edge.
+fn assert_same(pictures: &[Drawn], what: &str) {
+    for pair in pictures.windows(2) {
+        for (p, (a, b)) in pair[0].rgb.iter().zip(&pair[1].rgb).enumerate() {
+            assert!(a == b, "{what}: pixel {p} is {a:?} with wide and {b:?} with narrow tiles");
+        }
+    }
+}
+
 fn color(rng: &mut Pcg64Mcg) -> [f32; 3] {
     std::array::from_fn(|_| rng.random_range(0.0..1.0))
 }
@@ -447,11 +456,14 @@ fn needles(gpu: &Gpu) {
     let worst = want.bounds.iter().fold(0.0f64, |m, b| m.max(*b));
     let usual = want.bounds.iter().sum::<f64>() / want.bounds.len() as f64;
     assert!(usual < 0.02, "the bounds say nothing: {usual} on average, {worst} at most");
+    let mut pictures = vec![];
     for &tiling in tilings(gpu) {
         let got = draw(gpu, tiling, size, &splats, 60 * 1024);
         let share = assert_close(&got, &want, &splats, &format!("{tiling:?}"));
         assert!(share > 0.2, "{tiling:?}: gradients of {share} compared, bounds {worst:e} at most");
+        pictures.push(got);
     }
+    assert_same(&pictures, "needles");
 }
 
 fn stack(gpu: &Gpu) {
@@ -570,7 +582,9 @@ fn enormous(gpu: &Gpu) {
             color(&mut rng),
         );
     }
-    // The corners of what the projection lets through, and tiles' edges far away.
+    // The corners of what the projection lets through, and tiles' edges far away. With the steepest slope dx - k dy is 2^65
+    // at some pixels of the mean's own tile: its square overflows.
+    splats.push([20.5, 13.5], [0.3, 2.1e18, 0.3], 2.0, 0.4, color(&mut rng));
     for covariance in [
         [0.3, most as f32, 0.3],
         [0.3, 0.0, 2f32.powi(120)],
@@ -582,12 +596,15 @@ fn enormous(gpu: &Gpu) {
         }
     }
     let want = exact(size, &splats);
+    let mut pictures = vec![];
     for &tiling in tilings(gpu) {
-        let got = draw(gpu, tiling, size, &splats, 424 * 24);
+        let got = draw(gpu, tiling, size, &splats, 425 * 24);
         let drawn: std::collections::HashSet<u32> = got.lists.iter().flatten().copied().collect();
         assert!(drawn.len() > 40, "{} drawn: the case tests too little", drawn.len());
         assert_close(&got, &want, &splats, &format!("{tiling:?}"));
+        pictures.push(got);
     }
+    assert_same(&pictures, "enormous");
 }
 
 fn few(gpu: &Gpu) {
@@ -631,9 +648,12 @@ fn shapes(gpu: &Gpu) {
             splats.push(mean, covariance, rng.random_range(1.0..9.0), rng.random_range(0.05..1.0), color(&mut rng));
         }
         let want = exact(size, &splats);
+        let mut pictures = vec![];
         for &tiling in tilings(gpu) {
             let got = draw(gpu, tiling, size, &splats, 60 * 4096);
             assert_close(&got, &want, &splats, &format!("{size:?}, {tiling:?}"));
+            pictures.push(got);
         }
+        assert_same(&pictures, &format!("{size:?}"));
     }
 }
