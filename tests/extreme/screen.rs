@@ -45,6 +45,12 @@ pub const CASES: &[Case] = &[
     },
     Case {
         stage: "bin, rasterize",
+        case: "samples on the edge of a support and of a tile",
+        guarantee: "the same picture to the bit whatever the tiles: culling decides no pixel",
+        run: rims,
+    },
+    Case {
+        stage: "bin, rasterize",
         case: "a million pairs in one tile",
         guarantee: "the list is a stable sort by depth; picture and gradients within the bounds",
         run: crowded,
@@ -513,6 +519,34 @@ fn edge(gpu: &Gpu) {
             }
             assert!(got.rgb.iter().flatten().chain(&got.depth).all(|v| v.is_finite()), "{what}");
         }
+    }
+}
+
+fn rims(gpu: &Gpu) {
+    let mut rng = Pcg64Mcg::seed_from_u64(7);
+    let (mut tall, mut broad) = (Splats::default(), Splats::default());
+    for i in 0..250 {
+        let (narrow, opacity, dx) = loop {
+            let (narrow, opacity) = (rng.random_range(0.3f32..20.0), rng.random_range(0.004f32..0.99));
+            let dx = (f64::from(narrow) * 2.0 * (255.0 * f64::from(opacity)).ln()).sqrt();
+            if (0.6..7.9).contains(&dx) {
+                break (narrow, opacity, dx as f32);
+            }
+        };
+        // A few roundings inside, at and outside the distance at which alpha is 1/255, from the last sample of the
+        // narrow tile before; the wide tile holds both that sample and the mean.
+        let far = 7.5 + dx * (1.0 + f32::EPSILON * (i % 9 - 6) as f32);
+        let along = 8.0 * i as f32 + 3.5;
+        let color = color(&mut rng);
+        tall.push([far, along], [narrow, 0.0, 0.3], 2.0, opacity, color);
+        broad.push([along, far], [0.3, 0.0, narrow], 2.0, opacity, color);
+    }
+    for (size, splats) in [([16, 2000], tall), ([2000, 16], broad)] {
+        let pictures: Vec<Drawn> = tilings(gpu).iter().map(|&t| draw(gpu, t, size, &splats, 4096)).collect();
+        let rim = |i: usize| if size[0] == 16 { (8 * i + 3) * 16 + 7 } else { 7 * 2000 + 8 * i + 3 };
+        let drawn = (0..250).filter(|&i| pictures[0].transmittance[rim(i)] != 1.0).count();
+        assert!((50..200).contains(&drawn), "{drawn} of 250 rims are drawn: the case tests too little");
+        assert_same(&pictures, &format!("{size:?}"));
     }
 }
 
