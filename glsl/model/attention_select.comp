@@ -3,6 +3,7 @@
 #extension GL_GOOGLE_include_directive : require
 #include "thread.glsl"
 #include "patch.glsl"
+#include "camera.glsl"
 // Sort keys of the visible anchors: those whose centre falls into the patch come first, inside the mask before around
 // it, each in an order of its own random numbers. A thread: one visible anchor.
 layout(local_size_x = 64) in;
@@ -17,7 +18,8 @@ layout(push_constant, scalar) uniform Push {
   vec3 rotation0;    // first row of the rotation, world to camera
   vec3 rotation1;    // second row
   vec3 rotation2;    // third row
-  vec3 translation;  // world to camera, scene units
+  vec3 center;       // of the camera, scene units, rounded
+  vec3 center_low;   // the rest of it
   vec4 lens;         // fx fy cx cy, px
   vec4 distortion;   // k1 k2 p1 p2
   float near;        // smallest depth, scene units
@@ -32,10 +34,10 @@ void main() {
   uint i = thread_index();
   if (i >= visible_count[0]) return;
   uint anchor = visible[i];
-  vec3 p = position[anchor];
-  precise float x = ((push.rotation0.x * p.x + push.rotation0.y * p.y) + push.rotation0.z * p.z) + push.translation.x;
-  precise float y = ((push.rotation1.x * p.x + push.rotation1.y * p.y) + push.rotation1.z * p.z) + push.translation.y;
-  precise float z = ((push.rotation2.x * p.x + push.rotation2.y * p.y) + push.rotation2.z * p.z) + push.translation.z;
+  vec3 p = from_center(position[anchor], push.center, push.center_low);
+  precise float x = (push.rotation0.x * p.x + push.rotation0.y * p.y) + push.rotation0.z * p.z;
+  precise float y = (push.rotation1.x * p.x + push.rotation1.y * p.y) + push.rotation1.z * p.z;
+  precise float z = (push.rotation2.x * p.x + push.rotation2.y * p.y) + push.rotation2.z * p.z;
   vec2 pixel;
   uint side = 2u;
   vec2 low = vec2(push.corner), high = vec2(push.corner + push.side);

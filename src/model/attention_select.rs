@@ -11,6 +11,7 @@ use rand::{Rng, RngExt};
 
 use crate::gpu::kernels::model::{attention_select, attention_select_take};
 use crate::gpu::{Buffer, Error, Gpu, Recorder, Reference, Threads};
+use crate::math::camera::{from_center, split};
 
 /// The bits of the keys to sort by: two of the side, nineteen random ones. Ties keep the order of the anchors.
 pub const KEY_BITS: Range<u32> = 11..32;
@@ -43,8 +44,8 @@ pub fn patch_position(rng: &mut impl Rng, bounds: ([u32; 2], [u32; 2]), side: u3
 pub struct View {
     /// Rows of the rotation, world to camera.
     pub rotation: [[f32; 3]; 3],
-    /// Translation, world to camera, scene units.
-    pub translation: [f32; 3],
+    /// The camera's position, scene units.
+    pub center: [f64; 3],
     /// fx, fy, cx, cy in pixels.
     pub lens: [f32; 4],
     /// k1, k2, p1, p2.
@@ -97,11 +98,9 @@ impl Reference for attention_select::Kernel {
     fn reference(host: attention_select::Host<'_>, push: attention_select::Push, (): ()) {
         for i in 0..host.visible_count[0] as usize {
             let anchor = host.visible[i];
-            let p = host.position[anchor as usize];
+            let p = from_center(host.position[anchor as usize], [push.center, push.center_low]);
             let rows = [push.rotation0, push.rotation1, push.rotation2];
-            let camera: [f32; 3] = std::array::from_fn(|k| {
-                ((rows[k][0] * p[0] + rows[k][1] * p[1]) + rows[k][2] * p[2]) + push.translation[k]
-            });
+            let camera: [f32; 3] = std::array::from_fn(|k| (rows[k][0] * p[0] + rows[k][1] * p[1]) + rows[k][2] * p[2]);
             let within = |at: &[f32; 2]| {
                 (0..2).all(|k| at[k] >= push.corner[k] as f32 && at[k] < (push.corner[k] + push.side[k]) as f32)
             };
@@ -201,12 +200,14 @@ impl Select {
         assert!((0..2).all(|k| corner[k] + side[k] <= view.size[k]), "{:?} in {:?}", draw.patch, view.size);
         assert!(picture.len() >= (view.size[0] * view.size[1]) as usize, "{picture:?} of {:?}", view.size);
         let [rotation0, rotation1, rotation2] = view.rotation;
-        let View { translation, lens, distortion, near, max_radius2, .. } = *view;
+        let [center, center_low] = split(view.center);
+        let View { lens, distortion, near, max_radius2, .. } = *view;
         let push = attention_select::Push {
             rotation0,
             rotation1,
             rotation2,
-            translation,
+            center,
+            center_low,
             lens,
             distortion,
             near,
@@ -247,7 +248,8 @@ mod tests {
 
     const VIEW: View = View {
         rotation: [[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]],
-        translation: [0.1, -0.2, 4.0],
+        // Of the translation (0.1, -0.2, 4).
+        center: [2.32, 0.2, -3.26],
         lens: [90.0, 91.0, 50.5, 38.0],
         distortion: [0.03, -0.01, 0.002, -0.001],
         near: 0.2,
@@ -329,7 +331,7 @@ mod tests {
         let mask_of = |anchor: u32| {
             let p = scene.position[anchor as usize].map(f64::from);
             let camera: [f64; 3] = std::array::from_fn(|k| {
-                (0..3).map(|c| f64::from(VIEW.rotation[k][c]) * p[c]).sum::<f64>() + f64::from(VIEW.translation[k])
+                (0..3).map(|c| f64::from(VIEW.rotation[k][c]) * (p[c] - VIEW.center[c])).sum::<f64>()
             });
             let (x, y) = (camera[0] / camera[2], camera[1] / camera[2]);
             let [k1, k2, p1, p2] = VIEW.distortion.map(f64::from);

@@ -84,7 +84,7 @@ impl Attend {
         let camera = &photograph.camera;
         let view = View {
             rotation: camera.rotation,
-            translation: camera.translation.map(|v| v as f32),
+            center: camera.center(),
             lens: [camera.focal[0], camera.focal[1], camera.principal[0], camera.principal[1]],
             distortion: camera.distortion,
             near,

@@ -242,8 +242,8 @@ fn assert_close(camera: &Camera, near: f32, g: &Gaussian, got: &Outcome, s: usiz
     let moved = long * long / root + long / n.sqrt() + long / v.sqrt() + 1.0;
     let bound = 1024.0 * U * condition;
     if bound < 0.1 {
-        for i in 0..3 {
-            let error = (f64::from(got.scale[s][i]) - want.scale[i]).abs() * scale[i];
+        for (i, size) in scale.into_iter().enumerate() {
+            let error = (f64::from(got.scale[s][i]) - want.scale[i]).abs() * size;
             assert!(error <= bound, "{what}: grad_scale {:?}, not {:?}: {error:e}", got.scale[s], want.scale);
         }
         let error = distance(got.rotation[s], want.rotation);
