@@ -34,7 +34,7 @@ pub const CASES: &[Case] = &[
     Case {
         stage: "bin, rasterize",
         case: "100,000 Gaussians on one pixel, of opacity 1 - 1e-7 and of 0.0045",
-        guarantee: "colour, depth, transmittance and gradients within 4 n 2^-24 for the n <= 2345 that are blended; 0 behind them",
+        guarantee: "colour, depth, transmittance and gradients within 4 n 2^-24 and the exponentials' errors for the n <= 2345 that are blended; gradients of exactly 0 behind them",
         run: stack,
     },
     Case {
