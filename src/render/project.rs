@@ -62,8 +62,8 @@ pub fn push_backward(camera: &Camera, near: f32, offsets: u32) -> project_backwa
     camera_push!(project_backward::Push, camera, near, offsets: offsets)
 }
 
-/// Float32 roundings of a chain of eight operations, times `(|p| + |t|) / z`, which cancellation in `R p + t` costs:
-/// 32 covers points six units from the world's origin at the near plane. Each power of 1/z adds that once more.
+/// Float32 roundings of a chain of eight operations, times `|p| / z`, which cancellation in z = (R p)_z costs: 32 covers
+/// points six units from the camera at the near plane. Each power of 1/z adds that once more.
 const PER_POWER_OF_DEPTH: f64 = 8.0 * 6e-8 * 32.0;
 
 /// The projection rounds each entry relative to `|t| |Q| |s|` before its terms cancel: relative to the largest.
