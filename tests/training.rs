@@ -150,16 +150,16 @@ fn training_learns_and_what_it_saves_draws_the_same_picture() {
     let settings = common::settings(60);
     let folder = tempfile::tempdir().expect("a temporary folder");
     let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
-    let psnr = |run: &Run<'_>| {
+    let psnr = |run: &mut Run<'_>| {
         let report = run.evaluate(|_, _| ()).expect("an evaluation").expect("there are test views");
         report.mean.expect("means").metrics.full.psnr
     };
-    let untrained = psnr(&run);
+    let untrained = psnr(&mut run);
     let mut watch = Watch::default();
     let summary = run.train(folder.path(), &mut watch).expect("a run");
     let (before, after) = (mean_loss(&watch, 0..6), mean_loss(&watch, 54..60));
     assert!(after < 0.5 * before, "the loss went from {before} to {after}");
-    let trained = psnr(&run);
+    let trained = psnr(&mut run);
     assert!(trained > untrained + 3.0, "PSNR of the test views went from {untrained} to {trained} dB");
     let reported = summary.report.and_then(|r| r.mean).expect("figures at the end").metrics.full.psnr;
     assert_eq!(reported, trained, "the summary is of the model at the end");

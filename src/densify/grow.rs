@@ -378,11 +378,8 @@ fn reserve(gpu: &Gpu, anchors: &mut Anchors, statistics: &mut Statistics, count:
     if count > anchors.capacity {
         let generous = u64::from(anchors.capacity) + u64::from(anchors.capacity / 2);
         let capacity = (generous.min(most.into()) as u32).max(count);
-        let mut rec = gpu.recorder()?;
-        let more_statistics = statistics.grown(&mut rec, anchors.count, capacity)?;
-        let more_anchors = anchors.grown(&mut rec, capacity)?;
-        rec.submit()?.wait()?;
-        (*anchors, *statistics) = (more_anchors, more_statistics);
+        statistics.reserve(gpu, anchors.count, capacity)?;
+        anchors.reserve(gpu, capacity)?;
     }
     Ok(())
 }

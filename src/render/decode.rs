@@ -374,6 +374,25 @@ pub struct AnchorGradients<'a> {
     pub weights: &'a Buffer<f32>,
 }
 
+/// The gradients that somebody reads.
+#[derive(Clone, Copy)]
+pub struct WantedGradients<'a> {
+    /// As [`AnchorGradients::feature`].
+    pub feature: Option<&'a Buffer<f32>>,
+    /// As [`AnchorGradients::offset`].
+    pub offset: &'a Buffer<[f32; 3]>,
+    /// As [`AnchorGradients::log_scaling`].
+    pub log_scaling: &'a Buffer<f32>,
+    /// As [`AnchorGradients::weights`].
+    pub weights: Option<&'a Buffer<f32>>,
+}
+
+impl<'a> From<AnchorGradients<'a>> for WantedGradients<'a> {
+    fn from(AnchorGradients { feature, offset, log_scaling, weights }: AnchorGradients<'a>) -> Self {
+        Self { feature: Some(feature), offset, log_scaling, weights: Some(weights) }
+    }
+}
+
 /// The forward stage. Slot `s = v K + k` is Gaussian `k` of visible anchor `v`.
 #[derive(Debug)]
 pub struct Decode {
@@ -488,7 +507,13 @@ impl Decode {
 #[derive(Debug)]
 pub struct DecodeBackward {
     grad_output: Buffer<[f32; 4]>,
-    grad_hidden: Buffer<[f32; 4]>,
+    grad_hidden: Option<Buffer<[f32; 4]>>,
+    sums: Option<Sums>,
+}
+
+/// Parts of the weights' gradients.
+#[derive(Debug)]
+struct Sums {
     first: Buffer<[f32; 4]>,
     second: Buffer<[f32; 4]>,
 }
@@ -499,25 +524,43 @@ impl DecodeBackward {
     /// # Errors
     /// When the device has no memory for it.
     pub fn new(gpu: &Gpu, forward: &Decode) -> Result<Self, Error> {
+        Self::of(gpu, forward, true, true)
+    }
+
+    /// As [`DecodeBackward::new`], without what only gradients of the features or of the weights need.
+    ///
+    /// # Errors
+    /// When the device has no memory for it.
+    pub fn of(gpu: &Gpu, forward: &Decode, feature: bool, weights: bool) -> Result<Self, Error> {
         let (anchors, rows) = (forward.capacity as usize, forward.layout.rows());
         let parts = anchors.div_ceil(BLOCK).min(CHUNKS);
+        let sums = || -> Result<Sums, Error> {
+            Ok(Sums {
+                first: gpu.buffer("first", parts * FIRST_VEC4)?,
+                second: gpu.buffer("second", parts * rows * (HIDDEN + 1) / 4)?,
+            })
+        };
+        let hidden = || gpu.buffer("grad_hidden", anchors * HIDDEN_VEC4);
         Ok(Self {
             grad_output: gpu.buffer("grad_output", anchors * rows / 4)?,
-            grad_hidden: gpu.buffer("grad_hidden", anchors * HIDDEN_VEC4)?,
-            first: gpu.buffer("first", parts * FIRST_VEC4)?,
-            second: gpu.buffer("second", parts * rows * (HIDDEN + 1) / 4)?,
+            grad_hidden: if feature || weights { Some(hidden()?) } else { None },
+            sums: if weights { Some(sums()?) } else { None },
         })
     }
 
     /// Records the gradients, after [`Decode::record`] with the same arguments.
-    pub fn record(
+    ///
+    /// # Panics
+    /// When a gradient is asked for that the stage was made without.
+    pub fn record<'a>(
         &self,
         rec: &mut Recorder<'_>,
         forward: &Decode,
         anchors: Anchors<'_>,
         grad: GaussianGradients<'_>,
-        to: AnchorGradients<'_>,
+        to: impl Into<WantedGradients<'a>>,
     ) {
+        let to: WantedGradients<'_> = to.into();
         let offsets = forward.layout.offsets as u32;
         let groups = &forward.per_anchor.groups;
         let buffers = decode_backward::Buffers {
@@ -540,45 +583,53 @@ impl DecodeBackward {
             grad_output: &self.grad_output,
         };
         rec.run_with(decode_backward::Kernel, decode_backward::Constants { offsets }, buffers, (), groups);
+        if to.feature.is_none() && to.weights.is_none() {
+            return;
+        }
+        let grad_hidden = self.grad_hidden.as_ref().expect("made with features or weights");
         let groups = &forward.per_tile.groups;
         let buffers = decode_backward_hidden::Buffers {
             groups: &groups.buffer,
             packed: &forward.packed,
             hidden: &forward.hidden,
             grad_output: &self.grad_output,
-            grad_hidden: &self.grad_hidden,
+            grad_hidden,
         };
         let constants = decode_backward_hidden::Constants { offsets };
         rec.run_with(decode_backward_hidden::Kernel, constants, buffers, (), groups);
         let groups = &forward.per_anchor.groups;
-        let buffers = decode_backward_feature::Buffers {
-            groups: &groups.buffer,
-            visible: anchors.visible,
-            packed: &forward.packed,
-            grad_hidden: &self.grad_hidden,
-            grad_feature: to.feature,
-        };
-        rec.run(decode_backward_feature::Kernel, buffers, (), groups);
+        if let Some(grad_feature) = to.feature {
+            let buffers = decode_backward_feature::Buffers {
+                groups: &groups.buffer,
+                visible: anchors.visible,
+                packed: &forward.packed,
+                grad_hidden,
+                grad_feature,
+            };
+            rec.run(decode_backward_feature::Kernel, buffers, (), groups);
+        }
+        let Some(grad_weights) = to.weights else { return };
+        let Sums { first, second } = self.sums.as_ref().expect("made with weights");
         let buffers = decode_backward_first::Buffers {
             groups: &groups.buffer,
             inputs: &forward.inputs,
-            grad_hidden: &self.grad_hidden,
-            partial: &self.first,
+            grad_hidden,
+            partial: first,
         };
         rec.run(decode_backward_first::Kernel, buffers, (), groups);
         let buffers = decode_backward_second::Buffers {
             groups: &groups.buffer,
             hidden: &forward.hidden,
             grad_output: &self.grad_output,
-            partial: &self.second,
+            partial: second,
         };
         let constants = decode_backward_second::Constants { offsets };
         rec.run_with(decode_backward_second::Kernel, constants, buffers, (), groups);
         let buffers = decode_backward_weights::Buffers {
             groups: &groups.buffer,
-            first: &self.first,
-            second: &self.second,
-            grad_weights: to.weights,
+            first,
+            second,
+            grad_weights,
         };
         let constants = decode_backward_weights::Constants { offsets };
         rec.run_with(decode_backward_weights::Kernel, constants, buffers, (), forward.layout.packed());
