@@ -14,6 +14,12 @@ use super::kernel::Kernel;
 use super::ledger::{Ledger, Rehearsal};
 use super::recorder::Context;
 
+/// Bytes that are taken from the device at once for small buffers; larger buffers get memory of their own.
+const DEVICE_BLOCK: u64 = 32 << 20;
+const HOST_BLOCK: u64 = 16 << 20;
+/// What the device gives beyond the buffers in use: the last block's rest, and as much in gaps.
+pub const SPARE_BYTES: u64 = 2 * DEVICE_BLOCK + HOST_BLOCK;
+
 /// How to open a device.
 #[derive(Clone, Debug, Default)]
 pub struct Options {
@@ -381,7 +387,7 @@ impl Gpu {
             physical_device: physical,
             debug_settings: gpu_allocator::AllocatorDebugSettings::default(),
             buffer_device_address: false,
-            allocation_sizes: gpu_allocator::AllocationSizes::default(),
+            allocation_sizes: gpu_allocator::AllocationSizes::new(DEVICE_BLOCK, HOST_BLOCK),
         })
         .map_err(|source| Error::OutOfMemory {
             name: "allocator",

@@ -176,9 +176,7 @@ impl<'a> Run<'a> {
         let plan = Plan::new(scene, settings);
         let points: Vec<[f32; 3]> = scene.points.iter().map(|p| p.position).collect();
         let offsets = settings.model.offsets as usize;
-        let derived = || init::median_nearest_distance(&points).map_or(0.0, |d| d * settings.model.voxel_factor);
-        let voxel = if settings.model.voxel > 0.0 { settings.model.voxel } else { derived() };
-        let initial = init::anchors(&points, voxel, offsets)?;
+        let initial = init::from_points(&points, &settings.model)?;
         let weights = init::weights(settings.train.seed, offsets, plan.attention);
         let photographs = photographs::upload(gpu, scene, &plan)?;
         let step = Step::new(gpu, plan, settings, &initial.anchors, &weights, initial.voxel)?;
