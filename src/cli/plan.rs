@@ -265,7 +265,7 @@ impl Shown<'_> {
             text.push_str(line.trim_end());
             text.push('\n');
         };
-        line(format!("{:<20} {:>15} {:>7} {:>9} {:>13}", "stage", "steps", "passes", "buffers", "bytes"));
+        line(format!("{:<20} {:>15} {:>7} {:>9} {:>13}", "stage", "steps", "kernels", "buffers", "bytes"));
         for s in &self.stages {
             line(match (&s.steps, &s.why) {
                 (Some(Steps { first, last }), _) => {

@@ -24,6 +24,7 @@ struct Memory {
     raw: vk::Buffer,
     bytes: u64,
     name: &'static str,
+    stage: &'static str,
     backing: Backing,
 }
 
@@ -74,6 +75,10 @@ impl<T: bytemuck::Pod> Buffer<T> {
     /// The name given at creation.
     pub fn name(&self) -> &'static str {
         self.memory.name
+    }
+    /// The stage it was made for.
+    pub fn stage(&self) -> &'static str {
+        self.memory.stage
     }
     /// The buffer without its type.
     pub fn slot(&self) -> Slot {
@@ -242,7 +247,7 @@ impl Gpu {
             let raw = vk::Buffer::from_raw(rehearsal.open(name, padded, taken));
             let host = location != MemoryLocation::GpuOnly;
             let backing = Backing::Counted { taken, host, rehearsal: rehearsal.clone() };
-            let memory = Memory { raw, bytes: padded, name, backing };
+            let memory = Memory { raw, bytes: padded, name, stage: self.ledger().stage(), backing };
             return Ok(Buffer { memory: Arc::new(memory), bytes, len, element: PhantomData });
         }
         // SAFETY: the device outlives the buffer (the buffer holds an Arc of it), and the memory is bound before use.
@@ -271,7 +276,7 @@ impl Gpu {
         inner.name_object(raw, name);
         inner.ledger.open(raw.as_raw(), name, padded);
         let backing = Backing::Real { allocation: Some(allocation), gpu: inner.clone() };
-        let memory = Memory { raw, bytes: padded, name, backing };
+        let memory = Memory { raw, bytes: padded, name, stage: self.ledger().stage(), backing };
         Ok(Buffer { memory: Arc::new(memory), bytes, len, element: PhantomData })
     }
 }

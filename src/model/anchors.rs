@@ -43,7 +43,7 @@ impl Parameter {
 /// # Errors
 /// As [`Gpu::buffer`].
 pub fn lengthen<T: bytemuck::Pod>(gpu: &Gpu, buffer: &mut Buffer<T>, len: usize, kept: usize) -> Result<(), Error> {
-    let longer = gpu.buffer(buffer.name(), len)?;
+    let longer = gpu.stage(buffer.stage(), || gpu.buffer(buffer.name(), len))?;
     let mut rec = gpu.recorder()?;
     rec.zero(&longer);
     rec.copy(buffer, &longer, kept);

@@ -29,8 +29,8 @@ use super::plan::{Plan, Trained};
 /// Where the gradients of what is trained go, zeroed at the beginning of every step.
 struct Gradients {
     feature: Option<Buffer<f32>>,
-    offset: Buffer<f32>,
-    log_scaling: Buffer<f32>,
+    offset: Option<Buffer<f32>>,
+    log_scaling: Option<Buffer<f32>>,
     weights: Option<Buffer<f32>>,
 }
 
@@ -39,8 +39,8 @@ impl Gradients {
         let of = |name, parameter: &Parameter| gpu.buffer(name, parameter.value.len());
         Ok(Self {
             feature: trained.feature.then(|| of("grad_feature", &anchors.feature)).transpose()?,
-            offset: of("grad_offset", &anchors.offset)?,
-            log_scaling: of("grad_log_scaling", &anchors.log_scaling)?,
+            offset: trained.offset.then(|| of("grad_offset", &anchors.offset)).transpose()?,
+            log_scaling: trained.log_scaling.then(|| of("grad_log_scaling", &anchors.log_scaling)).transpose()?,
             weights: trained.decoders.then(|| of("grad_weights", weights)).transpose()?,
         })
     }
@@ -417,7 +417,7 @@ impl Step {
         let color_alone = canvas.picture.color();
         let picture = if depth { &canvas.picture } else { &color_alone };
         rec.stage(stage::DECODE_BACKWARD);
-        for gradient in gradients.feature.iter().chain([&gradients.offset, &gradients.log_scaling]) {
+        for gradient in [&gradients.feature, &gradients.offset, &gradients.log_scaling].into_iter().flatten() {
             rec.zero(gradient);
         }
         rec.stage(stage::CULL);
@@ -467,11 +467,11 @@ impl Step {
             scale: &project_backward.grad_scale,
             rotation: &project_backward.grad_rotation,
         };
-        let grad_offset = gradients.offset.view();
+        let grad_offset = gradients.offset.as_ref().map(Buffer::view);
         let to = WantedGradients {
             feature: gradients.feature.as_ref(),
-            offset: &grad_offset,
-            log_scaling: &gradients.log_scaling,
+            offset: grad_offset.as_ref(),
+            log_scaling: gradients.log_scaling.as_ref(),
             weights: gradients.weights.as_ref(),
         };
         rec.stage(stage::DECODE_BACKWARD);
@@ -512,8 +512,8 @@ impl Step {
         };
         let all = |parameter: &Parameter| (0, anchors.count * parameter.width);
         update(&anchors.feature, gradients.feature.as_ref(), all(&anchors.feature), rates.feature);
-        update(&anchors.offset, Some(&gradients.offset), all(&anchors.offset), rates.offset);
-        update(&anchors.log_scaling, Some(&gradients.log_scaling), all(&anchors.log_scaling), rates.log_scaling);
+        update(&anchors.offset, gradients.offset.as_ref(), all(&anchors.offset), rates.offset);
+        update(&anchors.log_scaling, gradients.log_scaling.as_ref(), all(&anchors.log_scaling), rates.log_scaling);
         let layout = Layout { offsets: anchors.offsets as usize };
         for (head, rate) in rates.decoders.into_iter().enumerate() {
             let first = layout.head(head);
@@ -564,8 +564,8 @@ impl Step {
         let gradients = &self.stages().gradients;
         for (name, buffer, width) in [
             ("feature", gradients.feature.as_ref(), 32),
-            ("offset", Some(&gradients.offset), 3 * self.anchors.offsets as usize),
-            ("log_scaling", Some(&gradients.log_scaling), 6),
+            ("offset", gradients.offset.as_ref(), 3 * self.anchors.offsets as usize),
+            ("log_scaling", gradients.log_scaling.as_ref(), 6),
         ] {
             if let Some(buffer) = buffer {
                 all.insert(name.to_owned(), self.gpu.read_range(buffer, n * width)?);
