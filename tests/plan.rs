@@ -296,6 +296,23 @@ fn gradients_of_what_is_not_trained_are_not_computed() {
     }
 }
 
+#[test]
+fn without_ssim_nothing_is_made_for_it() {
+    let gpu = testing::gpu();
+    for wanted in [Wanted::NOTHING, Wanted::EVERYTHING] {
+        let scene = wanted.scene(&common::folder());
+        let mut settings = wanted.settings();
+        settings.losses.ssim_weight = 0.0;
+        let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
+        assert!(run.step().plan.left_out.iter().any(|l| l.what == "SSIM"));
+        let kernels = kernels(&record(&mut run, &gpu, 1));
+        let photometric: Vec<_> = kernels.iter().filter(|name| name.starts_with("losses/photometric")).collect();
+        let suffix = if wanted.masks { "_weighted" } else { "" };
+        assert_eq!(photometric, [&format!("losses/photometric_gradient_l1{suffix}")]);
+        assert!(alive(&gpu).keys().all(|name| !name.contains("ssim")), "{:?}", alive(&gpu));
+    }
+}
+
 /// Kernels are compiled at their first use: a run compiles those of its plan and no other.
 #[test]
 fn a_run_compiles_the_kernels_of_its_plan() {
@@ -304,9 +321,11 @@ fn a_run_compiles_the_kernels_of_its_plan() {
     for wanted in [Wanted::NOTHING, Wanted::EVERYTHING] {
         let gpu = testing::gpu();
         let (scene, settings) = (wanted.scene(&folder), wanted.settings());
-        let planned: BTreeSet<&str> = rehearsed(&gpu, &scene, &settings).pipelines.into_iter().collect();
+        let forecast = rehearsed(&gpu, &scene, &settings);
+        let planned: BTreeSet<&str> = forecast.pipelines.into_iter().collect();
         assert!(gpu.pipelines().is_empty(), "a rehearsal compiles nothing: {:?}", gpu.pipelines());
         let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
+        run.resize(forecast.capacity).expect("the device has room");
         assert!(gpu.pipelines().is_empty(), "nothing is compiled before it is used: {:?}", gpu.pipelines());
         let out = tempfile::tempdir().expect("a temporary folder");
         run.train(out.path(), &mut common::Watch::default()).expect("a run");

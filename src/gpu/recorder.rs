@@ -10,7 +10,7 @@ use super::device::{Gpu, Inner, lock};
 use super::error::{Error, Named};
 use super::hazards::{Entry, Hazards, Id, Schedule};
 use super::kernel::{Access, Reference};
-use super::ledger::Rehearsal;
+use super::ledger::{NO_STAGE, Rehearsal};
 use super::memory::{Buffer, Slot};
 use super::timings::Timing;
 
@@ -75,7 +75,7 @@ impl Context {
     fn new(gpu: &Gpu) -> Result<Self, Error> {
         let inner = gpu.inner();
         // Without its Arc of the device: the device owns its contexts.
-        let markers = gpu.readback::<u32>("markers", MAX_PASSES as usize)?.into_parts();
+        let markers = gpu.stage(NO_STAGE, || gpu.readback::<u32>("markers", MAX_PASSES as usize))?.into_parts();
         let allocate =
             vk::CommandBufferAllocateInfo::default().command_pool(inner.command_pool).command_buffer_count(1);
         let queries =

@@ -274,7 +274,8 @@ pub fn rehearse(
             let round = rounds.partition_point(|&r| r <= number);
             let target = f64::from(survey.anchors) + grown * share(round) / share(rounds.len());
             let more = (target as u32).saturating_sub(step.anchors.count).div_ceil(settings.densify.levels);
-            let kept = step.anchors.count + more * settings.densify.levels;
+            let room = most_anchors(&gpu, settings, survey.anchors);
+            let kept = (step.anchors.count + more * settings.densify.levels).min(room.max(step.anchors.count));
             for (buffer, word) in [("candidate_count", 4 * more), ("free_count", more), ("kept_count", kept)] {
                 gpu.answer(buffer, word);
             }

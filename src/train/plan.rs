@@ -166,6 +166,9 @@ impl Plan {
         if depth && !depth_gradient {
             leave("depth gradient", "losses.depth.gradient.weight is zero");
         }
+        if settings.losses.ssim_weight == 0.0 {
+            leave("SSIM", "losses.ssim_weight is zero");
+        }
         let attention_config = &settings.model.attention;
         let attention = attention_config.enabled
             && masks
@@ -217,9 +220,7 @@ impl Plan {
         }
         leave("gradient of anchor positions", "anchors do not move");
         leave("gradient of view directions and distances", "cameras do not move");
-        if depth {
-            leave("transmittance and its gradient", "no loss looks at it");
-        }
+        leave("gradient of transmittance", "no loss looks at it");
         let evaluation = !scene.test.is_empty();
         if !evaluation {
             leave("evaluation", "there are no test views");
