@@ -135,7 +135,8 @@ fn every_combination_has_what_it_needs_and_nothing_else() {
         assert_eq!(computed, compiled, "{wanted:?}");
         ever.extend(&compiled);
     }
-    for name in ["losses/frame_masked_depth", "render/project_backward_color", "densify/prune", "model/attention_blend"] {
+    for name in ["losses/frame_masked_depth", "render/project_backward_color", "densify/prune", "model/attention_blend"]
+    {
         assert!(ever.iter().any(|n| n.starts_with(name)), "{name} is in no combination: {ever:?}");
     }
 }
@@ -184,13 +185,10 @@ fn stages_end_with_their_time() {
         let stages = gpu.stages();
         [stage::STATISTICS, stage::ATTENTION].map(|name| stages.contains_key(name))
     };
-    assert_eq!([1, 2, 3, 12, 13].map(&mut has), [
-        [false, false],
-        [true, false],
-        [true, true],
-        [true, true],
-        [false, true]
-    ]);
+    assert_eq!(
+        [1, 2, 3, 12, 13].map(&mut has),
+        [[false, false], [true, false], [true, true], [true, true], [false, true]]
+    );
     // The last round is the last that comes before the end, however long growth may go on.
     let mut short = settings.clone();
     short.train.iterations = 9;

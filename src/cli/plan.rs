@@ -55,11 +55,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let (scene, settings) = args.scene.load()?;
     let options = Options { timestamps: args.measure.is_some(), ..args.device.options() };
     with_gpu(&options, |gpu| {
-        let question = Question {
-            anchors: args.anchors,
-            available: args.memory.map(|mib| mib << 20),
-            also: Some(args.step),
-        };
+        let question =
+            Question { anchors: args.anchors, available: args.memory.map(|mib| mib << 20), also: Some(args.step) };
         let verdict = forecast::forecast(gpu, &scene, &settings, question)?;
         let plan = Plan::new(&scene, &settings);
         let view = Order::new(scene.train.len(), settings.train.seed, settings.train.view_order).view(args.step);

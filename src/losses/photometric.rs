@@ -163,7 +163,8 @@ fn gradient_check(binding: &str) -> Check {
 
 impl Reference for gradient::Kernel {
     fn reference(host: gradient::Host<'_>, push: gradient::Push, (): ()) {
-        let from = Pictures { grad_rows: Some(host.grad_rows), rendered: host.rendered, target: host.target, weight: None };
+        let from =
+            Pictures { grad_rows: Some(host.grad_rows), rendered: host.rendered, target: host.target, weight: None };
         gradient_reference(&from, host.grad_rendered, host.partial, push);
     }
     fn check(binding: &'static str) -> Check {

@@ -11,7 +11,8 @@
 
 use crate::gpu::kernels::render::{
     decode, decode_backward, decode_backward_feature, decode_backward_first, decode_backward_fixed,
-    decode_backward_fixed_offset, decode_backward_fixed_scaling, decode_backward_hidden, decode_backward_second, decode_backward_weights, decode_hidden, decode_input, decode_pack,
+    decode_backward_fixed_offset, decode_backward_fixed_scaling, decode_backward_hidden, decode_backward_second,
+    decode_backward_weights, decode_hidden, decode_input, decode_pack,
 };
 use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
 use crate::math::decoder::{
@@ -406,12 +407,7 @@ pub struct WantedGradients<'a> {
 
 impl<'a> From<AnchorGradients<'a>> for WantedGradients<'a> {
     fn from(AnchorGradients { feature, offset, log_scaling, weights }: AnchorGradients<'a>) -> Self {
-        Self {
-            feature: Some(feature),
-            offset: Some(offset),
-            log_scaling: Some(log_scaling),
-            weights: Some(weights),
-        }
+        Self { feature: Some(feature), offset: Some(offset), log_scaling: Some(log_scaling), weights: Some(weights) }
     }
 }
 
@@ -651,12 +647,7 @@ impl DecodeBackward {
         };
         let constants = decode_backward_second::Constants { offsets };
         rec.run_with(decode_backward_second::Kernel, constants, buffers, (), groups);
-        let buffers = decode_backward_weights::Buffers {
-            groups: &groups.buffer,
-            first,
-            second,
-            grad_weights,
-        };
+        let buffers = decode_backward_weights::Buffers { groups: &groups.buffer, first, second, grad_weights };
         let constants = decode_backward_weights::Constants { offsets };
         rec.run_with(decode_backward_weights::Kernel, constants, buffers, (), forward.layout.packed());
     }

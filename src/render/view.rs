@@ -71,9 +71,7 @@ impl Forward {
             visible: gpu.stage(stage::CULL, || Visible::new(gpu, capacity.anchors, offsets, capacity.visible, cull))?,
             decode: gpu.stage(stage::DECODE, || Decode::new(gpu, capacity.visible, offsets))?,
             project: gpu.stage(stage::PROJECT, || Project::new(gpu, capacity.visible, offsets))?,
-            bin: gpu.stage(stage::BIN, || {
-                Bin::new(gpu, tiling, capacity.visible * offsets, capacity.pairs, size)
-            })?,
+            bin: gpu.stage(stage::BIN, || Bin::new(gpu, tiling, capacity.visible * offsets, capacity.pairs, size))?,
             tiling,
             offsets,
         })
@@ -217,14 +215,7 @@ impl Painter {
         }
     }
 
-    fn record(
-        &self,
-        rec: &mut Recorder<'_>,
-        model: Model<'_>,
-        forward: &Forward,
-        picture: &Picture,
-        camera: &Camera,
-    ) {
+    fn record(&self, rec: &mut Recorder<'_>, model: Model<'_>, forward: &Forward, picture: &Picture, camera: &Camera) {
         let Self { limits, near, .. } = self;
         let Model { anchors, weights } = model;
         forward.visible.record(rec, anchors, camera, *near, limits);

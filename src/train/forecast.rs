@@ -502,7 +502,10 @@ fn remedies(
             let mut changed = settings.clone();
             changed.densify.max_anchors = count + (u64::from(expected - count) * eighths / 8) as u32;
             if let Some(needs) = needs(scene, &changed)? {
-                found.push(Remedy { change: format!("--set densify.max_anchors={}", changed.densify.max_anchors), needs });
+                found.push(Remedy {
+                    change: format!("--set densify.max_anchors={}", changed.densify.max_anchors),
+                    needs,
+                });
                 break;
             }
         }

@@ -170,10 +170,8 @@ impl Plan {
             leave("SSIM", "losses.ssim_weight is zero");
         }
         let attention_config = &settings.model.attention;
-        let attention = attention_config.enabled
-            && masks
-            && attention_config.start <= iterations
-            && attention_config.blend > 0.0;
+        let attention =
+            attention_config.enabled && masks && attention_config.start <= iterations && attention_config.blend > 0.0;
         if !attention {
             let why = if !attention_config.enabled {
                 "model.attention.enabled is false".to_owned()
@@ -280,9 +278,7 @@ impl Plan {
     pub fn steps(&self, name: &str, settings: &Settings) -> Option<Steps> {
         let all = Steps { first: 1, last: self.iterations };
         match name {
-            stage::ATTENTION => {
-                self.attention.then_some(Steps { first: settings.model.attention.start.max(1), ..all })
-            }
+            stage::ATTENTION => self.attention.then_some(Steps { first: settings.model.attention.start.max(1), ..all }),
             stage::DEPTH => self.depth.then_some(all),
             stage::DEPTH_GRADIENT => self.depth_gradient.then_some(all),
             stage::STATISTICS => self.counted,
