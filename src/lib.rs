@@ -19,4 +19,5 @@ pub mod optimizer;
 pub mod primitives;
 pub mod render;
 pub mod scene;
+pub mod stage;
 pub mod train;

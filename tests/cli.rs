@@ -384,6 +384,15 @@ fn plan_and_verify_of_a_scene() {
     for part in ["step 2 (view ", "\nleft out\n", "\nbuffers\n", "    barrier: ", "model/attention_project  <"] {
         assert!(plan.contains(part), "no {part:?} in {plan}");
     }
+    let json = succeeds(folder, &format!("plan scene --step 2 --measure 2 --json --validate {few}")).stdout;
+    let json: serde_json::Value = serde_json::from_str(&json).expect("JSON");
+    assert_eq!(json["memory"]["fits"], true, "{json:#}");
+    assert_eq!(json["stages"].as_array().map(Vec::len), Some(gscream_vk::stage::ALL.len()));
+    let measured = &json["measured"];
+    assert!(measured["ms"].as_f64().is_some_and(|ms| ms > 0.0), "{measured:#}");
+    assert_eq!(measured["passes"], json["step"]["passes"], "the step as rehearsed and as run");
+    let tight = succeeds(folder, &format!("plan scene --memory 1 {few}")).stdout;
+    assert!(tight.contains("does not fit") && tight.contains("1 MiB are free"), "{tight}");
     let verify = succeeds(folder, &format!("verify scene --warm-up 2 --validate {few}")).stdout;
     assert!(verify.starts_with("step 3, view "), "{verify}");
     let last = verify.lines().last().expect("lines");

@@ -6,10 +6,15 @@
 #include "group_sum.glsl"
 #include "ssim.glsl"
 // variant weighted: WEIGHTED
-// The window's adjoint along columns, SSIM's gradient by the rendered values, and L1: its loss and gradient.
+// variant l1: NO_SSIM
+// variant l1_weighted: NO_SSIM WEIGHTED
+// The window's adjoint along columns, SSIM's gradient by the rendered values, and L1: its loss and gradient. `l1` is for
+// losses without SSIM.
 const int RUN = 8;
 layout(local_size_x = 64) in;
+#ifndef NO_SSIM
 layout(binding = 0, scalar) readonly buffer GradRows { vec3 grad_rows[]; };        // [pixel * 3] of `photometric_adjoint`
+#endif
 layout(binding = 1, scalar) readonly buffer Rendered { vec3 rendered[]; };         // [pixel] rgb
 layout(binding = 2, scalar) readonly buffer Target { vec3 target[]; };             // [pixel] rgb
 layout(binding = 3, scalar) writeonly buffer GradRendered { vec3 grad_rendered[]; }; // [pixel] of the whole photometric loss
@@ -28,6 +33,7 @@ void main() {
   int height = int(push.size.y);
   float loss = 0.0;
   if (start < height) {
+#ifndef NO_SSIM
     // One channel after the other: its 24 sums stay near, and rgb is read and written whole.
     vec3 second[RUN], mixed[RUN], grad[RUN];
     [[unroll]] for (int c = 0; c < 3; ++c) {
@@ -48,6 +54,7 @@ void main() {
         mixed[o][c] = sums[o].z;
       }
     }
+#endif
     [[unroll]] for (int o = 0; o < RUN; ++o) {
       if (start + o < height) {
         uint pixel = uint(start + o) * push.size.x + x;
@@ -58,8 +65,11 @@ void main() {
         scale *= weight[pixel];
 #endif
         loss += scale * (abs(difference.r) + abs(difference.g) + abs(difference.b));
-        grad_rendered[pixel] =
-            grad[o] + 2.0 * ((a - 0.5) * second[o] + difference * mixed[o]) + scale * sign(difference);
+        vec3 gradient = scale * sign(difference);
+#ifndef NO_SSIM
+        gradient = grad[o] + 2.0 * ((a - 0.5) * second[o] + difference * mixed[o]) + gradient;
+#endif
+        grad_rendered[pixel] = gradient;
       }
     }
   }

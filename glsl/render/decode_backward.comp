@@ -2,7 +2,12 @@
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
+// variant fixed_offset: FIXED_OFFSET
+// variant fixed_scaling: FIXED_SCALING
+// variant fixed: FIXED_OFFSET FIXED_SCALING
+//
 // Back through the activations: gradients of offsets and log-scales, and of the second layer's outputs. One thread per visible anchor.
+// The variants leave out the gradients of offsets or of log-scales that are not trained.
 layout(local_size_x = 64) in;
 layout(constant_id = 0) const uint OFFSETS = 10u; // Gaussians per anchor
 #include "thread.glsl"
@@ -10,20 +15,28 @@ layout(constant_id = 0) const uint OFFSETS = 10u; // Gaussians per anchor
 #include "decoder.glsl"
 layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };  // [4] x, y, z of the dispatch; visible anchors
 layout(binding = 1, scalar) readonly buffer Visible { uint visible[]; };                // [V] anchors
+#ifndef FIXED_SCALING
 layout(binding = 2, scalar) readonly buffer Offset { vec3 offset[]; };                  // [N*K]
+#endif
 layout(binding = 3, scalar) readonly buffer LogScaling { float log_scaling[]; };        // [N*6]
 layout(binding = 4, scalar) readonly buffer Opacity { float opacity[]; };               // [V*K] of decode
 layout(binding = 5, scalar) readonly buffer Color { vec3 color[]; };                    // [V*K] of decode
 layout(binding = 6, scalar) readonly buffer Scale { vec3 scale[]; };                    // [V*K] of decode
 layout(binding = 7, scalar) readonly buffer Rotation { vec4 rotation[]; };              // [V*K] of decode
 layout(binding = 8, scalar) readonly buffer RotationNorm { float rotation_norm[]; };    // [V*K] of decode
+#if !defined(FIXED_OFFSET) || !defined(FIXED_SCALING)
 layout(binding = 9, scalar) readonly buffer GradPosition { vec3 grad_position[]; };     // [V*K]
+#endif
 layout(binding = 10, scalar) readonly buffer GradOpacity { float grad_opacity[]; };     // [V*K]
 layout(binding = 11, scalar) readonly buffer GradColor { vec3 grad_color[]; };          // [V*K]
 layout(binding = 12, scalar) readonly buffer GradScale { vec3 grad_scale[]; };          // [V*K]
 layout(binding = 13, scalar) readonly buffer GradRotation { vec4 grad_rotation[]; };    // [V*K]
+#ifndef FIXED_OFFSET
 layout(binding = 14, scalar) writeonly buffer GradOffset { vec3 grad_offset[]; };       // [N*K] visible anchors only
+#endif
+#ifndef FIXED_SCALING
 layout(binding = 15, scalar) writeonly buffer GradLogScaling { float grad_log_scaling[]; }; // [N*6] visible anchors only
+#endif
 layout(binding = 16, scalar) writeonly buffer GradOutput { vec4 grad_output[]; };       // [V*D/4] before the activations, padded rows 0
 void put(uint from, uint row, float value) { grad_output[from + row / 4u][row % 4u] = value; }
 void main() {
@@ -31,15 +44,25 @@ void main() {
   if (v >= groups[3]) return;
   uint anchor = visible[v], l = 6u * anchor, rows = head_row(3u, OFFSETS), to = v * (rows / 4u);
   uint color_row = head_row(1u, OFFSETS), cov_row = head_row(2u, OFFSETS);
+#if !defined(FIXED_OFFSET) || !defined(FIXED_SCALING)
   vec3 spread = exp_saturated(vec3(log_scaling[l], log_scaling[l + 1u], log_scaling[l + 2u]));
+#endif
   vec3 size = exp_saturated(vec3(log_scaling[l + 3u], log_scaling[l + 4u], log_scaling[l + 5u]));
+#ifndef FIXED_SCALING
   vec3 grad_spread = vec3(0.0), grad_size = vec3(0.0);
+#endif
   for (uint k = 0u; k < OFFSETS; ++k) {
     uint slot = v * OFFSETS + k;
+#if !defined(FIXED_OFFSET) || !defined(FIXED_SCALING)
     vec3 gp = grad_position[slot];
+#endif
+#ifndef FIXED_OFFSET
     grad_offset[anchor * OFFSETS + k] = gp * spread;
+#endif
+#ifndef FIXED_SCALING
     // By the displacement, which is finite where there is a Gaussian: the gradient of an offset of 0 may overflow, this not.
     grad_spread += gp * (offset[anchor * OFFSETS + k] * spread);
+#endif
     float o = opacity[slot];
     put(to, k, grad_opacity[slot] * ((1.0 - o) * (1.0 + o)));
     vec3 c = color[slot], gc = grad_color[slot] * c * (1.0 - c);
@@ -47,7 +70,9 @@ void main() {
     put(to, color_row + 3u * k + 1u, gc.y);
     put(to, color_row + 3u * k + 2u, gc.z);
     vec3 s = scale[slot], gs = grad_scale[slot] * s;
+#ifndef FIXED_SCALING
     grad_size += gs;
+#endif
     // The sigmoid is scale / size; of a size that underflowed to 0 the scale and its gradient are 0.
     gs *= 1.0 - s / max(size, vec3(1e-37));
     vec4 q = rotation[slot], gq = grad_rotation[slot];
@@ -62,10 +87,12 @@ void main() {
     put(to, row + 5u, gq.z);
     put(to, row + 6u, gq.w);
   }
+#ifndef FIXED_SCALING
   for (uint i = 0u; i < 3u; ++i) {
     grad_log_scaling[l + i] = grad_spread[i];
     grad_log_scaling[l + 3u + i] = grad_size[i];
   }
+#endif
   for (uint row = OFFSETS; row < color_row; ++row) put(to, row, 0.0);
   for (uint row = color_row + 3u * OFFSETS; row < cov_row; ++row) put(to, row, 0.0);
   for (uint row = cov_row + 7u * OFFSETS; row < rows; ++row) put(to, row, 0.0);

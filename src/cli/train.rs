@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, bail};
+use anyhow::{Context as _, bail, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::folders::{MODEL, RECORD, Record, SETTINGS, TEST};
@@ -13,6 +13,7 @@ use crate::evaluate::Report;
 use crate::gpu::{Gpu, Options, Timing};
 use crate::render::view::Rendered;
 use crate::scene::Scene;
+use crate::train::forecast::{self, Question};
 use crate::train::run::{Observer, Progress, Run, Summary};
 
 /// Train a scene without its object
@@ -89,8 +90,18 @@ pub(super) fn train(
     name: &str,
     folder: &Path,
 ) -> anyhow::Result<Trained> {
+    let verdict = forecast::forecast(gpu, scene, settings, Question::default())?;
+    if let Some(why) = verdict.describe() {
+        ensure!(verdict.starts(), "{}: {why}", gpu.info().name);
+        eprintln!("memory: {why}");
+    }
     std::fs::create_dir_all(folder).with_context(|| format!("{}: cannot be made", folder.display()))?;
     let mut run = Run::new(gpu, scene, settings)?;
+    if let Ok(forecast) = &verdict.forecast {
+        run.resize(forecast.capacity)?;
+        let mib = forecast.peak.div_ceil(1 << 20);
+        eprintln!("memory: about {mib} MiB of device memory at most, with {} anchors at the end", forecast.anchors);
+    }
     let path = folder.join(SETTINGS);
     std::fs::write(&path, settings.to_toml()).with_context(|| format!("{}: cannot be written", path.display()))?;
     Record::new(&gpu.info().name, name).write(folder)?;

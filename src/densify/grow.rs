@@ -373,16 +373,13 @@ fn draw_lots(gpu: &Gpu, cells: &Cells, round: Round, level: u32) -> Result<Buffe
     Ok(drawn)
 }
 
-/// Makes room for `count` anchors: half as many again, at most `most`.
+/// Makes room for `count` anchors and a sixteenth more, at most `most`. Memory follows the anchors closely: a round comes
+/// every so many steps, and costs a copy of the model at most.
 fn reserve(gpu: &Gpu, anchors: &mut Anchors, statistics: &mut Statistics, count: u32, most: u32) -> Result<(), Error> {
     if count > anchors.capacity {
-        let generous = u64::from(anchors.capacity) + u64::from(anchors.capacity / 2);
-        let capacity = (generous.min(most.into()) as u32).max(count);
-        let mut rec = gpu.recorder()?;
-        let more_statistics = statistics.grown(&mut rec, anchors.count, capacity)?;
-        let more_anchors = anchors.grown(&mut rec, capacity)?;
-        rec.submit()?.wait()?;
-        (*anchors, *statistics) = (more_anchors, more_statistics);
+        let capacity = count.saturating_add(count / 16).min(most).max(count);
+        statistics.reserve(gpu, anchors.count, capacity)?;
+        anchors.reserve(gpu, capacity)?;
     }
     Ok(())
 }

@@ -53,7 +53,7 @@ fn gather<T: bytemuck::Pod>(
     width: u32,
     buffer: &mut Buffer<T>,
 ) -> Result<(), Error> {
-    let fresh: Buffer<T> = gpu.buffer(buffer.name(), buffer.len())?;
+    let fresh: Buffer<T> = gpu.stage(buffer.stage(), || gpu.buffer(buffer.name(), buffer.len()))?;
     let mut rec = gpu.recorder()?;
     // What lies behind the rows stays initialised: the optimiser works in whole vectors.
     rec.zero(&fresh);

@@ -2,6 +2,7 @@
 
 use crate::gpu::kernels::densify::statistics;
 use crate::gpu::{Buffer, Error, Gpu, Groups, Recorder, Reference};
+use crate::model::anchors::lengthen;
 
 impl Reference for statistics::Kernel {
     fn reference(host: statistics::Host<'_>, push: statistics::Push, (): ()) {
@@ -63,7 +64,7 @@ pub struct Drawn<'a> {
 
 impl Statistics {
     /// Room for `capacity` anchors with `offsets` Gaussians each, uninitialised.
-    pub(super) fn empty(gpu: &Gpu, capacity: u32, offsets: u32) -> Result<Self, Error> {
+    fn empty(gpu: &Gpu, capacity: u32, offsets: u32) -> Result<Self, Error> {
         let (anchors, slots) = (capacity as usize, capacity as usize * offsets as usize);
         Ok(Self {
             gradient: gpu.buffer("accumulated_gradient", slots)?,
@@ -98,19 +99,18 @@ impl Statistics {
         self.visits.len() as u32
     }
 
-    /// The statistics of `count` anchors in buffers with room for `capacity`, zero for the others; the copy is recorded.
+    /// Makes room for `capacity` anchors, of which the first `count` keep their statistics; zero for the others. An array
+    /// at a time, with nothing in flight.
     ///
     /// # Errors
     /// As [`Gpu::buffer`].
-    pub fn grown(&self, rec: &mut Recorder<'_>, count: u32, capacity: u32) -> Result<Self, Error> {
-        let new = Self::empty(rec.gpu(), capacity, self.offsets)?;
-        let (anchors, slots) = (count as usize, count as usize * self.offsets as usize);
-        new.zero(rec);
-        rec.copy(&self.gradient, &new.gradient, slots);
-        rec.copy(&self.seen, &new.seen, slots);
-        rec.copy(&self.opacity_sum, &new.opacity_sum, anchors);
-        rec.copy(&self.visits, &new.visits, anchors);
-        Ok(new)
+    pub fn reserve(&mut self, gpu: &Gpu, count: u32, capacity: u32) -> Result<(), Error> {
+        let [kept, anchors] = [count, capacity].map(|n| n as usize);
+        let offsets = self.offsets as usize;
+        lengthen(gpu, &mut self.gradient, anchors * offsets, kept * offsets)?;
+        lengthen(gpu, &mut self.seen, anchors * offsets, kept * offsets)?;
+        lengthen(gpu, &mut self.opacity_sum, anchors, kept)?;
+        lengthen(gpu, &mut self.visits, anchors, kept)
     }
 
     /// Adds a step: for each Gaussian drawn (it touches a tile, so it exists and lies in front of the near plane) the

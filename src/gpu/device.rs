@@ -11,7 +11,14 @@ use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, Allocator, Allocat
 
 use super::error::{Error, Named};
 use super::kernel::Kernel;
+use super::ledger::{Ledger, Rehearsal};
 use super::recorder::Context;
+
+/// Bytes that are taken from the device at once for small buffers; larger buffers get memory of their own.
+const DEVICE_BLOCK: u64 = 32 << 20;
+const HOST_BLOCK: u64 = 16 << 20;
+/// What the device gives beyond the buffers in use: the last block's rest, and as much in gaps.
+pub const SPARE_BYTES: u64 = 2 * DEVICE_BLOCK + HOST_BLOCK;
 
 /// How to open a device.
 #[derive(Clone, Debug, Default)]
@@ -47,7 +54,7 @@ pub struct DeviceInfo {
     pub api: String,
     /// Threads of a subgroup.
     pub subgroup_size: u32,
-    /// Bytes one storage binding holds.
+    /// Bytes one storage binding holds: the range of a binding, the size of a buffer or of an allocation, the least.
     pub max_binding_bytes: u64,
     /// Bytes of the largest device-local heap.
     pub heap_bytes: u64,
@@ -61,11 +68,15 @@ pub struct DeviceInfo {
     pub lacks: Vec<String>,
 }
 
-/// An open device. Cheap to clone.
+/// An open device, or a rehearsal of one. Cheap to clone.
 #[derive(Clone)]
-pub struct Gpu(Arc<Inner>);
+pub struct Gpu {
+    inner: Arc<Inner>,
+    rehearsal: Option<Arc<Rehearsal>>,
+}
 
 pub(super) struct Pipeline {
+    name: &'static str,
     pub raw: vk::Pipeline,
     pub layout: vk::PipelineLayout,
     set: vk::DescriptorSetLayout,
@@ -82,14 +93,15 @@ pub(super) struct Inner {
     pub options: Options,
     pub contexts: Mutex<Vec<Context>>,
     pub debug: Option<ash::ext::debug_utils::Device>,
-    pub live: Mutex<HashMap<u64, (&'static str, u64)>>,
+    pub ledger: Ledger,
     in_flight: Mutex<u32>,
     trash: Mutex<Vec<(vk::Buffer, Allocation)>>,
     pipelines: Mutex<HashMap<PipelineKey, Arc<Pipeline>>>,
     cache: vk::PipelineCache,
     allocator: Mutex<Option<Allocator>>,
     messages: Arc<Mutex<Vec<String>>>,
-    allocated: Mutex<(u64, u64)>,
+    physical: vk::PhysicalDevice,
+    memory_budget: bool,
     messenger: Option<(ash::ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
     instance: ash::Instance,
     _entry: ash::Entry,
@@ -184,7 +196,9 @@ fn list(instance: &ash::Instance) -> Result<Vec<(vk::PhysicalDevice, DeviceInfo)
 fn describe(instance: &ash::Instance, p: vk::PhysicalDevice, index: usize) -> Result<DeviceInfo, Error> {
     let mut v11 = vk::PhysicalDeviceVulkan11Properties::default();
     let mut v12 = vk::PhysicalDeviceVulkan12Properties::default();
-    let mut properties = vk::PhysicalDeviceProperties2::default().push_next(&mut v11).push_next(&mut v12);
+    let mut v13 = vk::PhysicalDeviceVulkan13Properties::default();
+    let mut properties =
+        vk::PhysicalDeviceProperties2::default().push_next(&mut v11).push_next(&mut v12).push_next(&mut v13);
     let mut f12 = vk::PhysicalDeviceVulkan12Features::default();
     let mut f13 = vk::PhysicalDeviceVulkan13Features::default();
     let mut features = vk::PhysicalDeviceFeatures2::default().push_next(&mut f12).push_next(&mut f13);
@@ -210,6 +224,7 @@ fn describe(instance: &ash::Instance, p: vk::PhysicalDevice, index: usize) -> Re
     need(has(ash::khr::push_descriptor::NAME), "push descriptors (VK_KHR_push_descriptor)");
     need(f12.scalar_block_layout != 0, "scalar block layout");
     need(f13.synchronization2 != 0, "synchronization2");
+    need(f13.maintenance4 != 0, "maintenance4");
     need(
         f13.subgroup_size_control != 0 && f13.compute_full_subgroups != 0,
         "subgroup size control with full subgroups",
@@ -238,6 +253,8 @@ fn describe(instance: &ash::Instance, p: vk::PhysicalDevice, index: usize) -> Re
     let heaps = &memory.memory_heaps[..memory.memory_heap_count as usize];
     let local = heaps.iter().filter(|h| h.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL)).map(|h| h.size).max();
     let version = core.api_version;
+    // One binding is a whole buffer, and a buffer one allocation at most. A driver before 1.3 leaves the last limit at 0.
+    let limits = [u64::from(core.limits.max_storage_buffer_range), v11.max_memory_allocation_size, v13.max_buffer_size];
     Ok(DeviceInfo {
         index,
         name: text(core.device_name_as_c_str()),
@@ -250,7 +267,7 @@ fn describe(instance: &ash::Instance, p: vk::PhysicalDevice, index: usize) -> Re
             vk::api_version_patch(version)
         ),
         subgroup_size: v11.subgroup_size,
-        max_binding_bytes: u64::from(core.limits.max_storage_buffer_range),
+        max_binding_bytes: limits.into_iter().filter(|&bytes| bytes > 0).min().unwrap_or(0),
         heap_bytes: local.unwrap_or(0),
         shared_bytes: core.limits.max_compute_shared_memory_size,
         max_groups: core.limits.max_compute_work_group_count[0],
@@ -328,6 +345,12 @@ impl Gpu {
         } else {
             None
         };
+        // SAFETY: a plain query of a live instance.
+        let extensions = unsafe { instance.enumerate_device_extension_properties(physical) };
+        let extensions = extensions.named("listing device extensions")?;
+        let memory_budget = extensions
+            .iter()
+            .any(|e| e.extension_name_as_c_str().is_ok_and(|name| name == ash::ext::memory_budget::NAME));
         // SAFETY: the instance and physical device are live; names and features were checked by `describe`.
         let (device, queue, command_pool) = unsafe {
             let families = instance.get_physical_device_queue_family_properties(physical);
@@ -342,6 +365,7 @@ impl Gpu {
             let mut f12 = vk::PhysicalDeviceVulkan12Features::default().scalar_block_layout(true);
             let mut f13 = vk::PhysicalDeviceVulkan13Features::default()
                 .synchronization2(true)
+                .maintenance4(true)
                 .subgroup_size_control(true)
                 .compute_full_subgroups(true);
             let create = vk::DeviceCreateInfo::default()
@@ -363,7 +387,7 @@ impl Gpu {
             physical_device: physical,
             debug_settings: gpu_allocator::AllocatorDebugSettings::default(),
             buffer_device_address: false,
-            allocation_sizes: gpu_allocator::AllocationSizes::default(),
+            allocation_sizes: gpu_allocator::AllocationSizes::new(DEVICE_BLOCK, HOST_BLOCK),
         })
         .map_err(|source| Error::OutOfMemory {
             name: "allocator",
@@ -375,7 +399,7 @@ impl Gpu {
         let cache_info = vk::PipelineCacheCreateInfo::default().initial_data(&stored);
         // SAFETY: the driver checks the header of stored data and ignores another device's.
         let cache = unsafe { device.create_pipeline_cache(&cache_info, None) }.named("creating a pipeline cache")?;
-        Ok(Self(Arc::new(Inner {
+        let inner = Inner {
             push_descriptor: ash::khr::push_descriptor::Device::new(&instance, &device),
             debug: debug_utils.then(|| ash::ext::debug_utils::Device::new(&instance, &device)),
             queue,
@@ -383,51 +407,77 @@ impl Gpu {
             info,
             options: options.clone(),
             contexts: Mutex::default(),
-            live: Mutex::default(),
+            ledger: Ledger::default(),
             in_flight: Mutex::new(0),
             trash: Mutex::default(),
             pipelines: Mutex::default(),
             cache,
             allocator: Mutex::new(Some(allocator)),
             messages,
-            allocated: Mutex::default(),
+            physical,
+            memory_budget,
             messenger,
             device,
             instance,
             _entry: entry,
-        })))
+        };
+        Ok(Self { inner: Arc::new(inner), rehearsal: None })
     }
 
     /// What the device is and can.
     pub fn info(&self) -> &DeviceInfo {
-        &self.0.info
+        &self.inner.info
     }
 
     /// How it was opened.
     pub fn options(&self) -> &Options {
-        &self.0.options
+        &self.inner.options
     }
 
     /// Messages of the validation layer since the last call.
     pub fn take_messages(&self) -> Vec<String> {
-        std::mem::take(&mut *lock(&self.0.messages))
+        std::mem::take(&mut *lock(&self.inner.messages))
     }
 
-    /// Bytes of buffers alive now, and the most there ever were.
-    pub fn memory(&self) -> (u64, u64) {
-        *lock(&self.0.allocated)
-    }
-
-    /// Name, number and bytes of the buffers alive now, the largest first.
-    pub fn buffers(&self) -> Vec<(&'static str, usize, u64)> {
-        let mut sums: HashMap<&'static str, (usize, u64)> = HashMap::new();
-        for &(name, bytes) in lock(&self.0.live).values() {
-            let sum = sums.entry(name).or_default();
-            *sum = (sum.0 + 1, sum.1 + bytes);
+    /// Bytes that buffers of this process can still take on the device: what its driver says is free (memory budget), or
+    /// the size of its largest heap where the driver does not say.
+    pub fn available_bytes(&self) -> u64 {
+        let Inner { instance, physical, info, memory_budget, .. } = &*self.inner;
+        if !memory_budget {
+            return info.heap_bytes;
         }
-        let mut all: Vec<_> = sums.into_iter().map(|(name, (number, bytes))| (name, number, bytes)).collect();
-        all.sort_by(|a, b| b.2.cmp(&a.2).then(a.0.cmp(b.0)));
-        all
+        let mut budget = vk::PhysicalDeviceMemoryBudgetPropertiesEXT::default();
+        let mut memory = vk::PhysicalDeviceMemoryProperties2::default().push_next(&mut budget);
+        // SAFETY: a plain query of a live instance; the extension was listed by the device.
+        unsafe { instance.get_physical_device_memory_properties2(*physical, &mut memory) };
+        let heaps = memory.memory_properties;
+        let local = heaps.memory_heaps[..heaps.memory_heap_count as usize].iter().enumerate();
+        let local = local.filter(|(_, h)| h.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL));
+        let largest = local.max_by_key(|(_, h)| h.size).map(|(i, _)| i);
+        largest.map_or(0, |i| budget.heap_budget[i].saturating_sub(budget.heap_usage[i]))
+    }
+
+    /// Names of the kernels of all pipelines made so far, each once; in a rehearsal, of those that a device would make.
+    pub fn pipelines(&self) -> Vec<&'static str> {
+        if let Some(rehearsal) = &self.rehearsal {
+            return rehearsal.pipelines();
+        }
+        let mut names: Vec<_> = lock(&self.inner.pipelines).values().map(|p| p.name).collect();
+        names.sort_unstable();
+        names.dedup();
+        names
+    }
+
+    pub(super) fn with_rehearsal(&self, rehearsal: Arc<Rehearsal>) -> Self {
+        Self { inner: self.inner.clone(), rehearsal: Some(rehearsal) }
+    }
+
+    pub(super) fn rehearsing(&self) -> Option<&Arc<Rehearsal>> {
+        self.rehearsal.as_ref()
+    }
+
+    pub(super) fn ledger(&self) -> &Ledger {
+        self.rehearsal.as_ref().map_or(&self.inner.ledger, |r| &r.ledger)
     }
 
     /// Waits until the device has nothing left to do.
@@ -436,16 +486,16 @@ impl Gpu {
     /// When the device is lost.
     pub fn wait_idle(&self) -> Result<(), Error> {
         // SAFETY: the only queue is used from the recorder under the same lock discipline.
-        unsafe { self.0.device.device_wait_idle() }.named("waiting for the device")
+        unsafe { self.inner.device.device_wait_idle() }.named("waiting for the device")
     }
 
     /// Writes the pipeline cache to the file named at opening.
     pub fn save_cache(&self) {
-        self.0.save_cache();
+        self.inner.save_cache();
     }
 
     pub(super) fn inner(&self) -> &Arc<Inner> {
-        &self.0
+        &self.inner
     }
 }
 
@@ -462,9 +512,7 @@ impl Inner {
             }
             other => other?,
         };
-        let mut allocated = lock(&self.allocated);
-        allocated.0 += allocation.size();
-        allocated.1 = allocated.1.max(allocated.0);
+        self.ledger.take(allocation.size());
         Ok(allocation)
     }
 
@@ -492,7 +540,7 @@ impl Inner {
         let mut allocator = lock(&self.allocator);
         let Some(allocator) = allocator.as_mut() else { return };
         for (raw, allocation) in lock(&self.trash).drain(..) {
-            lock(&self.allocated).0 -= allocation.size();
+            self.ledger.give(allocation.size());
             // SAFETY: nothing in flight uses the buffer, and its owner is gone.
             unsafe { self.device.destroy_buffer(raw, None) };
             if let Err(error) = allocator.free(allocation) {
@@ -567,7 +615,7 @@ impl Inner {
             if raw == vk::Pipeline::null() {
                 return Err(refused(vk::Result::ERROR_UNKNOWN));
             }
-            Arc::new(Pipeline { raw, layout, set })
+            Arc::new(Pipeline { name: K::NAME, raw, layout, set })
         };
         self.name_object(pipeline.raw, K::NAME);
         lock(&self.pipelines).insert(key, pipeline.clone());

@@ -14,6 +14,8 @@ pub enum Entry {
     Pass {
         /// `folder/stem` of the kernel, or `fill`, `copy`.
         name: &'static str,
+        /// The stage it belongs to.
+        stage: &'static str,
         /// Buffer name and access, in binding order.
         accesses: Vec<(&'static str, Access)>,
     },
@@ -46,7 +48,7 @@ impl fmt::Display for Schedule {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for entry in &self.entries {
             match entry {
-                Entry::Pass { name, accesses } => {
+                Entry::Pass { name, accesses, .. } => {
                     write!(f, "{name}")?;
                     for (buffer, access) in accesses {
                         let mark = match access {

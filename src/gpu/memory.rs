@@ -7,9 +7,10 @@ use ash::vk::{self, Handle as _};
 use gpu_allocator::MemoryLocation;
 use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, AllocationScheme};
 
-use super::device::{Gpu, Inner, lock};
+use super::device::{Gpu, Inner};
 use super::error::{Error, Named};
 use super::hazards::Id;
+use super::ledger::Rehearsal;
 
 /// A typed array on the device. Freed when it and its views are dropped, after the work in flight has ended.
 pub struct Buffer<T> {
@@ -23,8 +24,16 @@ struct Memory {
     raw: vk::Buffer,
     bytes: u64,
     name: &'static str,
-    allocation: Option<Allocation>,
-    gpu: Arc<Inner>,
+    stage: &'static str,
+    backing: Backing,
+}
+
+/// What stands behind a buffer.
+enum Backing {
+    /// Memory of the device, until the buffer is taken apart.
+    Real { allocation: Option<Allocation>, gpu: Arc<Inner> },
+    /// Nothing but an entry in the books; `host` as if the host saw it.
+    Counted { taken: u64, host: bool, rehearsal: Arc<Rehearsal> },
 }
 
 /// A bound buffer without its type.
@@ -67,31 +76,53 @@ impl<T: bytemuck::Pod> Buffer<T> {
     pub fn name(&self) -> &'static str {
         self.memory.name
     }
+    /// The stage it was made for.
+    pub fn stage(&self) -> &'static str {
+        self.memory.stage
+    }
     /// The buffer without its type.
     pub fn slot(&self) -> Slot {
         Slot { raw: self.memory.raw, bytes: self.bytes, name: self.memory.name }
     }
     /// Host view of memory the host can see: of [`Gpu::readback`] buffers only.
     pub(super) fn mapped(&self) -> Option<&[u8]> {
-        self.memory.allocation.as_ref().and_then(Allocation::mapped_slice)
+        match &self.memory.backing {
+            Backing::Real { allocation, .. } => allocation.as_ref().and_then(Allocation::mapped_slice),
+            Backing::Counted { .. } => None,
+        }
+    }
+    /// True if [`Gpu::read`] of it copies nothing on the device.
+    fn on_host(&self) -> bool {
+        matches!(self.memory.backing, Backing::Counted { host: true, .. }) || self.mapped().is_some()
     }
     /// The parts, without the Arc of the device; the caller frees them with [`Inner::discard`].
     pub(super) fn into_parts(self) -> (vk::Buffer, Allocation) {
         let mut memory = Arc::into_inner(self.memory).expect("a buffer without views");
-        let allocation = memory.allocation.take().expect("a buffer owns its memory until it is dropped");
+        let Backing::Real { allocation, .. } = &mut memory.backing else {
+            panic!("{}: taken apart in a rehearsal", memory.name);
+        };
+        let allocation = allocation.take().expect("a buffer owns its memory until it is dropped");
         (memory.raw, allocation)
     }
     fn mapped_mut(&mut self) -> Option<&mut [u8]> {
         let memory = Arc::get_mut(&mut self.memory)?;
-        memory.allocation.as_mut().and_then(Allocation::mapped_slice_mut)
+        match &mut memory.backing {
+            Backing::Real { allocation, .. } => allocation.as_mut().and_then(Allocation::mapped_slice_mut),
+            Backing::Counted { .. } => None,
+        }
     }
 }
 
 impl Drop for Memory {
     fn drop(&mut self) {
-        if let Some(allocation) = self.allocation.take() {
-            lock(&self.gpu.live).remove(&self.raw.as_raw());
-            self.gpu.discard(self.raw, allocation);
+        match &mut self.backing {
+            Backing::Real { allocation, gpu } => {
+                if let Some(allocation) = allocation.take() {
+                    gpu.ledger.close(self.raw.as_raw());
+                    gpu.discard(self.raw, allocation);
+                }
+            }
+            Backing::Counted { taken, rehearsal, .. } => rehearsal.close(self.raw.as_raw(), *taken),
         }
     }
 }
@@ -134,8 +165,10 @@ impl Gpu {
         }
         let mut staging: Buffer<T> = self.allocate("staging", data.len(), MemoryLocation::CpuToGpu)?;
         let bytes: &[u8] = bytemuck::cast_slice(data);
-        let mapped = staging.mapped_mut().expect("staging memory is host visible");
-        mapped[..bytes.len()].copy_from_slice(bytes);
+        if self.rehearsing().is_none() {
+            let mapped = staging.mapped_mut().expect("staging memory is host visible");
+            mapped[..bytes.len()].copy_from_slice(bytes);
+        }
         let mut recorder = self.recorder()?;
         recorder.copy(&staging, buffer, data.len());
         recorder.submit()?.wait()?;
@@ -155,6 +188,13 @@ impl Gpu {
     /// # Errors
     /// As [`Gpu::read`].
     pub fn read_range<T: bytemuck::Pod>(&self, buffer: &Buffer<T>, len: usize) -> Result<Vec<T>, Error> {
+        if let Some(rehearsal) = self.rehearsing() {
+            if !buffer.on_host() {
+                self.read_words(buffer.slot(), (len * size_of::<T>()) as u64)?;
+            }
+            let words = vec![rehearsal.answer(buffer.name()); len * size_of::<T>() / 4];
+            return Ok(bytemuck::pod_collect_to_vec(&words));
+        }
         if let Some(bytes) = buffer.mapped() {
             return Ok(bytemuck::pod_collect_to_vec(&bytes[..len * size_of::<T>()]));
         }
@@ -171,6 +211,9 @@ impl Gpu {
         let mut recorder = self.recorder()?;
         recorder.copy_bytes(slot, staging.slot(), bytes);
         recorder.submit()?.wait()?;
+        if self.rehearsing().is_some() {
+            return Ok(vec![]);
+        }
         let mapped = staging.mapped().expect("readback memory is host visible");
         Ok(bytemuck::pod_collect_to_vec(&mapped[..bytes as usize]))
     }
@@ -195,6 +238,18 @@ impl Gpu {
         // Padded, so that a view as 16-byte vectors reaches the last element.
         let padded = bytes.next_multiple_of(16);
         let info = vk::BufferCreateInfo::default().size(padded).usage(usage);
+        if let Some(rehearsal) = self.rehearsing() {
+            let create = vk::DeviceBufferMemoryRequirements::default().create_info(&info);
+            let mut requirements = vk::MemoryRequirements2::default();
+            // SAFETY: a plain query of a live device.
+            unsafe { inner.device.get_device_buffer_memory_requirements(&create, &mut requirements) };
+            let taken = requirements.memory_requirements.size;
+            let raw = vk::Buffer::from_raw(rehearsal.open(name, padded, taken));
+            let host = location != MemoryLocation::GpuOnly;
+            let backing = Backing::Counted { taken, host, rehearsal: rehearsal.clone() };
+            let memory = Memory { raw, bytes: padded, name, stage: self.ledger().stage(), backing };
+            return Ok(Buffer { memory: Arc::new(memory), bytes, len, element: PhantomData });
+        }
         // SAFETY: the device outlives the buffer (the buffer holds an Arc of it), and the memory is bound before use.
         let (raw, requirements) = unsafe {
             let raw = inner.device.create_buffer(&info, None).named("creating a buffer")?;
@@ -219,8 +274,9 @@ impl Gpu {
         unsafe { inner.device.bind_buffer_memory(raw, allocation.memory(), allocation.offset()) }
             .named("binding a buffer's memory")?;
         inner.name_object(raw, name);
-        lock(&inner.live).insert(raw.as_raw(), (name, padded));
-        let memory = Memory { raw, bytes: padded, name, allocation: Some(allocation), gpu: inner.clone() };
+        inner.ledger.open(raw.as_raw(), name, padded);
+        let backing = Backing::Real { allocation: Some(allocation), gpu: inner.clone() };
+        let memory = Memory { raw, bytes: padded, name, stage: self.ledger().stage(), backing };
         Ok(Buffer { memory: Arc::new(memory), bytes, len, element: PhantomData })
     }
 }

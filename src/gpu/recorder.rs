@@ -1,5 +1,7 @@
 //! Recording passes: barriers, labels, timestamps and crash markers come from one function.
 
+use std::sync::Arc;
+
 use ash::vk;
 use gpu_allocator::vulkan::Allocation;
 
@@ -8,6 +10,7 @@ use super::device::{Gpu, Inner, lock};
 use super::error::{Error, Named};
 use super::hazards::{Entry, Hazards, Id, Schedule};
 use super::kernel::{Access, Reference};
+use super::ledger::{NO_STAGE, Rehearsal};
 use super::memory::{Buffer, Slot};
 use super::timings::Timing;
 
@@ -72,7 +75,7 @@ impl Context {
     fn new(gpu: &Gpu) -> Result<Self, Error> {
         let inner = gpu.inner();
         // Without its Arc of the device: the device owns its contexts.
-        let markers = gpu.readback::<u32>("markers", MAX_PASSES as usize)?.into_parts();
+        let markers = gpu.stage(NO_STAGE, || gpu.readback::<u32>("markers", MAX_PASSES as usize))?.into_parts();
         let allocate =
             vk::CommandBufferAllocateInfo::default().command_pool(inner.command_pool).command_buffer_count(1);
         let queries =
@@ -107,6 +110,9 @@ pub struct Recorder<'g> {
     hazards: Hazards,
     schedule: Schedule,
     passes: Vec<&'static str>,
+    stage: &'static str,
+    /// In a rehearsal, in place of a context.
+    rehearsal: Option<Arc<Rehearsal>>,
     error: Option<Error>,
     differences: Option<Vec<Difference>>,
 }
@@ -116,6 +122,7 @@ pub struct Recorder<'g> {
 pub struct Submission<'g> {
     gpu: &'g Gpu,
     context: Option<Context>,
+    rehearsal: Option<Arc<Rehearsal>>,
     passes: Vec<&'static str>,
     /// What was recorded.
     pub schedule: Schedule,
@@ -129,13 +136,25 @@ impl Gpu {
     /// # Errors
     /// When the device has no memory for a command buffer.
     pub fn recorder(&self) -> Result<Recorder<'_>, Error> {
-        let context = lock(&self.inner().contexts).pop();
-        let context = context.map_or_else(|| Context::new(self), Ok)?;
+        let rehearsal = self.rehearsing().cloned();
         // From here on the device may come to use whatever is recorded: dropped buffers wait.
-        self.inner().began();
+        let context = match &rehearsal {
+            Some(rehearsal) => {
+                rehearsal.began();
+                None
+            }
+            None => {
+                let context = lock(&self.inner().contexts).pop();
+                let context = context.map_or_else(|| Context::new(self), Ok)?;
+                self.inner().began();
+                Some(context)
+            }
+        };
         let mut recorder = Recorder {
             gpu: self,
-            context: Some(context),
+            context,
+            stage: self.ledger().stage(),
+            rehearsal,
             hazards: Hazards::default(),
             schedule: Schedule::default(),
             passes: vec![],
@@ -150,7 +169,11 @@ impl Gpu {
     ///
     /// # Errors
     /// As [`Gpu::recorder`].
+    ///
+    /// # Panics
+    /// In a rehearsal, which has no numbers to compare.
     pub fn checked(&self) -> Result<Recorder<'_>, Error> {
+        assert!(self.rehearsing().is_none(), "a rehearsal has no numbers to compare");
         let mut recorder = self.recorder()?;
         recorder.differences = Some(vec![]);
         Ok(recorder)
@@ -165,6 +188,11 @@ impl<'g> Recorder<'g> {
     /// The device it records for.
     pub fn gpu(&self) -> &'g Gpu {
         self.gpu
+    }
+
+    /// What is recorded from now on belongs to this stage.
+    pub fn stage(&mut self, stage: &'static str) {
+        self.stage = stage;
     }
 
     /// Runs kernel `K` with default constants on so many threads.
@@ -261,12 +289,17 @@ impl<'g> Recorder<'g> {
         if groups.contains(&0) {
             return Ok(());
         }
-        let pipeline = self.gpu.inner().pipeline::<K>(constants)?;
         let mut accesses: Vec<(Id, &'static str, Access)> =
             slots.iter().zip(K::BINDINGS).map(|(s, b)| (s.id(), s.name, b.access)).collect();
         if let Threads::Counted(counted) = threads {
             accesses.push((counted.buffer.slot().id(), counted.buffer.name(), Access::Read));
         }
+        if let Some(rehearsal) = &self.rehearsal {
+            rehearsal.pipeline(K::NAME);
+            self.pass(K::NAME, &accesses, |_| {});
+            return Ok(());
+        }
+        let pipeline = self.gpu.inner().pipeline::<K>(constants)?;
         let infos: Vec<_> =
             slots.iter().map(|s| [vk::DescriptorBufferInfo::default().buffer(s.raw).range(s.bytes)]).collect();
         let writes: Vec<_> = infos
@@ -376,13 +409,21 @@ impl<'g> Recorder<'g> {
     ) {
         let inner = self.gpu.inner();
         let reasons = self.hazards.enter(name, accesses, inner.options.serialize);
+        let waits = !reasons.is_empty();
+        if waits {
+            self.schedule.entries.push(Entry::Barrier { reasons });
+        }
+        let stage = self.stage;
+        let listed = accesses.iter().map(|(_, buffer, access)| (*buffer, *access)).collect();
+        self.schedule.entries.push(Entry::Pass { name, stage, accesses: listed });
+        if let Some(rehearsal) = &self.rehearsal {
+            rehearsal.pass(stage, name);
+            return;
+        }
         let context = self.context.as_ref().expect("a recorder has its context until it is submitted");
         let commands = context.commands;
-        if !reasons.is_empty() {
-            self.schedule.entries.push(Entry::Barrier { reasons });
-            if !inner.options.omit_barriers {
-                barrier(inner, commands);
-            }
+        if waits && !inner.options.omit_barriers {
+            barrier(inner, commands);
         }
         let index = self.passes.len() as u32;
         let tracked = index < MAX_PASSES;
@@ -412,11 +453,12 @@ impl<'g> Recorder<'g> {
             }
         }
         self.passes.push(name);
-        let accesses = accesses.iter().map(|(_, buffer, access)| (*buffer, *access)).collect();
-        self.schedule.entries.push(Entry::Pass { name, accesses });
     }
 
     fn begin(&mut self) -> Result<(), Error> {
+        if self.rehearsal.is_some() {
+            return Ok(());
+        }
         let inner = self.gpu.inner();
         let context = self.context.as_ref().expect("begin comes before submit");
         let info = vk::CommandBufferBeginInfo::default().flags(vk::CommandBufferUsageFlags::ONE_TIME_SUBMIT);
@@ -443,10 +485,10 @@ impl<'g> Recorder<'g> {
         if let Some(error) = self.error.take() {
             return Err(error);
         }
-        let context = self.context.take().expect("a recorder is submitted once");
         let submission = Submission {
             gpu: self.gpu,
-            context: Some(context),
+            context: self.context.take(),
+            rehearsal: self.rehearsal.take(),
             passes: std::mem::take(&mut self.passes),
             schedule: std::mem::take(&mut self.schedule),
             differences: self.differences.take().unwrap_or_default(),
@@ -466,6 +508,7 @@ impl<'g> Recorder<'g> {
         let submission = Submission {
             gpu: self.gpu,
             context: Some(context),
+            rehearsal: None,
             passes,
             schedule: Schedule::default(),
             differences: vec![],
@@ -481,6 +524,9 @@ impl<'g> Recorder<'g> {
 
 impl Drop for Recorder<'_> {
     fn drop(&mut self) {
+        if let Some(rehearsal) = self.rehearsal.take() {
+            rehearsal.ended();
+        }
         if let Some(context) = self.context.take() {
             // SAFETY: recording, never submitted; ending it makes it reusable.
             let _ = unsafe { self.gpu.inner().device.end_command_buffer(context.commands) };
@@ -509,6 +555,9 @@ fn barrier(inner: &Inner, commands: vk::CommandBuffer) {
 
 impl Submission<'_> {
     fn start(&self) -> Result<(), Error> {
+        if self.rehearsal.is_some() {
+            return Ok(());
+        }
         let inner = self.gpu.inner();
         let context = self.context.as_ref().expect("a submission holds its context until it is waited for");
         let host = [vk::MemoryBarrier2::default()
@@ -547,6 +596,9 @@ impl Submission<'_> {
     /// # Errors
     /// [`Error::DeviceLost`] with the last pass reached.
     pub fn wait(mut self) -> Result<Vec<Timing>, Error> {
+        if self.rehearsal.is_some() {
+            return Ok(vec![]);
+        }
         let inner = self.gpu.inner().clone();
         let context = self.context.as_ref().expect("waited for once");
         // SAFETY: the fence was given to the queue in `start`.
@@ -591,6 +643,9 @@ impl Submission<'_> {
 
 impl Drop for Submission<'_> {
     fn drop(&mut self) {
+        if let Some(rehearsal) = self.rehearsal.take() {
+            rehearsal.ended();
+        }
         if let Some(context) = self.context.take() {
             let inner = self.gpu.inner();
             // SAFETY: given to the queue in `start`; a failure here means the device is lost and nothing runs any more.

@@ -14,6 +14,7 @@ pub use config::Config;
 mod sum;
 
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
+use crate::stage;
 
 pub use align::Quantity;
 pub use frame::{Rectangle, Weights, pack};
@@ -118,7 +119,8 @@ impl Losses {
     /// As [`Gpu::buffer`].
     pub fn new(gpu: &Gpu, plan: &Plan) -> Result<Self, Error> {
         let Plan { size, masks, gradient_scales: scales, .. } = *plan;
-        let gradient = || depth_gradient::DepthGradient::new(gpu, size, scales, masks);
+        let gradient =
+            || gpu.stage(stage::DEPTH_GRADIENT, || depth_gradient::DepthGradient::new(gpu, size, scales, masks));
         let depth = || -> Result<Depth, Error> {
             Ok(Depth {
                 align: align::Align::new(gpu, size)?,
@@ -126,11 +128,13 @@ impl Losses {
                 gradient: if scales > 0 { Some(gradient()?) } else { None },
             })
         };
-        Ok(Self {
-            frame: frame::Frame::new(gpu, size, masks, plan.depth)?,
-            photometric: photometric::Photometric::new(gpu, size, plan.ssim_weight)?,
-            depth: if plan.depth { Some(depth()?) } else { None },
-            terms: gpu.buffer("losses", Term::ALL.len())?,
+        gpu.stage(stage::PHOTOMETRIC, || {
+            Ok(Self {
+                frame: frame::Frame::new(gpu, size, masks, plan.depth)?,
+                photometric: photometric::Photometric::new(gpu, size, plan.ssim_weight)?,
+                depth: if plan.depth { Some(gpu.stage(stage::DEPTH, depth)?) } else { None },
+                terms: gpu.buffer("losses", Term::ALL.len())?,
+            })
         })
     }
 
@@ -144,6 +148,7 @@ impl Losses {
         rgb: &Buffer<[f32; 3]>,
         depth: Option<&Buffer<f32>>,
     ) -> Gradients<'_> {
+        rec.stage(stage::PHOTOMETRIC);
         self.frame.forward(rec, view.picture, view.weights, view.depth.map(|d| (d.weights, d.rectangle)));
         self.compare(rec, view.depth, rgb, depth)
     }
@@ -162,11 +167,13 @@ impl Losses {
         depth: Option<&Buffer<f32>>,
     ) -> Gradients<'_> {
         let Self { frame, photometric, depth: stages, terms } = self;
+        rec.stage(stage::PHOTOMETRIC);
         rec.zero(terms);
         let slot = Term::Photometric as u32;
         let grad_rgb = photometric.forward_backward(rec, rgb, frame.target(), frame.weight(), terms, slot);
         let planned = stages.as_ref().zip(depth).zip(view);
         let grad_depth = planned.map(|((Depth { align, l1, gradient }, depth), view)| {
+            rec.stage(stage::DEPTH);
             let prior = align::Prior { values: view.prior, quantity: view.quantity, valid: frame.valid() };
             let fit = align.forward(rec, depth, prior);
             let weight =
@@ -176,7 +183,9 @@ impl Losses {
             if let Some(gradient) = gradient.as_ref().filter(|_| view.gradient != 0.0) {
                 let valid = frame.valid().filter(|_| !view.gradient_inside);
                 let slot = Term::DepthGradient as u32;
+                rec.stage(stage::DEPTH_GRADIENT);
                 gradient.forward_backward(rec, difference, grad_aligned, valid, view.gradient, terms, slot);
+                rec.stage(stage::DEPTH);
             }
             align.backward(rec, grad_aligned, depth, prior)
         });

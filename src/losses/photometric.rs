@@ -5,7 +5,9 @@
 
 use crate::gpu::kernels::losses::{
     photometric_adjoint as adjoint, photometric_columns as columns, photometric_columns_weighted as columns_weighted,
-    photometric_gradient as gradient, photometric_gradient_weighted as gradient_weighted, photometric_rows as rows,
+    photometric_gradient as gradient, photometric_gradient_l1 as gradient_l1,
+    photometric_gradient_l1_weighted as gradient_l1_weighted, photometric_gradient_weighted as gradient_weighted,
+    photometric_rows as rows,
 };
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::math::ssim;
@@ -119,7 +121,7 @@ impl Reference for adjoint::Kernel {
 }
 
 struct Pictures<'a> {
-    grad_rows: &'a [[f32; 3]],
+    grad_rows: Option<&'a [[f32; 3]]>,
     rendered: &'a [[f32; 3]],
     target: &'a [[f32; 3]],
     weight: Option<&'a [f32]>,
@@ -134,8 +136,9 @@ fn gradient_reference(from: &Pictures<'_>, grad_rendered: &mut [[f32; 3]], parti
             let scale = f64::from(push.factor) * from.weight.map_or(1.0, |w| f64::from(w[pixel]));
             for (c, grad) in grad_rendered[pixel].iter_mut().enumerate() {
                 let (a, b) = (f64::from(from.rendered[pixel][c]), f64::from(from.target[pixel][c]));
-                let s: [f64; 3] = std::array::from_fn(|k| {
-                    ssim::blur(y, height, |y: usize| f64::from(from.grad_rows[(y * width + x) * 3 + c][k]))
+                let s: [f64; 3] = from.grad_rows.map_or([0.0; 3], |rows| {
+                    let row = |k: usize| move |y: usize| f64::from(rows[(y * width + x) * 3 + c][k]);
+                    std::array::from_fn(|k| ssim::blur(y, height, row(k)))
                 });
                 losses[(y / RUN * width + x) / 64] += scale * (a - b).abs();
                 let sign = if a == b { 0.0 } else { (a - b).signum() };
@@ -160,7 +163,8 @@ fn gradient_check(binding: &str) -> Check {
 
 impl Reference for gradient::Kernel {
     fn reference(host: gradient::Host<'_>, push: gradient::Push, (): ()) {
-        let from = Pictures { grad_rows: host.grad_rows, rendered: host.rendered, target: host.target, weight: None };
+        let from =
+            Pictures { grad_rows: Some(host.grad_rows), rendered: host.rendered, target: host.target, weight: None };
         gradient_reference(&from, host.grad_rendered, host.partial, push);
     }
     fn check(binding: &'static str) -> Check {
@@ -171,7 +175,28 @@ impl Reference for gradient::Kernel {
 impl Reference for gradient_weighted::Kernel {
     fn reference(host: gradient_weighted::Host<'_>, push: gradient_weighted::Push, (): ()) {
         let weight = Some(host.weight);
-        let from = Pictures { grad_rows: host.grad_rows, rendered: host.rendered, target: host.target, weight };
+        let from = Pictures { grad_rows: Some(host.grad_rows), rendered: host.rendered, target: host.target, weight };
+        gradient_reference(&from, host.grad_rendered, host.partial, bytemuck::cast(push));
+    }
+    fn check(binding: &'static str) -> Check {
+        gradient_check(binding)
+    }
+}
+
+impl Reference for gradient_l1::Kernel {
+    fn reference(host: gradient_l1::Host<'_>, push: gradient_l1::Push, (): ()) {
+        let from = Pictures { grad_rows: None, rendered: host.rendered, target: host.target, weight: None };
+        gradient_reference(&from, host.grad_rendered, host.partial, bytemuck::cast(push));
+    }
+    fn check(binding: &'static str) -> Check {
+        gradient_check(binding)
+    }
+}
+
+impl Reference for gradient_l1_weighted::Kernel {
+    fn reference(host: gradient_l1_weighted::Host<'_>, push: gradient_l1_weighted::Push, (): ()) {
+        let weight = Some(host.weight);
+        let from = Pictures { grad_rows: None, rendered: host.rendered, target: host.target, weight };
         gradient_reference(&from, host.grad_rendered, host.partial, bytemuck::cast(push));
     }
     fn check(binding: &'static str) -> Check {
@@ -200,26 +225,37 @@ fn column_groups(size: [u32; 2]) -> [usize; 2] {
 pub struct Photometric {
     size: [u32; 2],
     ssim_weight: f32,
-    moments: Buffer<[f32; 4]>,
-    grad_moments: Buffer<[f32; 3]>,
-    grad_rows: Buffer<[f32; 3]>,
+    ssim: Option<Ssim>,
     grad_rendered: Buffer<[f32; 3]>,
     partial: Buffer<f32>,
 }
 
+#[derive(Debug)]
+struct Ssim {
+    moments: Buffer<[f32; 4]>,
+    grad_moments: Buffer<[f32; 3]>,
+    grad_rows: Buffer<[f32; 3]>,
+}
+
 impl Photometric {
-    /// For pictures of `size` = width, height. `ssim_weight` is the share of 1 - SSIM, the rest is L1.
+    /// For pictures of `size` = width, height. `ssim_weight` is the share of 1 - SSIM, the rest is L1; at 0 there is
+    /// nothing for SSIM.
     ///
     /// # Errors
     /// As [`Gpu::buffer`].
     pub fn new(gpu: &Gpu, size: [u32; 2], ssim_weight: f32) -> Result<Self, Error> {
         let pixels = size[0] as usize * size[1] as usize;
+        let ssim = || -> Result<Ssim, Error> {
+            Ok(Ssim {
+                moments: gpu.buffer("ssim_moments", 3 * pixels)?,
+                grad_moments: gpu.buffer("grad_ssim_moments", 3 * pixels)?,
+                grad_rows: gpu.buffer("grad_ssim_rows", 3 * pixels)?,
+            })
+        };
         Ok(Self {
             size,
             ssim_weight,
-            moments: gpu.buffer("ssim_moments", 3 * pixels)?,
-            grad_moments: gpu.buffer("grad_ssim_moments", 3 * pixels)?,
-            grad_rows: gpu.buffer("grad_ssim_rows", 3 * pixels)?,
+            ssim: if ssim_weight > 0.0 { Some(ssim()?) } else { None },
             grad_rendered: gpu.buffer("grad_rgb", pixels)?,
             partial: gpu.buffer("photometric_partial", column_groups(size).iter().sum())?,
         })
@@ -238,13 +274,29 @@ impl Photometric {
         losses: &Buffer<f32>,
         slot: u32,
     ) -> &Buffer<[f32; 3]> {
-        let Self { size, moments, grad_moments, grad_rows, grad_rendered, partial, .. } = self;
+        let Self { size, ssim, grad_rendered, partial, .. } = self;
         let size = *size;
         let per_value = 1.0 / (3.0 * f64::from(size[0]) * f64::from(size[1]));
         let share = f64::from(self.ssim_weight);
         let (of_ssim, of_l1) = ((share * per_value) as f32, ((1.0 - share) * per_value) as f32);
         let (across, down) = (row_runs(size), column_runs(size));
         let [first, last] = column_groups(size).map(|n| n as u32);
+        let Some(Ssim { moments, grad_moments, grad_rows }) = ssim else {
+            let (factor, first) = (of_l1, 0);
+            match weight {
+                None => {
+                    let buffers = gradient_l1::Buffers { rendered, target, grad_rendered, partial };
+                    rec.run(gradient_l1::Kernel, buffers, gradient_l1::Push { size, factor, first }, down);
+                }
+                Some(weight) => {
+                    let buffers = gradient_l1_weighted::Buffers { rendered, target, grad_rendered, partial, weight };
+                    let push = gradient_l1_weighted::Push { size, factor, first };
+                    rec.run(gradient_l1_weighted::Kernel, buffers, push, down);
+                }
+            }
+            sum::record(rec, partial, last, 1, losses, slot);
+            return grad_rendered;
+        };
         rec.run(rows::Kernel, rows::Buffers { rendered, target, moments }, rows::Push { size }, across);
         match weight {
             None => {
@@ -362,6 +414,19 @@ mod tests {
                     down,
                 );
                 let gradient::Arrays { grad_rows, rendered, target, grad_rendered, partial } = case;
+                let l1 = gradient_l1::Arrays {
+                    rendered: rendered.clone(),
+                    target: target.clone(),
+                    grad_rendered: grad_rendered.clone(),
+                    partial: partial.clone(),
+                };
+                let push = gradient_l1::Push { size, factor: 0.7, first };
+                testing::assert_twin(gradient_l1::Kernel, &gpu, l1.clone(), push, down);
+                let gradient_l1::Arrays { rendered: a, target: b, grad_rendered: g, partial: p } = l1;
+                let weight = weights(size);
+                let l1 = gradient_l1_weighted::Arrays { rendered: a, target: b, grad_rendered: g, partial: p, weight };
+                let push = gradient_l1_weighted::Push { size, factor: 0.7, first };
+                testing::assert_twin(gradient_l1_weighted::Kernel, &gpu, l1, push, down);
                 let weight = weights(size);
                 let case = gradient_weighted::Arrays { grad_rows, rendered, target, grad_rendered, partial, weight };
                 let push = gradient_weighted::Push { size, factor: 0.7, first };

@@ -1,6 +1,6 @@
 //! The anchors on the device: everything that is learnt per anchor, with Adam's moments.
 
-use crate::gpu::{Buffer, Error, Gpu, Recorder};
+use crate::gpu::{Buffer, Error, Gpu};
 use crate::model::files;
 
 /// One learnt array, `width` floats per anchor, with its moments.
@@ -22,16 +22,34 @@ impl Parameter {
     /// # Errors
     /// As [`Gpu::buffer`].
     pub fn new(gpu: &Gpu, names: [&'static str; 3], width: u32, capacity: u32) -> Result<Self, Error> {
-        // Whole vectors of four, which the optimiser works in, and of three, as which offsets are viewed.
-        let len = (capacity as usize * width as usize).next_multiple_of(12);
+        let len = Self::len(capacity, width);
         let [value, first, root] = names;
         Ok(Self { value: gpu.buffer(value, len)?, first: gpu.buffer(first, len)?, root: gpu.buffer(root, len)?, width })
+    }
+
+    fn len(capacity: u32, width: u32) -> usize {
+        // Whole vectors of four, which the optimiser works in, and of three, as which offsets are viewed.
+        (capacity as usize * width as usize).next_multiple_of(12)
     }
 
     /// Value and moments.
     pub fn tensors(&self) -> [&Buffer<f32>; 3] {
         [&self.value, &self.first, &self.root]
     }
+}
+
+/// Puts `buffer` into one of `len` elements: the first `kept` as they are, zero behind them.
+///
+/// # Errors
+/// As [`Gpu::buffer`].
+pub fn lengthen<T: bytemuck::Pod>(gpu: &Gpu, buffer: &mut Buffer<T>, len: usize, kept: usize) -> Result<(), Error> {
+    let longer = gpu.stage(buffer.stage(), || gpu.buffer(buffer.name(), len))?;
+    let mut rec = gpu.recorder()?;
+    rec.zero(&longer);
+    rec.copy(buffer, &longer, kept);
+    rec.submit()?.wait()?;
+    *buffer = longer;
+    Ok(())
 }
 
 /// The anchors, with room for `capacity`; the first `count` are in use. Their positions do not move.
@@ -100,21 +118,23 @@ impl Anchors {
         [&self.feature, &self.offset, &self.log_scaling]
     }
 
-    /// The same anchors in buffers with room for `capacity`; the copy is recorded.
+    /// Makes room for `capacity` anchors and keeps what there is, an array at a time: beside the model only the largest of
+    /// its arrays exists twice. Nothing that uses the anchors may be in flight.
     ///
     /// # Errors
-    /// As [`Gpu::buffer`].
-    pub fn grown(&self, rec: &mut Recorder<'_>, capacity: u32) -> Result<Self, Error> {
-        let mut new = Self::empty(rec.gpu(), self.offsets, capacity.max(self.count))?;
-        new.count = self.count;
-        rec.copy(&self.position, &new.position, self.count as usize);
-        for (from, to) in self.parameters().into_iter().zip(new.parameters()) {
-            for (from_tensor, to_tensor) in from.tensors().into_iter().zip(to.tensors()) {
-                rec.zero(to_tensor);
-                rec.copy(from_tensor, to_tensor, (self.count * from.width) as usize);
+    /// As [`Gpu::buffer`]; the anchors are the same then, some of their arrays longer.
+    pub fn reserve(&mut self, gpu: &Gpu, capacity: u32) -> Result<(), Error> {
+        let (capacity, count) = (capacity.max(self.count), self.count as usize);
+        lengthen(gpu, &mut self.position, capacity as usize, count)?;
+        for parameter in [&mut self.feature, &mut self.offset, &mut self.log_scaling] {
+            let width = parameter.width as usize;
+            let len = Parameter::len(capacity, parameter.width);
+            for tensor in [&mut parameter.value, &mut parameter.first, &mut parameter.root] {
+                lengthen(gpu, tensor, len, count * width)?;
             }
         }
-        Ok(new)
+        self.capacity = capacity;
+        Ok(())
     }
 
     /// The model as it is now.
@@ -150,13 +170,11 @@ mod tests {
             offsets_per_anchor: 10,
             log_scaling: (0..n).map(|i| std::array::from_fn(|c| (i + c) as f32)).collect(),
         };
-        let anchors = Anchors::upload(&gpu, &model, 0).unwrap();
+        let mut anchors = Anchors::upload(&gpu, &model, 0).unwrap();
         assert_eq!(anchors.read(&gpu).unwrap(), model);
-        let mut rec = gpu.recorder().unwrap();
-        let grown = anchors.grown(&mut rec, 20).unwrap();
-        rec.submit().unwrap().wait().unwrap();
-        assert_eq!((grown.count, grown.capacity), (7, 20));
-        assert_eq!(grown.read(&gpu).unwrap(), model);
-        assert_eq!(gpu.read_range(&grown.offset.root, 210).unwrap(), vec![0.0; 210]);
+        anchors.reserve(&gpu, 20).unwrap();
+        assert_eq!((anchors.count, anchors.capacity), (7, 20));
+        assert_eq!(anchors.read(&gpu).unwrap(), model);
+        assert_eq!(gpu.read(&anchors.offset.root).unwrap(), vec![0.0; 600]);
     }
 }

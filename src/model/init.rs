@@ -89,6 +89,16 @@ pub fn anchors(points: &[[f32; 3]], voxel: f64, offsets_per_anchor: usize) -> Re
     Ok(Initial { anchors, voxel })
 }
 
+/// Anchors for these points at the voxel that the settings name, or at the one derived from the points times its factor.
+///
+/// # Errors
+/// As [`anchors`].
+pub fn from_points(points: &[[f32; 3]], config: &super::Config) -> Result<Initial, Error> {
+    let derived = || median_nearest_distance(points).map_or(0.0, |d| d * config.voxel_factor);
+    let voxel = if config.voxel > 0.0 { config.voxel } else { derived() };
+    anchors(points, voxel, config.offsets as usize)
+}
+
 /// Mean distance of each position to its three nearest neighbours, or to as many as there are; at least `floor`.
 ///
 /// `floor` must be positive. It is what a lone position gets, and it keeps the logarithm finite where positions coincide:

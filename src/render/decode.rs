@@ -10,8 +10,9 @@
 //! rounding error is at most `(n / 1024 + 64 + 32 + 32) 2^-24` of the sum of the terms' magnitudes.
 
 use crate::gpu::kernels::render::{
-    decode, decode_backward, decode_backward_feature, decode_backward_first, decode_backward_hidden,
-    decode_backward_second, decode_backward_weights, decode_hidden, decode_input, decode_pack,
+    decode, decode_backward, decode_backward_feature, decode_backward_first, decode_backward_fixed,
+    decode_backward_fixed_offset, decode_backward_fixed_scaling, decode_backward_hidden, decode_backward_second,
+    decode_backward_weights, decode_hidden, decode_input, decode_pack,
 };
 use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
 use crate::math::camera::{from_center, split};
@@ -165,50 +166,67 @@ impl Reference for decode::Kernel {
     }
 }
 
-impl Reference for decode_backward::Kernel {
-    fn reference(host: decode_backward::Host<'_>, (): (), constants: decode_backward::Constants) {
-        let layout = Layout { offsets: constants.offsets as usize };
-        let grad_output = host.grad_output.as_flattened_mut();
-        for v in 0..host.groups[3] as usize {
-            let anchor = host.visible[v] as usize;
-            let log_scaling = six(host.log_scaling, anchor);
-            let mut sum = [0.0; 6];
-            grad_output[v * layout.rows()..][..layout.rows()].fill(0.0);
-            for k in 0..layout.offsets {
-                let (slot, at) = (v * layout.offsets + k, anchor * layout.offsets + k);
-                let of = Gaussian {
-                    position: [0.0; 3],
-                    opacity: host.opacity[slot].into(),
-                    color: wide(host.color[slot]),
-                    scale: wide(host.scale[slot]),
-                    rotation: wide(host.rotation[slot]),
-                    norm: host.rotation_norm[slot].into(),
-                };
-                let grad = Gaussian {
-                    position: wide(host.grad_position[slot]),
-                    opacity: host.grad_opacity[slot].into(),
-                    color: wide(host.grad_color[slot]),
-                    scale: wide(host.grad_scale[slot]),
-                    rotation: wide(host.grad_rotation[slot]),
-                    norm: 0.0,
-                };
-                let g = activate_backward(&of, wide(host.offset[at]), log_scaling, &grad);
-                host.grad_offset[at] = narrow(g.offset);
-                sum.iter_mut().zip(g.log_scaling).for_each(|(s, g)| *s += g);
-                for (raw, (head, output)) in g.raw.into_iter().zip(outputs_of(k)) {
-                    grad_output[v * layout.rows() + layout.row(head) + output] = raw as f32;
+/// `offset` and `scaling` name what is trained of the two; `position` the gradient they need.
+macro_rules! backward_twin {
+    ($module:ident $(, position: $position:ident)? $(, offset: $offset:ident)? $(, scaling: $scaling:ident)?) => {
+        impl Reference for $module::Kernel {
+            fn reference(host: $module::Host<'_>, (): (), constants: $module::Constants) {
+                let layout = Layout { offsets: constants.offsets as usize };
+                let grad_output = host.grad_output.as_flattened_mut();
+                for v in 0..host.groups[3] as usize {
+                    let anchor = host.visible[v] as usize;
+                    let log_scaling = six(host.log_scaling, anchor);
+                    let mut sum = [0.0; 6];
+                    grad_output[v * layout.rows()..][..layout.rows()].fill(0.0);
+                    for k in 0..layout.offsets {
+                        let (slot, at) = (v * layout.offsets + k, anchor * layout.offsets + k);
+                        let of = Gaussian {
+                            position: [0.0; 3],
+                            opacity: host.opacity[slot].into(),
+                            color: wide(host.color[slot]),
+                            scale: wide(host.scale[slot]),
+                            rotation: wide(host.rotation[slot]),
+                            norm: host.rotation_norm[slot].into(),
+                        };
+                        let (mut _position, mut _offset) = ([0.0; 3], [0.0; 3]);
+                        $(_position = wide(host.$position[slot]);)?
+                        $(
+                            let _ = &host.$scaling;
+                            _offset = wide(host.offset[at]);
+                        )?
+                        let grad = Gaussian {
+                            position: _position,
+                            opacity: host.grad_opacity[slot].into(),
+                            color: wide(host.grad_color[slot]),
+                            scale: wide(host.grad_scale[slot]),
+                            rotation: wide(host.grad_rotation[slot]),
+                            norm: 0.0,
+                        };
+                        let g = activate_backward(&of, _offset, log_scaling, &grad);
+                        let _ = at;
+                        $(host.$offset[at] = narrow(g.offset);)?
+                        sum.iter_mut().zip(g.log_scaling).for_each(|(s, g)| *s += g);
+                        for (raw, (head, output)) in g.raw.into_iter().zip(outputs_of(k)) {
+                            grad_output[v * layout.rows() + layout.row(head) + output] = raw as f32;
+                        }
+                    }
+                    let _ = (anchor, sum);
+                    $(host.$scaling[6 * anchor..][..6].copy_from_slice(&narrow(sum));)?
                 }
             }
-            host.grad_log_scaling[6 * anchor..][..6].copy_from_slice(&narrow(sum));
-        }
-    }
 
-    /// Ten products, Vulkan's `exp` (27 units in the last place at e^-12), and `1 - sigmoid`, `g - q (q . g)`, which
-    /// cancel: relative to the largest.
-    fn check(_: &'static str) -> Check {
-        sums(10 + 27)
-    }
+            /// Ten products, Vulkan's `exp` (27 units in the last place at e^-12), and `1 - sigmoid`, `g - q (q . g)`,
+            /// which cancel: relative to the largest.
+            fn check(_: &'static str) -> Check {
+                sums(10 + 27)
+            }
+        }
+    };
 }
+backward_twin!(decode_backward, position: grad_position, offset: grad_offset, scaling: grad_log_scaling);
+backward_twin!(decode_backward_fixed_offset, position: grad_position, scaling: grad_log_scaling);
+backward_twin!(decode_backward_fixed_scaling, position: grad_position, offset: grad_offset);
+backward_twin!(decode_backward_fixed);
 
 impl Reference for decode_backward_hidden::Kernel {
     fn reference(host: decode_backward_hidden::Host<'_>, (): (), constants: decode_backward_hidden::Constants) {
@@ -377,6 +395,25 @@ pub struct AnchorGradients<'a> {
     pub weights: &'a Buffer<f32>,
 }
 
+/// The gradients that somebody reads.
+#[derive(Clone, Copy)]
+pub struct WantedGradients<'a> {
+    /// As [`AnchorGradients::feature`].
+    pub feature: Option<&'a Buffer<f32>>,
+    /// As [`AnchorGradients::offset`].
+    pub offset: Option<&'a Buffer<[f32; 3]>>,
+    /// As [`AnchorGradients::log_scaling`].
+    pub log_scaling: Option<&'a Buffer<f32>>,
+    /// As [`AnchorGradients::weights`].
+    pub weights: Option<&'a Buffer<f32>>,
+}
+
+impl<'a> From<AnchorGradients<'a>> for WantedGradients<'a> {
+    fn from(AnchorGradients { feature, offset, log_scaling, weights }: AnchorGradients<'a>) -> Self {
+        Self { feature: Some(feature), offset: Some(offset), log_scaling: Some(log_scaling), weights: Some(weights) }
+    }
+}
+
 /// The forward stage. Slot `s = v K + k` is Gaussian `k` of visible anchor `v`.
 #[derive(Debug)]
 pub struct Decode {
@@ -498,7 +535,13 @@ impl Decode {
 #[derive(Debug)]
 pub struct DecodeBackward {
     grad_output: Buffer<[f32; 4]>,
-    grad_hidden: Buffer<[f32; 4]>,
+    grad_hidden: Option<Buffer<[f32; 4]>>,
+    sums: Option<Sums>,
+}
+
+/// Parts of the weights' gradients.
+#[derive(Debug)]
+struct Sums {
     first: Buffer<[f32; 4]>,
     second: Buffer<[f32; 4]>,
 }
@@ -509,87 +552,112 @@ impl DecodeBackward {
     /// # Errors
     /// When the device has no memory for it.
     pub fn new(gpu: &Gpu, forward: &Decode) -> Result<Self, Error> {
+        Self::of(gpu, forward, true, true)
+    }
+
+    /// As [`DecodeBackward::new`], without what only gradients of the features or of the weights need.
+    ///
+    /// # Errors
+    /// When the device has no memory for it.
+    pub fn of(gpu: &Gpu, forward: &Decode, feature: bool, weights: bool) -> Result<Self, Error> {
         let (anchors, rows) = (forward.capacity as usize, forward.layout.rows());
         let parts = anchors.div_ceil(BLOCK).min(CHUNKS);
+        let sums = || -> Result<Sums, Error> {
+            Ok(Sums {
+                first: gpu.buffer("first", parts * FIRST_VEC4)?,
+                second: gpu.buffer("second", parts * rows * (HIDDEN + 1) / 4)?,
+            })
+        };
+        let hidden = || gpu.buffer("grad_hidden", anchors * HIDDEN_VEC4);
         Ok(Self {
             grad_output: gpu.buffer("grad_output", anchors * rows / 4)?,
-            grad_hidden: gpu.buffer("grad_hidden", anchors * HIDDEN_VEC4)?,
-            first: gpu.buffer("first", parts * FIRST_VEC4)?,
-            second: gpu.buffer("second", parts * rows * (HIDDEN + 1) / 4)?,
+            grad_hidden: if feature || weights { Some(hidden()?) } else { None },
+            sums: if weights { Some(sums()?) } else { None },
         })
     }
 
     /// Records the gradients, after [`Decode::record`] with the same arguments.
-    pub fn record(
+    ///
+    /// # Panics
+    /// When a gradient is asked for that the stage was made without.
+    pub fn record<'a>(
         &self,
         rec: &mut Recorder<'_>,
         forward: &Decode,
         anchors: Anchors<'_>,
         grad: GaussianGradients<'_>,
-        to: AnchorGradients<'_>,
+        to: impl Into<WantedGradients<'a>>,
     ) {
+        let to: WantedGradients<'_> = to.into();
         let offsets = forward.layout.offsets as u32;
         let groups = &forward.per_anchor.groups;
-        let buffers = decode_backward::Buffers {
-            groups: &groups.buffer,
-            visible: anchors.visible,
-            offset: anchors.offset,
-            log_scaling: anchors.log_scaling,
-            opacity: &forward.opacity,
-            color: &forward.color,
-            scale: &forward.scale,
-            rotation: &forward.rotation,
-            rotation_norm: &forward.rotation_norm,
-            grad_position: grad.position,
-            grad_opacity: grad.opacity,
-            grad_color: grad.color,
-            grad_scale: grad.scale,
-            grad_rotation: grad.rotation,
-            grad_offset: to.offset,
-            grad_log_scaling: to.log_scaling,
-            grad_output: &self.grad_output,
-        };
-        rec.run_with(decode_backward::Kernel, decode_backward::Constants { offsets }, buffers, (), groups);
+        let (offset, log_scaling) = (anchors.offset, anchors.log_scaling);
+        let (visible, grad_output) = (anchors.visible, &self.grad_output);
+        let Decode { opacity, color, scale, rotation, rotation_norm, .. } = forward;
+        let GaussianGradients { opacity: grad_opacity, color: grad_color, scale: grad_scale, .. } = grad;
+        let (grad_position, grad_rotation) = (grad.position, grad.rotation);
+        macro_rules! back {
+            ($module:ident $(, $field:ident)*) => {{
+                let buffers = $module::Buffers {
+                    groups: &groups.buffer, visible, log_scaling, opacity, color, scale, rotation, rotation_norm,
+                    grad_opacity, grad_color, grad_scale, grad_rotation, grad_output $(, $field)*
+                };
+                rec.run_with($module::Kernel, $module::Constants { offsets }, buffers, (), groups);
+            }};
+        }
+        match (to.offset, to.log_scaling) {
+            (Some(grad_offset), Some(grad_log_scaling)) => {
+                back!(decode_backward, offset, grad_position, grad_offset, grad_log_scaling);
+            }
+            (None, Some(grad_log_scaling)) => {
+                back!(decode_backward_fixed_offset, offset, grad_position, grad_log_scaling);
+            }
+            (Some(grad_offset), None) => back!(decode_backward_fixed_scaling, grad_position, grad_offset),
+            (None, None) => back!(decode_backward_fixed),
+        }
+        if to.feature.is_none() && to.weights.is_none() {
+            return;
+        }
+        let grad_hidden = self.grad_hidden.as_ref().expect("made with features or weights");
         let groups = &forward.per_tile.groups;
         let buffers = decode_backward_hidden::Buffers {
             groups: &groups.buffer,
             packed: &forward.packed,
             hidden: &forward.hidden,
             grad_output: &self.grad_output,
-            grad_hidden: &self.grad_hidden,
+            grad_hidden,
         };
         let constants = decode_backward_hidden::Constants { offsets };
         rec.run_with(decode_backward_hidden::Kernel, constants, buffers, (), groups);
         let groups = &forward.per_anchor.groups;
-        let buffers = decode_backward_feature::Buffers {
-            groups: &groups.buffer,
-            visible: anchors.visible,
-            packed: &forward.packed,
-            grad_hidden: &self.grad_hidden,
-            grad_feature: to.feature,
-        };
-        rec.run(decode_backward_feature::Kernel, buffers, (), groups);
+        if let Some(grad_feature) = to.feature {
+            let buffers = decode_backward_feature::Buffers {
+                groups: &groups.buffer,
+                visible: anchors.visible,
+                packed: &forward.packed,
+                grad_hidden,
+                grad_feature,
+            };
+            rec.run(decode_backward_feature::Kernel, buffers, (), groups);
+        }
+        let Some(grad_weights) = to.weights else { return };
+        let Sums { first, second } = self.sums.as_ref().expect("made with weights");
         let buffers = decode_backward_first::Buffers {
             groups: &groups.buffer,
             inputs: &forward.inputs,
-            grad_hidden: &self.grad_hidden,
-            partial: &self.first,
+            grad_hidden,
+            partial: first,
         };
         rec.run(decode_backward_first::Kernel, buffers, (), groups);
         let buffers = decode_backward_second::Buffers {
             groups: &groups.buffer,
             hidden: &forward.hidden,
             grad_output: &self.grad_output,
-            partial: &self.second,
+            partial: second,
         };
         let constants = decode_backward_second::Constants { offsets };
         rec.run_with(decode_backward_second::Kernel, constants, buffers, (), groups);
-        let buffers = decode_backward_weights::Buffers {
-            groups: &groups.buffer,
-            first: &self.first,
-            second: &self.second,
-            grad_weights: to.weights,
-        };
+        let buffers = decode_backward_weights::Buffers { groups: &groups.buffer, first, second, grad_weights };
         let constants = decode_backward_weights::Constants { offsets };
         rec.run_with(decode_backward_weights::Kernel, constants, buffers, (), forward.layout.packed());
     }
@@ -744,6 +812,21 @@ mod tests {
                 grad_log_scaling: vec![testing::UNWRITTEN; m.log_scaling.len()],
                 grad_output: unwritten(count * layout.rows() / 4 + 3),
             };
+            macro_rules! fixed {
+                ($module:ident $(, $field:ident)*) => {{
+                    let c = case.clone();
+                    let case = $module::Arrays {
+                        groups: c.groups, visible: c.visible, log_scaling: c.log_scaling, opacity: c.opacity,
+                        color: c.color, scale: c.scale, rotation: c.rotation, rotation_norm: c.rotation_norm,
+                        grad_opacity: c.grad_opacity, grad_color: c.grad_color, grad_scale: c.grad_scale,
+                        grad_rotation: c.grad_rotation, grad_output: c.grad_output $(, $field: c.$field)*
+                    };
+                    twin($module::Kernel, &gpu, $module::Constants { offsets: k }, case, (), count);
+                }};
+            }
+            fixed!(decode_backward_fixed_offset, offset, grad_position, grad_log_scaling);
+            fixed!(decode_backward_fixed_scaling, grad_position, grad_offset);
+            fixed!(decode_backward_fixed);
             let constants = decode_backward::Constants { offsets: k };
             let grad_output = twin(decode_backward::Kernel, &gpu, constants, case, (), count).grad_output;
             let case = decode_backward_hidden::Arrays {

@@ -319,6 +319,13 @@ impl Picture {
     }
 }
 
+impl Picture {
+    /// The same picture without its depth.
+    pub fn color(&self) -> Self {
+        Self { size: self.size, rgb: self.rgb.view(), depth: None }
+    }
+}
+
 /// Draws the binned Gaussians.
 pub fn forward(
     rec: &mut Recorder<'_>,

@@ -10,6 +10,7 @@ use crate::model::anchors::Anchors;
 use crate::model::files;
 use crate::primitives::limit::{COUNTERS, Counter, Limits};
 use crate::scene::Camera;
+use crate::stage;
 
 /// How much the forward stages have room for.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -67,10 +68,10 @@ impl Forward {
         cull: bool,
     ) -> Result<Self, Error> {
         Ok(Self {
-            visible: Visible::new(gpu, capacity.anchors, offsets, capacity.visible, cull)?,
-            decode: Decode::new(gpu, capacity.visible, offsets)?,
-            project: Project::new(gpu, capacity.visible, offsets)?,
-            bin: Bin::new(gpu, tiling, capacity.visible * offsets, capacity.pairs, size)?,
+            visible: gpu.stage(stage::CULL, || Visible::new(gpu, capacity.anchors, offsets, capacity.visible, cull))?,
+            decode: gpu.stage(stage::DECODE, || Decode::new(gpu, capacity.visible, offsets))?,
+            project: gpu.stage(stage::PROJECT, || Project::new(gpu, capacity.visible, offsets))?,
+            bin: gpu.stage(stage::BIN, || Bin::new(gpu, tiling, capacity.visible * offsets, capacity.pairs, size))?,
             tiling,
             offsets,
         })
@@ -132,11 +133,18 @@ pub fn to_rgb8([width, height]: [u32; 2], rgb: &[[f32; 3]]) -> image::RgbImage {
         .expect("one colour per pixel")
 }
 
-/// Renders views of a model.
-pub struct Renderer {
+/// A model on the device.
+#[derive(Clone, Copy)]
+pub struct Model<'a> {
+    /// The anchors.
+    pub anchors: &'a Anchors,
+    /// The decoders, flat.
+    pub weights: &'a Buffer<f32>,
+}
+
+/// The stages that draw views of a model.
+pub struct Painter {
     gpu: Gpu,
-    anchors: Anchors,
-    weights: Buffer<f32>,
     near: f32,
     cull: bool,
     background: [f32; 3],
@@ -145,29 +153,19 @@ pub struct Renderer {
     stages: Option<(Forward, Picture)>,
 }
 
-impl Renderer {
-    /// A renderer of this model.
+impl Painter {
+    /// With room for so much at first.
     ///
     /// # Errors
-    /// When the device has no room for it.
-    pub fn new(
-        gpu: &Gpu,
-        anchors: &files::Anchors,
-        weights: &files::Weights,
-        config: &super::Config,
-        background: [f32; 3],
-    ) -> Result<Self, Error> {
-        let weights = gpu.upload("weights", &weights.decoders())?;
-        let anchors = Anchors::upload(gpu, anchors, 0)?;
+    /// As [`Gpu::buffer`].
+    pub fn new(gpu: &Gpu, config: &super::Config, background: [f32; 3], capacity: Capacity) -> Result<Self, Error> {
         Ok(Self {
             gpu: gpu.clone(),
             near: config.near as f32,
             cull: config.cull,
             background,
             limits: Limits::new(gpu)?,
-            capacity: Capacity::guess(anchors.count),
-            anchors,
-            weights,
+            capacity,
             stages: None,
         })
     }
@@ -176,21 +174,27 @@ impl Renderer {
     ///
     /// # Errors
     /// When the device has no room for it, or is lost.
-    pub fn render(&mut self, camera: &Camera) -> Result<Rendered, Error> {
+    ///
+    /// # Panics
+    /// For more anchors than the capacity's.
+    pub fn render(&mut self, model: Model<'_>, camera: &Camera) -> Result<Rendered, Error> {
         loop {
             let (forward, picture) = match self.stages.take() {
                 Some((forward, picture)) if picture.size == camera.size => (forward, picture),
-                _ => {
+                // Those of another size go before these are made.
+                old => {
+                    drop(old);
                     let tiling = Tiling::of(self.gpu.info().subgroup_size);
                     let pixels = camera.size[0] as usize * camera.size[1] as usize;
+                    let offsets = model.anchors.offsets;
                     (
-                        Forward::new(&self.gpu, self.capacity, self.anchors.offsets, tiling, camera.size, self.cull)?,
+                        Forward::new(&self.gpu, self.capacity, offsets, tiling, camera.size, self.cull)?,
                         Picture::new(&self.gpu, camera.size, pixels, Outputs::ColorDepth)?,
                     )
                 }
             };
             let mut rec = self.gpu.recorder()?;
-            self.record(&mut rec, &forward, &picture, camera);
+            self.record(&mut rec, model, &forward, &picture, camera);
             rec.submit()?.wait()?;
             if self.gpu.read(self.limits.overflow())?[0] == 0 {
                 let (depth, transmittance) = picture.depth.as_ref().expect("the picture was made with depth");
@@ -211,8 +215,9 @@ impl Renderer {
         }
     }
 
-    fn record(&self, rec: &mut Recorder<'_>, forward: &Forward, picture: &Picture, camera: &Camera) {
-        let Self { anchors, limits, near, .. } = self;
+    fn record(&self, rec: &mut Recorder<'_>, model: Model<'_>, forward: &Forward, picture: &Picture, camera: &Camera) {
+        let Self { limits, near, .. } = self;
+        let Model { anchors, weights } = model;
         forward.visible.record(rec, anchors, camera, *near, limits);
         let offset = anchors.offset.value.view();
         let model = decode::Anchors {
@@ -220,12 +225,46 @@ impl Renderer {
             feature: &anchors.feature.value,
             offset: &offset,
             log_scaling: &anchors.log_scaling.value,
-            weights: &self.weights,
+            weights,
             visible: &forward.visible.list,
         };
         forward.decode.record(rec, model, &forward.visible.count, camera.center());
         forward.project.record(rec, &forward.visible.slots, forward.gaussians(), camera, *near);
         let binned = forward.bin.record(rec, forward.projected(), camera.size, limits);
         rasterize::forward(rec, forward.tiling, forward.projected(), binned, self.background, picture);
+    }
+}
+
+/// Renders views of a finished model.
+pub struct Renderer {
+    painter: Painter,
+    anchors: Anchors,
+    weights: Buffer<f32>,
+}
+
+impl Renderer {
+    /// A renderer of this model.
+    ///
+    /// # Errors
+    /// When the device has no room for it.
+    pub fn new(
+        gpu: &Gpu,
+        anchors: &files::Anchors,
+        weights: &files::Weights,
+        config: &super::Config,
+        background: [f32; 3],
+    ) -> Result<Self, Error> {
+        let weights = gpu.upload("weights", &weights.decoders())?;
+        let anchors = Anchors::upload(gpu, anchors, 0)?;
+        let painter = Painter::new(gpu, config, background, Capacity::guess(anchors.count))?;
+        Ok(Self { painter, anchors, weights })
+    }
+
+    /// Renders one view; buffers grow as it needs.
+    ///
+    /// # Errors
+    /// When the device has no room for it, or is lost.
+    pub fn render(&mut self, camera: &Camera) -> Result<Rendered, Error> {
+        self.painter.render(Model { anchors: &self.anchors, weights: &self.weights }, camera)
     }
 }

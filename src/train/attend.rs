@@ -16,14 +16,29 @@ use crate::render::visible::Visible;
 pub struct Attend {
     config: Config,
     seed: u64,
-    select: Select,
-    sort: Sort,
+    room: Option<Room>,
     blend: Blend,
-    blended: Buffer<f32>,
     /// Projections, flat, with their moments.
     pub weights: Parameter,
     /// dL/d weights.
     pub grad_weights: Buffer<f32>,
+}
+
+/// What depends on the number of anchors.
+struct Room {
+    select: Select,
+    sort: Sort,
+    blended: Buffer<f32>,
+}
+
+impl Room {
+    fn new(gpu: &Gpu, config: &Config, anchors: u32) -> Result<Self, Error> {
+        Ok(Self {
+            select: Select::new(gpu, anchors as usize, config.tokens, config.min_tokens)?,
+            sort: Sort::new(gpu, anchors)?,
+            blended: gpu.buffer("blended", anchors as usize * 32)?,
+        })
+    }
 }
 
 /// The anchors chosen in a step.
@@ -48,25 +63,31 @@ impl Attend {
         rec.submit()?.wait()?;
         Ok(Self {
             seed,
-            select: Select::new(gpu, anchors as usize, config.tokens, config.min_tokens)?,
-            sort: Sort::new(gpu, anchors)?,
+            room: Some(Room::new(gpu, config, anchors)?),
             blend: Blend::new(gpu, config.tokens, config.blend as f32)?,
-            blended: gpu.buffer("blended", anchors as usize * 32)?,
             grad_weights: gpu.buffer("grad_attention_weights", WEIGHTS)?,
             weights: parameter,
             config: config.clone(),
         })
     }
 
-    /// The same projections for another number of anchors.
+    /// Gives back what depends on the number of anchors, until [`Attend::furnish`].
+    pub fn release(&mut self) {
+        self.room = None;
+    }
+
+    /// Makes it again, for so many anchors.
     ///
     /// # Errors
     /// As [`Gpu::buffer`].
-    pub fn resize(&mut self, gpu: &Gpu, anchors: u32) -> Result<(), Error> {
-        self.select = Select::new(gpu, anchors as usize, self.config.tokens, self.config.min_tokens)?;
-        self.sort = Sort::new(gpu, anchors)?;
-        self.blended = gpu.buffer("blended", anchors as usize * 32)?;
+    pub fn furnish(&mut self, gpu: &Gpu, anchors: u32) -> Result<(), Error> {
+        self.release();
+        self.room = Some(Room::new(gpu, &self.config, anchors)?);
         Ok(())
+    }
+
+    fn room(&self) -> &Room {
+        self.room.as_ref().expect("released only while no step is recorded")
     }
 
     /// Chooses tokens and blends their features. Returns the features to decode, and what the way back needs; nothing
@@ -94,21 +115,22 @@ impl Attend {
         let mut rng = random(self.seed, Stream::Patch, step);
         let patch = patch_position(&mut rng, ([x0, y0], [x1, y1]), self.config.patch, camera.size);
         let draw = Draw { patch, seed: self.seed as u32, step };
+        let Room { select, sort, blended } = self.room();
         let listed = (&visible.list, &visible.count, anchors.count);
-        let candidates = self.select.candidates(rec, listed, &anchors.position, &photograph.picture, &view, draw);
+        let candidates = select.candidates(rec, listed, &anchors.position, &photograph.picture, &view, draw);
         let pairs = Pairs { keys: candidates.keys, values: candidates.anchors };
-        let sorted = self.sort.record(rec, pairs, Count::Device(&visible.count), KEY_BITS);
-        let chosen = self.select.take(rec, sorted.values);
+        let sorted = sort.record(rec, pairs, Count::Device(&visible.count), KEY_BITS);
+        let chosen = select.take(rec, sorted.values);
         let inputs = Inputs { chosen, weights: &self.weights.value };
         let feature = &anchors.feature.value;
         let attended = Attended { chosen, reference: photograph.reference };
         if self.config.write_back {
             let which = (anchors.count as usize, attended.reference);
-            self.blend.mix_to_write_back(rec, inputs, feature, &self.blended, which);
+            self.blend.mix_to_write_back(rec, inputs, feature, blended, which);
         } else {
-            self.blend.mix(rec, inputs, feature, &self.blended, anchors.count as usize);
+            self.blend.mix(rec, inputs, feature, blended, anchors.count as usize);
         }
-        (&self.blended, Some(attended))
+        (blended, Some(attended))
     }
 
     /// Writes the blended features into the anchors where the settings say so, unless the step overflowed. Returns the

@@ -2,6 +2,7 @@
 
 pub mod attend;
 pub mod config;
+pub mod forecast;
 pub mod order;
 pub mod photographs;
 pub mod plan;

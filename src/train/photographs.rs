@@ -2,9 +2,11 @@
 
 use image::{GrayImage, RgbImage};
 
+use super::plan::Plan;
 use crate::gpu::{Buffer, Error, Gpu};
 use crate::losses;
 use crate::scene::{Camera, Prior, PriorKind, Scene};
+use crate::stage;
 
 /// One training view on the device.
 pub struct Photograph {
@@ -36,11 +38,11 @@ pub fn mask_box(mask: &GrayImage) -> Option<[u32; 4]> {
     })
 }
 
-/// Uploads all training views. Priors stay behind when no loss looks at depth.
+/// Uploads all training views. Priors stay behind that no loss looks at.
 ///
 /// # Errors
 /// When the device has no room.
-pub fn upload(gpu: &Gpu, scene: &Scene, depth: bool) -> Result<Vec<Photograph>, Error> {
+pub fn upload(gpu: &Gpu, scene: &Scene, plan: &Plan) -> Result<Vec<Photograph>, Error> {
     let mut all = vec![];
     for (i, view) in scene.train.iter().enumerate() {
         let reference = scene.reference.as_ref().filter(|r| r.view == i);
@@ -49,15 +51,16 @@ pub fn upload(gpu: &Gpu, scene: &Scene, depth: bool) -> Result<Vec<Photograph>, 
             Some(r) => r.prior.as_ref(),
             None => view.prior.as_ref(),
         };
-        let prior = match prior.filter(|_| depth) {
-            Some(Prior { kind, values }) => Some((*kind, gpu.upload("prior", values)?)),
+        let prior = match prior.filter(|_| plan.depth_losses(reference.is_some()).any()) {
+            Some(Prior { kind, values }) => Some((*kind, gpu.stage(stage::PICTURES, || gpu.upload("prior", values))?)),
             None => None,
         };
+        let words = pack(picture, view.mask.as_ref());
         all.push(Photograph {
             name: view.name.clone(),
             camera: view.camera,
             reference: reference.is_some(),
-            picture: gpu.upload("picture", &pack(picture, view.mask.as_ref()))?,
+            picture: gpu.stage(stage::PICTURES, || gpu.upload("picture", &words))?,
             prior,
             mask_box: view.mask.as_ref().and_then(mask_box),
         });

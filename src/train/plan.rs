@@ -1,10 +1,11 @@
-//! What a scene needs: every stage that is present, and for each that is left out the reason.
+//! What a scene needs: every stage that is present, from which step to which, and for each that is left out the reason.
 
 use crate::config::Settings;
 use crate::losses;
 use crate::render::bin::Tiling;
 use crate::render::rasterize::Outputs;
 use crate::scene::Scene;
+use crate::stage;
 
 /// Something a scene does not need.
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
@@ -15,25 +16,114 @@ pub struct LeftOut {
     pub why: String,
 }
 
+/// Steps, the first and the last, counted from 1.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+pub struct Steps {
+    /// The first.
+    pub first: u32,
+    /// The last.
+    pub last: u32,
+}
+
+impl Steps {
+    /// Whether it is one of them.
+    pub fn contain(self, step: u32) -> bool {
+        (self.first..=self.last).contains(&step)
+    }
+}
+
+/// Which losses look at the depth of a view that has a prior.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, serde::Serialize)]
+pub struct DepthLosses {
+    /// The L1 loss.
+    pub l1: bool,
+    /// The multi-scale gradient of the difference.
+    pub gradient: bool,
+}
+
+impl DepthLosses {
+    /// Whether any does.
+    pub fn any(self) -> bool {
+        self.l1 || self.gradient
+    }
+}
+
+/// The parameters that are trained: only their gradients are computed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+pub struct Trained {
+    /// Anchor features, or the attention's projections behind them.
+    pub feature: bool,
+    /// Offsets.
+    pub offset: bool,
+    /// Log-scales.
+    pub log_scaling: bool,
+    /// Any of the decoders.
+    pub decoders: bool,
+}
+
+impl Default for Trained {
+    /// Everything.
+    fn default() -> Self {
+        Self { feature: true, offset: true, log_scaling: true, decoders: true }
+    }
+}
+
 /// The stages of a run.
-#[derive(Clone, Debug, serde::Serialize)]
+#[derive(Clone, Debug, Default, serde::Serialize)]
 pub struct Plan {
     /// Pixels have weights: some view has a mask.
     pub masks: bool,
-    /// Depth losses: some view has a prior.
+    /// Depth losses: some view has a prior that they look at.
     pub depth: bool,
     /// The multi-scale gradient of the depth difference.
     pub depth_gradient: bool,
+    /// Losses that look at the reference view's depth.
+    pub reference_depth: DepthLosses,
+    /// Losses that look at the other views' depth.
+    pub other_depth: DepthLosses,
     /// Cross-attention, from `model.attention.start` on.
     pub attention: bool,
-    /// Growing and pruning of anchors.
+    /// Growing and pruning of anchors: the steps behind which the first and the last round come.
     pub growth: bool,
+    /// Likewise, with the steps behind which the first and the last round come.
+    pub rounds: Option<Steps>,
+    /// Steps that are counted for them.
+    pub counted: Option<Steps>,
+    /// Culling of anchors that are out of view.
+    pub cull: bool,
+    /// What is trained.
+    pub trained: Trained,
+    /// Figures on the test views.
+    pub evaluation: bool,
     /// The reference view, an index into the training views.
     pub reference: Option<usize>,
     /// Distinct sizes of training pictures.
     pub sizes: Vec<[u32; 2]>,
+    /// Steps.
+    pub iterations: u32,
     /// What is absent and why.
     pub left_out: Vec<LeftOut>,
+}
+
+/// The losses that have a weight on the depth of a view. Without masks nothing is inside one.
+fn depth_losses(config: &losses::config::Depth, reference: bool, masks: bool) -> DepthLosses {
+    let gradient = &config.gradient;
+    let (l1, factor) = if reference {
+        let inside = if masks { config.reference_inside_weight } else { 0.0 };
+        (config.reference_weight + inside, gradient.reference_weight)
+    } else {
+        (config.other_weight, gradient.other_weight)
+    };
+    DepthLosses { l1: config.enabled && l1 > 0.0, gradient: config.enabled && gradient.weight * factor > 0.0 }
+}
+
+/// The rounds of growing and pruning that come to pass; none behind the last step, whose anchors nobody would train.
+fn rounds(settings: &Settings) -> Option<Steps> {
+    let config = &settings.densify;
+    let first = config.from.max(1).next_multiple_of(config.every);
+    let until = config.until.min(settings.train.iterations.saturating_sub(1));
+    let last = until - until % config.every;
+    (config.enabled && first <= last).then_some(Steps { first, last })
 }
 
 impl Plan {
@@ -41,6 +131,7 @@ impl Plan {
     pub fn new(scene: &Scene, settings: &Settings) -> Self {
         let mut left_out = vec![];
         let mut leave = |what, why: &str| left_out.push(LeftOut { what, why: why.to_owned() });
+        let iterations = settings.train.iterations;
         let masks = scene.train.iter().any(|v| v.mask.is_some());
         if !masks {
             leave("pixel weights", "no view has a mask");
@@ -49,55 +140,110 @@ impl Plan {
             leave("reference view", "the scene has no inpainted picture");
         }
         let config = &settings.losses.depth;
-        let priors = scene.train.iter().any(|v| v.prior.is_some())
-            || scene.reference.as_ref().is_some_and(|r| r.prior.is_some());
-        let weighted = config.reference_weight + config.reference_inside_weight + config.other_weight > 0.0;
-        let gradient_weight =
-            config.gradient.weight * (config.gradient.reference_weight + config.gradient.other_weight);
-        let depth = priors && config.enabled && (weighted || gradient_weight > 0.0);
-        if !priors {
+        let reference = scene.reference.as_ref().map(|r| r.view);
+        let reference_prior = scene.reference.as_ref().is_some_and(|r| r.prior.is_some());
+        let other_priors = scene.train.iter().enumerate().any(|(i, v)| Some(i) != reference && v.prior.is_some());
+        let of = |prior, is_reference| {
+            if prior { depth_losses(config, is_reference, masks) } else { DepthLosses::default() }
+        };
+        let (reference_depth, other_depth) = (of(reference_prior, true), of(other_priors, false));
+        let depth = reference_depth.any() || other_depth.any();
+        if !reference_prior && !other_priors {
             leave("depth map, its gradient, alignment and depth losses", "no view has a depth prior");
         } else if !depth {
             leave(
                 "depth map, its gradient, alignment and depth losses",
                 "losses.depth.enabled is false or all its weights are zero",
             );
+        } else if !other_depth.any() && scene.train.len() > 1 {
+            let why = if other_priors { "their weights are zero" } else { "they have no prior" };
+            leave("depth of views other than the reference", why);
+        } else if !reference_depth.any() && reference.is_some() {
+            let why = if reference_prior { "its weights are zero" } else { "it has no prior" };
+            leave("depth of the reference view", why);
         }
-        let depth_gradient = depth && gradient_weight > 0.0;
+        let depth_gradient = reference_depth.gradient || other_depth.gradient;
         if depth && !depth_gradient {
             leave("depth gradient", "losses.depth.gradient.weight is zero");
         }
+        if settings.losses.ssim_weight == 0.0 {
+            leave("SSIM", "losses.ssim_weight is zero");
+        }
         let attention_config = &settings.model.attention;
-        let attention = attention_config.enabled && masks && attention_config.start < settings.train.iterations;
+        let attention =
+            attention_config.enabled && masks && attention_config.start <= iterations && attention_config.blend > 0.0;
         if !attention {
             let why = if !attention_config.enabled {
                 "model.attention.enabled is false".to_owned()
             } else if !masks {
                 "there is no mask to split anchors by".to_owned()
-            } else {
+            } else if attention_config.blend > 0.0 {
                 format!("it would start at step {}, after the last", attention_config.start)
+            } else {
+                "model.attention.blend is zero".to_owned()
             };
             leave("cross-attention", &why);
         }
-        let growth = settings.densify.enabled && settings.densify.from < settings.train.iterations;
-        if !growth {
+        let rounds = rounds(settings);
+        if rounds.is_none() {
             let why = if settings.densify.enabled {
-                format!("it would start at step {}, after the last", settings.densify.from)
+                format!("no round comes between step {} and the last", settings.densify.from)
             } else {
                 "densify.enabled is false".to_owned()
             };
             leave("statistics, growing and pruning", &why);
         }
+        let counted = rounds.map(|r| Steps { first: settings.densify.statistics_from.max(1), last: r.last });
+        let cull = settings.render.cull;
+        if !cull {
+            leave("culling", "render.cull is false");
+        }
+        let rates = &settings.optimizer.learning_rate;
+        let some = |rate: [f64; 2]| rate != [0.0; 2];
+        let trained = Trained {
+            feature: some(rates.feature) || attention,
+            offset: some(rates.offset),
+            log_scaling: some(rates.log_scaling),
+            decoders: some(rates.mlp_opacity) || some(rates.mlp_color) || some(rates.mlp_cov),
+        };
+        for (what, trained, rate) in [
+            ("gradient of features", trained.feature, "feature"),
+            ("gradient of offsets", trained.offset, "offset"),
+            ("gradient of log-scales", trained.log_scaling, "log_scaling"),
+            ("gradient of decoders", trained.decoders, "mlp_*"),
+        ] {
+            if !trained {
+                leave(what, &format!("optimizer.learning_rate.{rate} is zero"));
+            }
+        }
         leave("gradient of anchor positions", "anchors do not move");
+        leave("gradient of view directions and distances", "cameras do not move");
         leave("gradient of transmittance", "no loss looks at it");
-        if scene.test.is_empty() {
+        let evaluation = !scene.test.is_empty();
+        if !evaluation {
             leave("evaluation", "there are no test views");
         }
         let mut sizes: Vec<[u32; 2]> = scene.train.iter().map(|v| v.camera.size).collect();
         sizes.sort_unstable();
         sizes.dedup();
-        let reference = scene.reference.as_ref().map(|r| r.view);
-        Self { masks, depth, depth_gradient, attention, growth, reference, sizes, left_out }
+        Self {
+            masks,
+            depth,
+            depth_gradient,
+            reference_depth,
+            other_depth,
+            attention,
+            growth: rounds.is_some(),
+            rounds,
+            counted,
+            cull,
+            trained,
+            evaluation,
+            reference,
+            sizes,
+            iterations,
+            left_out,
+        }
     }
 
     /// The losses of pictures of this size.
@@ -105,6 +251,11 @@ impl Plan {
         let gradient_scales = if self.depth_gradient { settings.losses.depth.gradient.scales } else { 0 };
         let ssim_weight = settings.losses.ssim_weight as f32;
         losses::Plan { size, ssim_weight, masks: self.masks, depth: self.depth, gradient_scales }
+    }
+
+    /// The losses that look at the depth of the reference view, or of the others.
+    pub fn depth_losses(&self, reference: bool) -> DepthLosses {
+        if reference { self.reference_depth } else { self.other_depth }
     }
 
     /// What the rasteriser writes.
@@ -120,5 +271,39 @@ impl Plan {
     /// Tile shape on a device.
     pub fn tiling(&self, subgroup_size: u32) -> Tiling {
         Tiling::of(subgroup_size)
+    }
+
+    /// The steps that a stage of [`stage::ALL`] takes part in; `None` for one that is left out. What comes behind a step
+    /// counts as that step's.
+    pub fn steps(&self, name: &str, settings: &Settings) -> Option<Steps> {
+        let all = Steps { first: 1, last: self.iterations };
+        match name {
+            stage::ATTENTION => self.attention.then_some(Steps { first: settings.model.attention.start.max(1), ..all }),
+            stage::DEPTH => self.depth.then_some(all),
+            stage::DEPTH_GRADIENT => self.depth_gradient.then_some(all),
+            stage::STATISTICS => self.counted,
+            stage::GROWTH => self.rounds,
+            stage::EVALUATION => {
+                let every = settings.train.eval_interval;
+                let first = if every == 0 { self.iterations } else { every.min(self.iterations) };
+                self.evaluation.then_some(Steps { first, ..all })
+            }
+            _ => Some(all),
+        }
+    }
+
+    /// Why a stage of [`stage::ALL`] is left out.
+    pub fn why(&self, name: &str) -> Option<&str> {
+        let listed = |what: &str| self.left_out.iter().find(|left| left.what == what).map(|left| left.why.as_str());
+        match name {
+            stage::ATTENTION => listed("cross-attention"),
+            stage::DEPTH => listed("depth map, its gradient, alignment and depth losses"),
+            stage::DEPTH_GRADIENT => {
+                listed("depth gradient").or_else(|| listed("depth map, its gradient, alignment and depth losses"))
+            }
+            stage::STATISTICS | stage::GROWTH => listed("statistics, growing and pruning"),
+            stage::EVALUATION => listed("evaluation"),
+            _ => None,
+        }
     }
 }

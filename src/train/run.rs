@@ -17,7 +17,7 @@ use crate::gpu::{self, Buffer, Gpu, Submission, Timing, Timings};
 use crate::losses::Term;
 use crate::model::{files, init};
 use crate::primitives::limit::{COUNTERS, Counter};
-use crate::render::view::{Capacity, Rendered, Renderer};
+use crate::render::view::{Capacity, Rendered};
 use crate::scene::Scene;
 
 /// Why a run ended early.
@@ -176,11 +176,9 @@ impl<'a> Run<'a> {
         let plan = Plan::new(scene, settings);
         let points: Vec<[f32; 3]> = scene.points.iter().map(|p| p.position).collect();
         let offsets = settings.model.offsets as usize;
-        let derived = || init::median_nearest_distance(&points).map_or(0.0, |d| d * settings.model.voxel_factor);
-        let voxel = if settings.model.voxel > 0.0 { settings.model.voxel } else { derived() };
-        let initial = init::anchors(&points, voxel, offsets)?;
+        let initial = init::from_points(&points, &settings.model)?;
         let weights = init::weights(settings.train.seed, offsets, plan.attention);
-        let photographs = photographs::upload(gpu, scene, plan.depth)?;
+        let photographs = photographs::upload(gpu, scene, &plan)?;
         let step = Step::new(gpu, plan, settings, &initial.anchors, &weights, initial.voxel)?;
         let mailboxes = (0..DEPTH)
             .map(|_| {
@@ -411,25 +409,25 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// Renders every test view with the model as it is now, shows it to `look`, and compares.
+    /// Renders every test view with the model as it is now, shows it to `look`, and compares. Nothing of the run may be in
+    /// flight.
     ///
     /// # Errors
-    /// When the device has no room for a second copy of the model.
-    pub fn evaluate(&self, mut look: impl FnMut(&str, &Rendered)) -> Result<Option<Report>, Error> {
-        if self.scene.test.is_empty() {
+    /// When the device has no room, or a picture cannot be compared.
+    pub fn evaluate(&mut self, mut look: impl FnMut(&str, &Rendered)) -> Result<Option<Report>, Error> {
+        let views = &self.scene.test;
+        if views.is_empty() {
             return Ok(None);
         }
-        let (anchors, weights) = self.step.model()?;
-        let background = self.settings.train.background.map(|c| c as f32);
-        let mut renderer = Renderer::new(self.gpu, &anchors, &weights, &self.settings.render, background)?;
-        let mut views = vec![];
-        for view in &self.scene.test {
-            let rendered = renderer.render(&view.camera)?;
+        let mut figures = vec![];
+        self.step.draw(views.iter().map(|v| &v.camera), |i, rendered| {
+            let view = &views[i];
             let metrics = evaluate::compare(&rendered.to_rgb8(), &view.image, view.mask.as_ref())?;
-            views.push(ViewMetrics { name: view.name.clone(), metrics });
+            figures.push(ViewMetrics { name: view.name.clone(), metrics });
             look(&view.name, &rendered);
-        }
-        Ok(Some(Report::new(views)))
+            Ok::<_, Error>(())
+        })?;
+        Ok(Some(Report::new(figures)))
     }
 }
 

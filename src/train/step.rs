@@ -14,32 +14,34 @@ use crate::optimizer::adam::{self, Tensors};
 use crate::optimizer::schedule::Rate;
 use crate::primitives::limit::Limits;
 
-use crate::render::decode::{self, AnchorGradients, DecodeBackward, GaussianGradients};
+use crate::render::decode::{self, DecodeBackward, GaussianGradients, WantedGradients};
 use crate::render::project::{ProjectBackward, SplatGradients};
 use crate::render::rasterize::{self, Backward, Picture, PictureGradient};
-use crate::render::view::{Capacity, Forward};
+use crate::render::view::{Capacity, Forward, Model, Painter, Rendered};
 use crate::scene::{Camera, PriorKind};
+use crate::stage;
 
 use super::attend::{Attend, Attended};
 use super::order::{Stream, random};
 use super::photographs::Photograph;
-use super::plan::Plan;
+use super::plan::{Plan, Trained};
 
-/// Where the model's gradients go, zeroed at the beginning of every step.
+/// Where the gradients of what is trained go, zeroed at the beginning of every step.
 struct Gradients {
-    feature: Buffer<f32>,
-    offset: Buffer<f32>,
-    log_scaling: Buffer<f32>,
-    weights: Buffer<f32>,
+    feature: Option<Buffer<f32>>,
+    offset: Option<Buffer<f32>>,
+    log_scaling: Option<Buffer<f32>>,
+    weights: Option<Buffer<f32>>,
 }
 
 impl Gradients {
-    fn new(gpu: &Gpu, anchors: &Anchors, weights: &Parameter) -> Result<Self, Error> {
+    fn new(gpu: &Gpu, trained: Trained, anchors: &Anchors, weights: &Parameter) -> Result<Self, Error> {
+        let of = |name, parameter: &Parameter| gpu.buffer(name, parameter.value.len());
         Ok(Self {
-            feature: gpu.buffer("grad_feature", anchors.feature.value.len())?,
-            offset: gpu.buffer("grad_offset", anchors.offset.value.len())?,
-            log_scaling: gpu.buffer("grad_log_scaling", anchors.log_scaling.value.len())?,
-            weights: gpu.buffer("grad_weights", weights.value.len())?,
+            feature: trained.feature.then(|| of("grad_feature", &anchors.feature)).transpose()?,
+            offset: trained.offset.then(|| of("grad_offset", &anchors.offset)).transpose()?,
+            log_scaling: trained.log_scaling.then(|| of("grad_log_scaling", &anchors.log_scaling)).transpose()?,
+            weights: trained.decoders.then(|| of("grad_weights", weights)).transpose()?,
         })
     }
 }
@@ -50,17 +52,30 @@ struct Stages {
     rasterize: Backward,
     project: ProjectBackward,
     decode: DecodeBackward,
+    gradients: Gradients,
 }
 
 impl Stages {
-    fn new(gpu: &Gpu, plan: &Plan, capacity: Capacity, offsets: u32, cull: bool) -> Result<Self, Error> {
+    fn new(
+        gpu: &Gpu,
+        plan: &Plan,
+        capacity: Capacity,
+        anchors: &Anchors,
+        weights: &Parameter,
+        cull: bool,
+    ) -> Result<Self, Error> {
+        let (offsets, trained) = (anchors.offsets, plan.trained);
         let forward =
             Forward::new(gpu, capacity, offsets, plan.tiling(gpu.info().subgroup_size), plan.largest(), cull)?;
         let slots = (capacity.visible * offsets) as usize;
+        let pairs = capacity.pairs as usize;
         Ok(Self {
-            rasterize: Backward::new(gpu, slots, capacity.pairs as usize, plan.outputs())?,
-            project: ProjectBackward::new(gpu, &forward.project)?,
-            decode: DecodeBackward::new(gpu, &forward.decode)?,
+            rasterize: gpu.stage(stage::RASTERIZE_BACKWARD, || Backward::new(gpu, slots, pairs, plan.outputs()))?,
+            project: gpu.stage(stage::PROJECT_BACKWARD, || ProjectBackward::new(gpu, &forward.project))?,
+            decode: gpu.stage(stage::DECODE_BACKWARD, || {
+                DecodeBackward::of(gpu, &forward.decode, trained.feature, trained.decoders)
+            })?,
+            gradients: gpu.stage(stage::DECODE_BACKWARD, || Gradients::new(gpu, trained, anchors, weights))?,
             forward,
         })
     }
@@ -116,8 +131,8 @@ pub struct Step {
     /// Overflow flag and counters.
     pub limits: Limits,
     capacity: Capacity,
-    gradients: Gradients,
-    stages: Stages,
+    /// Nothing while anchors change or views are drawn for their figures: those take the room.
+    stages: Option<Stages>,
     canvases: Vec<Canvas>,
     statistics: Option<Statistics>,
     voxel: f64,
@@ -161,36 +176,36 @@ impl Step {
         weights: &files::Weights,
         voxel: f64,
     ) -> Result<Self, Error> {
-        let anchors = Anchors::upload(gpu, anchors, 0)?;
+        let anchors = gpu.stage(stage::MODEL, || Anchors::upload(gpu, anchors, 0))?;
         let initial = weights;
         let flat = initial.decoders();
-        let weights = Parameter::new(gpu, WEIGHTS, flat.len() as u32, 1)?;
+        let weights = gpu.stage(stage::MODEL, || Parameter::new(gpu, WEIGHTS, flat.len() as u32, 1))?;
         gpu.write(&weights.value, &flat)?;
         let mut rec = gpu.recorder()?;
         rec.zero(&weights.first);
         rec.zero(&weights.root);
         rec.submit()?.wait()?;
         let capacity = Capacity::guess(anchors.capacity);
-        let stages = Stages::new(gpu, &plan, capacity, anchors.offsets, settings.render.cull)?;
+        let stages = Stages::new(gpu, &plan, capacity, &anchors, &weights, settings.render.cull)?;
         let canvases = plan
             .sizes
             .iter()
             .map(|&size| {
                 let pixels = size[0] as usize * size[1] as usize;
+                let picture = || Picture::new(gpu, size, pixels, plan.outputs());
                 Ok(Canvas {
-                    picture: Picture::new(gpu, size, pixels, plan.outputs())?,
+                    picture: gpu.stage(stage::RASTERIZE, picture)?,
                     losses: Losses::new(gpu, &plan.losses(size, settings))?,
                 })
             })
             .collect::<Result<_, Error>>()?;
         Ok(Self {
-            gradients: Gradients::new(gpu, &anchors, &weights)?,
             limits: Limits::new(gpu)?,
             gpu: gpu.clone(),
             anchors,
             weights,
             capacity,
-            stages,
+            stages: Some(stages),
             canvases,
             statistics: None,
             voxel,
@@ -214,16 +229,52 @@ impl Step {
     /// When the device has no room.
     pub fn resize(&mut self, capacity: Capacity) -> Result<(), Error> {
         // The old stages' memory goes before the new ones' is taken.
-        let cull = self.config.render.cull;
-        let smallest = Capacity { anchors: 1, visible: 1, pairs: 1 };
-        self.stages = Stages::new(&self.gpu, &self.plan, smallest, self.anchors.offsets, cull)?;
-        self.stages = Stages::new(&self.gpu, &self.plan, capacity, self.anchors.offsets, cull)?;
-        self.gradients = Gradients::new(&self.gpu, &self.anchors, &self.weights)?;
-        if let Some(attend) = &mut self.attend {
-            attend.resize(&self.gpu, self.anchors.capacity)?;
-        }
+        self.release();
         self.capacity = capacity;
+        self.furnish()
+    }
+
+    /// Gives back all memory that holds nothing from one step to the next.
+    fn release(&mut self) {
+        self.stages = None;
+        if let Some(attend) = &mut self.attend {
+            attend.release();
+        }
+    }
+
+    /// Takes it again, for the anchors there are now.
+    fn furnish(&mut self) -> Result<(), Error> {
+        let Self { gpu, plan, anchors, weights, config, .. } = self;
+        self.capacity.anchors = anchors.capacity;
+        self.stages = Some(Stages::new(gpu, plan, self.capacity, anchors, weights, config.render.cull)?);
+        if let Some(attend) = &mut self.attend {
+            gpu.stage(stage::ATTENTION, || attend.furnish(gpu, anchors.capacity))?;
+        }
         Ok(())
+    }
+
+    fn stages(&self) -> &Stages {
+        self.stages.as_ref().expect("the stages are away only within a call")
+    }
+
+    /// Draws the model as it is now from these cameras, one after the other, and hands each picture to `look`. The step's
+    /// own stages make room meanwhile, so that nothing of the step may be in flight.
+    ///
+    /// # Errors
+    /// When the device has no room, or is lost; `look`'s own.
+    pub fn draw<'c, E: From<Error>>(
+        &mut self,
+        cameras: impl IntoIterator<Item = &'c Camera>,
+        mut look: impl FnMut(usize, Rendered) -> Result<(), E>,
+    ) -> Result<(), E> {
+        self.release();
+        let gpu = self.gpu.clone();
+        gpu.stage(stage::EVALUATION, || {
+            let mut painter = Painter::new(&gpu, &self.config.render, self.background, self.capacity)?;
+            let model = Model { anchors: &self.anchors, weights: &self.weights.value };
+            cameras.into_iter().enumerate().try_for_each(|(i, camera)| look(i, painter.render(model, camera)?))
+        })?;
+        Ok(self.furnish()?)
     }
 
     /// What the stages have room for.
@@ -238,8 +289,7 @@ impl Step {
 
     /// Whether anchors are grown and pruned behind this step.
     pub fn changes_anchors(&self, step: u32) -> bool {
-        let config = &self.config.densify;
-        self.plan.growth && (config.from..=config.until).contains(&step) && step.is_multiple_of(config.every)
+        self.plan.rounds.is_some_and(|r| r.contain(step)) && step.is_multiple_of(self.config.densify.every)
     }
 
     /// Grows and prunes anchors behind this step, with nothing in flight; says what changed.
@@ -247,15 +297,26 @@ impl Step {
     /// # Errors
     /// When the device has no room.
     pub fn change_anchors(&mut self, step: u32) -> Result<String, Error> {
+        if self.statistics.is_none() {
+            return Ok(String::new());
+        }
+        self.release();
+        let gpu = self.gpu.clone();
+        let text = gpu.stage(stage::GROWTH, || self.grow_and_prune(step))?;
+        self.furnish()?;
+        Ok(text)
+    }
+
+    fn grow_and_prune(&mut self, step: u32) -> Result<String, Error> {
         let Some(statistics) = &mut self.statistics else { return Ok(String::new()) };
         let config = &self.config.densify;
         let round = densify::Round { voxel: self.voxel as f32, seed: self.config.train.seed, step };
         let before = self.anchors.count;
         let grown = densify::grow::run(&self.gpu, &mut self.anchors, statistics, config, round)?;
         let pruned = densify::prune::run(&self.gpu, &mut self.anchors, statistics, config)?;
-        if self.anchors.capacity != self.capacity.anchors {
-            self.resize(Capacity { anchors: self.anchors.capacity, ..self.capacity })?;
-        }
+        // As large a share of the anchors is in view as before.
+        let [visible, old, new] = [self.capacity.visible, self.capacity.anchors, self.anchors.capacity].map(u64::from);
+        self.capacity.visible = (visible * new).div_ceil(old.max(1)).max(visible) as u32;
         let mut text =
             format!("step {step}: {} new anchors, {pruned} pruned: {before} -> {}", grown.added, self.anchors.count);
         if grown.refused > 0 {
@@ -282,7 +343,8 @@ impl Step {
     /// Records step `step` (counted from 1) on a photograph.
     pub fn record(&self, rec: &mut Recorder<'_>, photograph: &Photograph, step: u32, rates: Rates) {
         let view = self.view(photograph, step);
-        self.line(rec, &photograph.camera, Some(photograph), step, rates, |rec, canvas| {
+        let compared = (&photograph.camera, view.depth.is_some());
+        self.line(rec, compared, Some(photograph), step, rates, |rec, canvas| {
             let Canvas { picture, losses } = canvas;
             losses.forward_backward(rec, &view, &picture.rgb, picture.depth.as_ref().map(|d| &d.0))
         });
@@ -297,7 +359,7 @@ impl Step {
         step: u32,
         rates: Rates,
     ) {
-        self.line(rec, camera, None, step, rates, |rec, canvas| {
+        self.line(rec, (camera, depth.is_some()), None, step, rates, |rec, canvas| {
             let Canvas { picture, losses } = canvas;
             losses.compare(rec, depth, &picture.rgb, picture.depth.as_ref().map(|d| &d.0))
         });
@@ -308,7 +370,8 @@ impl Step {
         let config = &self.config.losses;
         let (reference, near) = (photograph.reference, self.near);
         let inside = |on_reference: f64| if reference { on_reference as f32 } else { 0.0 };
-        let depth = photograph.prior.as_ref().map(|(kind, prior)| {
+        let looked_at = self.plan.depth_losses(reference).any();
+        let depth = photograph.prior.as_ref().filter(|_| looked_at).map(|(kind, prior)| {
             let depth = &config.depth;
             let gradient = &depth.gradient;
             let outside = if reference { depth.reference_weight } else { depth.other_weight };
@@ -340,22 +403,28 @@ impl Step {
     fn line<'s>(
         &'s self,
         rec: &mut Recorder<'_>,
-        camera: &Camera,
+        (camera, depth): (&Camera, bool),
         photograph: Option<&Photograph>,
         step: u32,
         rates: Rates,
         compare: impl FnOnce(&mut Recorder<'_>, &'s Canvas) -> losses::Gradients<'s>,
     ) {
-        let Self { anchors, gradients, limits, near, .. } = self;
-        let Stages { forward, rasterize: backward, project: project_backward, decode: decode_backward } = &self.stages;
+        let Self { anchors, limits, near, .. } = self;
+        let Stages { forward, rasterize: backward, project: project_backward, decode: decode_backward, gradients } =
+            self.stages();
         let canvas = self.canvas(camera.size);
-        let picture = &canvas.picture;
-        for gradient in [&gradients.feature, &gradients.offset, &gradients.log_scaling] {
+        // Depth is drawn for views alone whose depth is compared.
+        let color_alone = canvas.picture.color();
+        let picture = if depth { &canvas.picture } else { &color_alone };
+        rec.stage(stage::DECODE_BACKWARD);
+        for gradient in [&gradients.feature, &gradients.offset, &gradients.log_scaling].into_iter().flatten() {
             rec.zero(gradient);
         }
+        rec.stage(stage::CULL);
         forward.visible.record(rec, anchors, camera, *near, limits);
         // A step may be recorded again after later ones: the stage is there then, but its time has not come.
         let attend = self.attend.as_ref().filter(|_| step >= self.config.model.attention.start);
+        rec.stage(stage::ATTENTION);
         let (feature, attended) = match attend.zip(photograph) {
             Some((attend, photograph)) => attend.forward(rec, anchors, &forward.visible, photograph, *near, step),
             None => (&anchors.feature.value, None),
@@ -369,14 +438,19 @@ impl Step {
             weights: &self.weights.value,
             visible: &forward.visible.list,
         };
+        rec.stage(stage::DECODE);
         forward.decode.record(rec, model, &forward.visible.count, camera.center());
+        rec.stage(stage::PROJECT);
         forward.project.record(rec, &forward.visible.slots, forward.gaussians(), camera, *near);
+        rec.stage(stage::BIN);
         let binned = forward.bin.record(rec, forward.projected(), camera.size, limits);
+        rec.stage(stage::RASTERIZE);
         rasterize::forward(rec, forward.tiling(), forward.projected(), binned, self.background, picture);
 
         let gradient = compare(rec, canvas);
 
         let gradient = PictureGradient { rgb: gradient.rgb, depth: gradient.depth, transmittance: None };
+        rec.stage(stage::RASTERIZE_BACKWARD);
         backward.record(rec, forward.tiling(), forward.projected(), binned, picture, gradient);
         let splats = SplatGradients {
             mean: &backward.grad_mean,
@@ -384,6 +458,7 @@ impl Step {
             depth: gradient.depth.and(backward.grad_depth.as_ref()),
         };
         let slots = &forward.visible.slots;
+        rec.stage(stage::PROJECT_BACKWARD);
         project_backward.record(rec, &forward.project, slots, forward.gaussians(), splats, camera, *near);
         let gaussians = GaussianGradients {
             position: &project_backward.grad_position,
@@ -392,12 +467,14 @@ impl Step {
             scale: &project_backward.grad_scale,
             rotation: &project_backward.grad_rotation,
         };
-        let to = AnchorGradients {
-            feature: &gradients.feature,
-            offset: &gradients.offset.view(),
-            log_scaling: &gradients.log_scaling,
-            weights: &gradients.weights,
+        let grad_offset = gradients.offset.as_ref().map(Buffer::view);
+        let to = WantedGradients {
+            feature: gradients.feature.as_ref(),
+            offset: grad_offset.as_ref(),
+            log_scaling: gradients.log_scaling.as_ref(),
+            weights: gradients.weights.as_ref(),
         };
+        rec.stage(stage::DECODE_BACKWARD);
         decode_backward.record(rec, &forward.decode, model, gaussians, to);
         if let Some(statistics) = &self.statistics {
             let drawn = Drawn {
@@ -409,36 +486,38 @@ impl Step {
                 opacity: &forward.decode.opacity,
                 size: camera.size,
             };
+            rec.stage(stage::STATISTICS);
             statistics.record(rec, drawn);
         }
-        if let Some((attend, attended)) = self.attend.as_ref().zip(attended) {
-            attend.backward(rec, attended, &gradients.feature);
+        rec.stage(stage::ATTENTION);
+        if let Some(((attend, attended), grad_feature)) = self.attend.as_ref().zip(attended).zip(to.feature) {
+            attend.backward(rec, attended, grad_feature);
         }
         self.optimize(rec, attended, step, rates);
     }
 
     fn optimize(&self, rec: &mut Recorder<'_>, attended: Option<Attended<'_>>, step: u32, rates: Rates) {
-        let Self { anchors, weights, gradients, .. } = self;
+        let Self { anchors, weights, .. } = self;
+        let gradients = &self.stages().gradients;
         let overflow = self.limits.overflow();
         // Before the optimiser, which goes on from the features that were decoded.
         let attention = self.attend.as_ref().zip(attended);
         let attention =
             attention.map(|(attend, attended)| (attend, attend.write_back(rec, attended, anchors, overflow)));
-        let mut update = |parameter: &Parameter, gradient: &Buffer<f32>, range: (u32, u32), rate: f64| {
-            if rate == 0.0 {
-                return;
-            }
+        rec.stage(stage::OPTIMIZER);
+        let mut update = |parameter: &Parameter, gradient: Option<&Buffer<f32>>, range: (u32, u32), rate: f64| {
+            let Some(gradient) = gradient.filter(|_| rate != 0.0) else { return };
             let tensors = Tensors { value: &parameter.value, gradient, first: &parameter.first, root: &parameter.root };
             adam::record(rec, &self.adam, tensors, overflow, range, (step, rate));
         };
         let all = |parameter: &Parameter| (0, anchors.count * parameter.width);
-        update(&anchors.feature, &gradients.feature, all(&anchors.feature), rates.feature);
-        update(&anchors.offset, &gradients.offset, all(&anchors.offset), rates.offset);
-        update(&anchors.log_scaling, &gradients.log_scaling, all(&anchors.log_scaling), rates.log_scaling);
+        update(&anchors.feature, gradients.feature.as_ref(), all(&anchors.feature), rates.feature);
+        update(&anchors.offset, gradients.offset.as_ref(), all(&anchors.offset), rates.offset);
+        update(&anchors.log_scaling, gradients.log_scaling.as_ref(), all(&anchors.log_scaling), rates.log_scaling);
         let layout = Layout { offsets: anchors.offsets as usize };
         for (head, rate) in rates.decoders.into_iter().enumerate() {
             let first = layout.head(head);
-            update(weights, &gradients.weights, (first as u32, (layout.head(head + 1) - first) as u32), rate);
+            update(weights, gradients.weights.as_ref(), (first as u32, (layout.head(head + 1) - first) as u32), rate);
         }
         if let Some((attend, skip)) = attention {
             let weights = &attend.weights;
@@ -460,35 +539,41 @@ impl Step {
     pub fn prepare(&mut self, step: u32) -> Result<(), Error> {
         let config = &self.config.model.attention;
         if let Some(weights) = self.attention_weights.take_if(|_| step >= config.start) {
-            let attend = Attend::new(&self.gpu, config, self.config.train.seed, self.anchors.capacity, &weights)?;
-            self.attend = Some(attend);
+            let (seed, anchors) = (self.config.train.seed, self.anchors.capacity);
+            let attend = || Attend::new(&self.gpu, config, seed, anchors, &weights);
+            self.attend = Some(self.gpu.stage(stage::ATTENTION, attend)?);
         }
-        let config = &self.config.densify;
-        let counting = self.plan.growth && (config.statistics_from..=config.until).contains(&step);
+        let counting = self.plan.counted.is_some_and(|c| c.contain(step));
         if counting && self.statistics.is_none() {
-            self.statistics = Some(Statistics::new(&self.gpu, self.anchors.capacity, self.anchors.offsets)?);
+            let (anchors, offsets) = (self.anchors.capacity, self.anchors.offsets);
+            let statistics = || Statistics::new(&self.gpu, anchors, offsets);
+            self.statistics = Some(self.gpu.stage(stage::STATISTICS, statistics)?);
         } else if !counting {
             self.statistics = None;
         }
         Ok(())
     }
 
-    /// The gradients of the last recorded step by PyTorch's names: for tests.
+    /// The gradients of the last recorded step by PyTorch's names, of what is trained: for tests.
     ///
     /// # Errors
     /// Whatever the copies meet.
     pub fn gradients(&self) -> Result<std::collections::BTreeMap<String, Vec<f32>>, Error> {
         let mut all = std::collections::BTreeMap::new();
         let n = self.anchors.count as usize;
+        let gradients = &self.stages().gradients;
         for (name, buffer, width) in [
-            ("feature", &self.gradients.feature, 32),
-            ("offset", &self.gradients.offset, 3 * self.anchors.offsets as usize),
-            ("log_scaling", &self.gradients.log_scaling, 6),
+            ("feature", gradients.feature.as_ref(), 32),
+            ("offset", gradients.offset.as_ref(), 3 * self.anchors.offsets as usize),
+            ("log_scaling", gradients.log_scaling.as_ref(), 6),
         ] {
-            all.insert(name.to_owned(), self.gpu.read_range(buffer, n * width)?);
+            if let Some(buffer) = buffer {
+                all.insert(name.to_owned(), self.gpu.read_range(buffer, n * width)?);
+            }
         }
         let layout = Layout { offsets: self.anchors.offsets as usize };
-        let flat = self.gpu.read_range(&self.gradients.weights, layout.weights())?;
+        let Some(weights) = &gradients.weights else { return Ok(all) };
+        let flat = self.gpu.read_range(weights, layout.weights())?;
         let weights = files::Weights::from_device(self.anchors.offsets as usize, &flat, None);
         all.extend(weights.tensors.into_iter().map(|(name, tensor)| (name, tensor.data)));
         Ok(all)

@@ -51,11 +51,9 @@ fn step() {
             masks: true,
             depth: true,
             depth_gradient: true,
-            attention: false,
-            growth: false,
             reference: Some(0),
             sizes: vec![cameras[0].size],
-            left_out: vec![],
+            ..Plan::default()
         };
         let size = cameras[0].size;
         assert_eq!(size, cameras[1].size);

@@ -1,0 +1,63 @@
+//! The stages of a run by name: passes and buffers say which one they belong to, and `plan` lists them.
+
+/// Training pictures and depth priors.
+pub const PICTURES: &str = "pictures";
+/// Anchors and decoders, with the optimiser's moments.
+pub const MODEL: &str = "model";
+/// The list of visible anchors.
+pub const CULL: &str = "cull";
+/// Cross-attention, both ways.
+pub const ATTENTION: &str = "attention";
+/// Anchors to Gaussians.
+pub const DECODE: &str = "decode";
+/// Gaussians to the picture plane.
+pub const PROJECT: &str = "project";
+/// Tiles' lists.
+pub const BIN: &str = "bin";
+/// The picture.
+pub const RASTERIZE: &str = "rasterize";
+/// The colour losses.
+pub const PHOTOMETRIC: &str = "photometric";
+/// The depth's alignment and L1 loss.
+pub const DEPTH: &str = "depth";
+/// The multi-scale gradient of the depth difference.
+pub const DEPTH_GRADIENT: &str = "depth gradient";
+/// Back from the picture to the picture plane.
+pub const RASTERIZE_BACKWARD: &str = "rasterize backward";
+/// Back from the picture plane to the Gaussians.
+pub const PROJECT_BACKWARD: &str = "project backward";
+/// Back from the Gaussians to the model.
+pub const DECODE_BACKWARD: &str = "decode backward";
+/// What growing and pruning look at.
+pub const STATISTICS: &str = "statistics";
+/// Adam.
+pub const OPTIMIZER: &str = "adam";
+/// Growing and pruning of anchors.
+pub const GROWTH: &str = "grow and prune";
+/// Test views.
+pub const EVALUATION: &str = "evaluation";
+/// What the loop itself needs: uploads, counters, figures on their way to the host.
+pub const RUN: &str = crate::gpu::ledger::NO_STAGE;
+
+/// All, in the order of a step.
+pub const ALL: [&str; 19] = [
+    PICTURES,
+    MODEL,
+    CULL,
+    ATTENTION,
+    DECODE,
+    PROJECT,
+    BIN,
+    RASTERIZE,
+    PHOTOMETRIC,
+    DEPTH,
+    DEPTH_GRADIENT,
+    RASTERIZE_BACKWARD,
+    PROJECT_BACKWARD,
+    DECODE_BACKWARD,
+    STATISTICS,
+    OPTIMIZER,
+    GROWTH,
+    EVALUATION,
+    RUN,
+];

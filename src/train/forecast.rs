@@ -1,0 +1,527 @@
+//! What a run will take, before it takes it.
+//!
+//! Two things are looked up, the rest is rehearsed. A *survey* decodes, projects and counts every training view of the
+//! untrained model on the device, without drawing it: visible anchors and (Gaussian, tile) pairs. The *rehearsal* then runs
+//! the stages' own code from the first step to the last on a device that only keeps the books ([`Gpu::rehearsal`]), so
+//! that what it finds is what that code allocates. How many anchors grow is not known before; [`expected_anchors`] says
+//! what is assumed.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use image::{GrayImage, RgbImage};
+use serde::Serialize;
+
+use super::photographs;
+use super::plan::Plan;
+use super::step::{Rates, Step};
+use crate::config::Settings;
+use crate::gpu::{self, Gpu, Schedule, Used};
+use crate::model::anchors::Anchors;
+use crate::model::init::{self, Initial};
+use crate::primitives::limit::{Counter, Limits};
+use crate::render::decode;
+use crate::render::view::{Capacity, Forward};
+use crate::scene::{Camera, Prior, Reference, Scene, View};
+use crate::stage;
+
+/// Why there is no forecast.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The device.
+    #[error(transparent)]
+    Gpu(#[from] gpu::Error),
+    /// The points.
+    #[error(transparent)]
+    Init(#[from] init::Error),
+}
+
+/// The most there is of each in any of the views surveyed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct Survey {
+    /// Anchors of the untrained model.
+    pub anchors: u32,
+    /// Of them in view.
+    pub visible: u32,
+    /// (Gaussian, tile) pairs.
+    pub pairs: u32,
+}
+
+impl Survey {
+    /// Room for that and for what training adds: an eighth of the anchors in view, and six tenths of the pairs, which swell
+    /// before the Gaussians find their sizes (by 35, 52 and 54 % within the first 100 steps of fern, SPIn-NeRF's scene 1 and
+    /// the built-in scene).
+    pub fn capacity(&self) -> Capacity {
+        let Self { anchors, visible, pairs } = *self;
+        let visible = visible.saturating_add(visible / 8).saturating_add(16).min(anchors.max(1));
+        Capacity { anchors, visible, pairs: pairs.saturating_add(pairs / 5 * 3).max(1 << 17) }
+    }
+}
+
+/// The model that a run starts from.
+///
+/// # Errors
+/// Points that make no anchor.
+pub fn initial(scene: &Scene, settings: &Settings) -> Result<Initial, init::Error> {
+    let points: Vec<[f32; 3]> = scene.points.iter().map(|p| p.position).collect();
+    init::from_points(&points, &settings.model)
+}
+
+/// Counts what the untrained model shows to these cameras.
+///
+/// # Errors
+/// When the device has no room for a forward pass.
+pub fn survey<'c>(
+    gpu: &Gpu,
+    initial: &Initial,
+    settings: &Settings,
+    cameras: impl IntoIterator<Item = &'c Camera>,
+) -> Result<Survey, gpu::Error> {
+    let cameras: Vec<&Camera> = cameras.into_iter().collect();
+    let offsets = initial.anchors.offsets_per_anchor as u32;
+    let flat = init::weights(settings.train.seed, offsets as usize, false).decoders();
+    let weights = gpu.upload("weights", &flat)?;
+    let anchors = Anchors::upload(gpu, &initial.anchors, 0)?;
+    let size = cameras.iter().fold([1, 1], |a, c| [a[0].max(c.size[0]), a[1].max(c.size[1])]);
+    let tiling = crate::render::bin::Tiling::of(gpu.info().subgroup_size);
+    let limits = Limits::new(gpu)?;
+    let near = settings.render.near as f32;
+    // Pairs are counted whether they fit or not.
+    let mut capacity = Capacity { pairs: 1, ..Capacity::guess(anchors.capacity) };
+    let mut forward = Forward::new(gpu, capacity, offsets, tiling, size, settings.render.cull)?;
+    let mut most = Survey { anchors: anchors.count, visible: 0, pairs: 0 };
+    for camera in cameras {
+        loop {
+            let mut rec = gpu.recorder()?;
+            limits.lower(&mut rec);
+            forward.visible.record(&mut rec, &anchors, camera, near, &limits);
+            let offset = anchors.offset.value.view();
+            let model = decode::Anchors {
+                position: &anchors.position,
+                feature: &anchors.feature.value,
+                offset: &offset,
+                log_scaling: &anchors.log_scaling.value,
+                weights: &weights,
+                visible: &forward.visible.list,
+            };
+            forward.decode.record(&mut rec, model, &forward.visible.count, camera.center());
+            forward.project.record(&mut rec, &forward.visible.slots, forward.gaussians(), camera, near);
+            forward.bin.record(&mut rec, forward.projected(), camera.size, &limits);
+            rec.submit()?.wait()?;
+            let counters = gpu.read(limits.counters())?;
+            let [visible, pairs] = [Counter::Visible, Counter::Pairs].map(|c| counters[c as usize]);
+            if visible <= capacity.visible {
+                most = Survey { visible: most.visible.max(visible), pairs: most.pairs.max(pairs), ..most };
+                break;
+            }
+            drop(forward);
+            capacity.visible = visible.saturating_add(visible / 2).min(anchors.capacity);
+            forward = Forward::new(gpu, capacity, offsets, tiling, size, settings.render.cull)?;
+        }
+    }
+    Ok(most)
+}
+
+/// The anchors there will be at the end of training, an estimate.
+///
+/// New anchors fill up the surfaces around the first ones: a cell of the coarsest growth grid that a surface passes through
+/// has `(cells of the finest grid along its side)^2` places for them, of which a fifth is filled in the long run, half of
+/// that within the first eight rounds: `N + M c^2 / 5 * r / (r + 8)` for N anchors in M such cells after r rounds. The two
+/// numbers come from three scenes (the built-in one, fern and SPIn-NeRF's scene 1 at a quarter of its size), whose growth
+/// the formula meets within 4 % of all anchors; other scenes may differ by more. `densify.max_anchors` and the device's
+/// largest binding limit it.
+pub fn expected_anchors(gpu: &Gpu, plan: &Plan, settings: &Settings, initial: &Initial) -> u32 {
+    let count = initial.anchors.position.len() as u32;
+    let Some(rounds) = plan.rounds else { return count };
+    let config = &settings.densify;
+    let side = initial.voxel * f64::from(config.coarsest_cell);
+    let cells: BTreeSet<[i64; 3]> =
+        initial.anchors.position.iter().map(|p| p.map(|x| (f64::from(x) / side).round_ties_even() as i64)).collect();
+    let rounds = f64::from((rounds.last - rounds.first) / config.every + 1);
+    let per_cell = 16f64.powi(config.levels as i32 - 1) / 5.0;
+    let grown = cells.len() as f64 * per_cell * rounds / (rounds + 8.0);
+    (f64::from(count) + grown).min(f64::from(most_anchors(gpu, settings, count))) as u32
+}
+
+/// The most anchors that growing makes.
+fn most_anchors(gpu: &Gpu, settings: &Settings, count: u32) -> u32 {
+    let most = Anchors::most(gpu, settings.model.offsets);
+    let most = if settings.densify.max_anchors == 0 { most } else { most.min(settings.densify.max_anchors) };
+    most.max(count)
+}
+
+/// Device memory at a point of the run.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Moment {
+    /// What happens there.
+    pub what: String,
+    /// Behind, or at, this step.
+    pub step: u32,
+    /// Anchors.
+    pub anchors: u32,
+    /// Bytes of buffers.
+    pub bytes: u64,
+    /// The most bytes there were so far.
+    pub peak: u64,
+}
+
+/// A run as rehearsed.
+#[derive(Clone, Debug)]
+pub struct Forecast {
+    /// What there is to stand on.
+    pub survey: Survey,
+    /// Room to start with.
+    pub capacity: Capacity,
+    /// Anchors at the end, as assumed.
+    pub anchors: u32,
+    /// Bytes with the first step's stages.
+    pub start: u64,
+    /// The most bytes of buffers at any time.
+    pub peak: u64,
+    /// Where memory rises.
+    pub moments: Vec<Moment>,
+    /// What each stage uses in the course of the run.
+    pub used: BTreeMap<&'static str, Used>,
+    /// The kernels that are compiled.
+    pub pipelines: Vec<&'static str>,
+    /// Steps as recorded, by step and view (an index into the training views).
+    pub schedules: BTreeMap<(u32, usize), Schedule>,
+}
+
+impl Forecast {
+    /// Bytes that the device has to have free: buffers, and the allocator's blocks around them.
+    pub fn needs(&self) -> u64 {
+        self.peak + gpu::device::SPARE_BYTES
+    }
+}
+
+/// One view of each kind: whether it is the reference view, has a mask, and has a prior; and one of each size.
+fn kinds(scene: &Scene) -> Vec<usize> {
+    let mut seen = BTreeSet::new();
+    let kind = |i: usize, view: &View| {
+        let reference = scene.reference.as_ref().filter(|r| r.view == i);
+        let prior = reference.map_or(view.prior.is_some(), |r| r.prior.is_some());
+        let masked = view.mask.as_ref().is_some_and(|m| m.as_raw().iter().any(|&v| v != 0));
+        (reference.is_some(), masked, prior, view.camera.size)
+    };
+    scene.train.iter().enumerate().filter(|(i, view)| seen.insert(kind(*i, view))).map(|(i, _)| i).collect()
+}
+
+/// Rehearses a run that starts with this model and ends with so many anchors. `also` is a step to record for all kinds of
+/// views besides those at which something begins.
+///
+/// # Errors
+/// [`gpu::Error::TooLarge`] when one buffer is beyond what the device binds.
+pub fn rehearse(
+    gpu: &Gpu,
+    scene: &Scene,
+    settings: &Settings,
+    initial: &Initial,
+    survey: Survey,
+    anchors: u32,
+    also: Option<u32>,
+) -> Result<Forecast, Error> {
+    let gpu = gpu.rehearsal();
+    let plan = Plan::new(scene, settings);
+    let offsets = settings.model.offsets as usize;
+    let weights = init::weights(settings.train.seed, offsets, plan.attention);
+    let photographs = photographs::upload(&gpu, scene, &plan)?;
+    let mut step = Step::new(&gpu, plan.clone(), settings, &initial.anchors, &weights, initial.voxel)?;
+    let capacity = survey.capacity();
+    step.resize(capacity)?;
+    let start = gpu.memory().0;
+    let mut moments = vec![];
+    let mut note = |what: &str, at: u32, anchors: u32| {
+        let (bytes, peak) = gpu.memory();
+        moments.push(Moment { what: what.to_owned(), step: at, anchors, bytes, peak });
+    };
+    note("the first step", 1, step.anchors.count);
+
+    let iterations = plan.iterations;
+    let counted = plan.counted;
+    let attention = plan.steps(stage::ATTENTION, settings).map(|s| s.first);
+    let after = plan.rounds.map(|r| r.last + 1);
+    let evaluations = plan.steps(stage::EVALUATION, settings).map(|s| s.first);
+    let mut at: BTreeSet<u32> = [1, iterations].into_iter().chain(also).collect();
+    at.extend(counted.map(|c| c.first).into_iter().chain(attention).chain(after).chain(evaluations));
+    let every = settings.densify.every as usize;
+    let rounds: Vec<u32> = plan.rounds.map_or(vec![], |r| (r.first..=r.last).step_by(every).collect());
+    at.extend(&rounds);
+    at.retain(|&s| s <= iterations || Some(s) == also);
+    let kinds = kinds(scene);
+    let mut schedules = BTreeMap::new();
+    let grown = f64::from(anchors.saturating_sub(survey.anchors));
+    let share = |r: usize| r as f64 / (r as f64 + 8.0);
+    for number in at {
+        step.prepare(number)?;
+        let kept = !rounds.contains(&number) || Some(number) == also;
+        if kept {
+            for &view in &kinds {
+                let mut rec = gpu.recorder()?;
+                let rates = Rates::at(settings, f64::from(scene.radius), number);
+                step.record(&mut rec, &photographs[view], number, rates);
+                let submission = rec.submit()?;
+                schedules.insert((number, view), submission.schedule.clone());
+                submission.wait()?;
+            }
+        }
+        if Some(number) == counted.map(|c| c.first) {
+            note("statistics begin", number, step.anchors.count);
+        }
+        if Some(number) == attention {
+            note("attention begins", number, step.anchors.count);
+        }
+        if step.changes_anchors(number) && number <= iterations {
+            let round = rounds.partition_point(|&r| r <= number);
+            let target = f64::from(survey.anchors) + grown * share(round) / share(rounds.len());
+            let more = (target as u32).saturating_sub(step.anchors.count).div_ceil(settings.densify.levels);
+            let room = most_anchors(&gpu, settings, survey.anchors);
+            let kept = (step.anchors.count + more * settings.densify.levels).min(room.max(step.anchors.count));
+            for (buffer, word) in [("candidate_count", 4 * more), ("free_count", more), ("kept_count", kept)] {
+                gpu.answer(buffer, word);
+            }
+            step.change_anchors(number)?;
+            if number == rounds[rounds.len() - 1] {
+                note("the last round of growing", number, step.anchors.count);
+            }
+        }
+        if Some(number) == after {
+            note("statistics have ended", number, step.anchors.count);
+        }
+        if Some(number) == evaluations || (plan.evaluation && number == iterations) {
+            let mut sizes = BTreeSet::new();
+            let cameras = scene.test.iter().map(|v| &v.camera).filter(|c| sizes.insert(c.size));
+            step.draw(cameras, |_, _| Ok::<_, gpu::Error>(()))?;
+            note("test views", number, step.anchors.count);
+        }
+    }
+    step.model()?;
+    note("the model is saved", iterations, step.anchors.count);
+    let (used, pipelines, peak) = (gpu.used(), gpu.pipelines(), gpu.memory().1);
+    let anchors = step.anchors.count;
+    Ok(Forecast { survey, capacity, anchors, start, peak, moments, used, pipelines, schedules })
+}
+
+/// A change of settings under which a run would fit.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Remedy {
+    /// As typed.
+    pub change: String,
+    /// Bytes that it needs then.
+    pub needs: u64,
+}
+
+/// A run's memory against a device's.
+#[derive(Clone, Debug)]
+pub struct Verdict {
+    /// Bytes there are.
+    pub available: u64,
+    /// The run, or the one buffer that the device cannot bind.
+    pub forecast: Result<Forecast, String>,
+    /// What would fit; empty for a run that does.
+    pub remedies: Vec<Remedy>,
+}
+
+impl Verdict {
+    /// True if the whole run fits, growth included.
+    pub fn fits(&self) -> bool {
+        self.forecast.as_ref().is_ok_and(|f| f.needs() <= self.available)
+    }
+
+    /// True if training can begin.
+    pub fn starts(&self) -> bool {
+        self.forecast.as_ref().is_ok_and(|f| f.start + gpu::device::SPARE_BYTES <= self.available)
+    }
+
+    /// One sentence for a run that does not fit.
+    pub fn describe(&self) -> Option<String> {
+        if self.fits() {
+            return None;
+        }
+        let mib = |bytes: u64| bytes.div_ceil(1 << 20);
+        let remedies: Vec<_> = self.remedies.iter().map(|r| format!("{} ({} MiB)", r.change, mib(r.needs))).collect();
+        let remedies = match remedies.as_slice() {
+            [] => "no smaller picture and no coarser grid was found that does".to_owned(),
+            all => format!("what fits: {}", all.join(", or ")),
+        };
+        Some(match &self.forecast {
+            Ok(f) => format!(
+                "this run needs about {} MiB of device memory ({} MiB at its start, the rest with {} anchors at its end), \
+                 and {} MiB are free; {remedies}",
+                mib(f.needs()),
+                mib(f.start + gpu::device::SPARE_BYTES),
+                f.anchors,
+                mib(self.available)
+            ),
+            Err(buffer) => format!("{buffer}; {remedies}"),
+        })
+    }
+}
+
+/// The scene at another size of its pictures, which are blank: for rehearsals.
+fn resized(scene: &Scene, from: u32, to: u32) -> Scene {
+    let scaled = |size: [u32; 2]| size.map(|n| (u64::from(n) * u64::from(from)).div_ceil(to.into()).max(1) as u32);
+    let blank = |prior: &Prior, [w, h]: [u32; 2]| Prior { kind: prior.kind, values: vec![0.0; (w * h) as usize] };
+    let view = |view: &View| {
+        let size @ [w, h] = scaled(view.camera.size);
+        let masked = view.mask.as_ref().is_some_and(|m| m.as_raw().iter().any(|&v| v != 0));
+        let fill = image::Luma([if masked { 255 } else { 0 }]);
+        View {
+            name: view.name.clone(),
+            camera: view.camera.scaled(size),
+            image: RgbImage::new(w, h),
+            mask: view.mask.as_ref().map(|_| GrayImage::from_pixel(w, h, fill)),
+            prior: view.prior.as_ref().map(|p| blank(p, size)),
+        }
+    };
+    let reference = scene.reference.as_ref().map(|r| {
+        let size @ [w, h] = scaled([r.image.width(), r.image.height()]);
+        let prior = r.prior.as_ref().map(|p| blank(p, size));
+        Reference { view: r.view, image: RgbImage::new(w, h), prior }
+    });
+    Scene {
+        train: scene.train.iter().map(view).collect(),
+        test: scene.test.iter().map(view).collect(),
+        reference,
+        points: scene.points.clone(),
+        radius: scene.radius,
+        notes: vec![],
+    }
+}
+
+/// What is asked of [`forecast`].
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Question {
+    /// Anchors at the end, instead of [`expected_anchors`].
+    pub anchors: Option<u32>,
+    /// Bytes of device memory to plan for, instead of those free now.
+    pub available: Option<u64>,
+    /// A step to record besides those at which something begins.
+    pub also: Option<u32>,
+}
+
+/// At most so many views are surveyed for each change of settings that might fit.
+const VIEWS: usize = 8;
+
+/// Surveys and rehearses a run, and looks for what would fit if it does not.
+///
+/// # Errors
+/// Points that make no anchor; a device that is lost.
+pub fn forecast(gpu: &Gpu, scene: &Scene, settings: &Settings, question: Question) -> Result<Verdict, Error> {
+    let available = question.available.unwrap_or_else(|| gpu.available_bytes());
+    let plan = Plan::new(scene, settings);
+    let first = initial(scene, settings)?;
+    let cameras = || scene.train.iter().map(|v| &v.camera);
+    let counts = surveyed(gpu, &first, settings, cameras())?;
+    let anchors = question.anchors.unwrap_or_else(|| expected_anchors(gpu, &plan, settings, &first));
+    let rehearsed = rehearse(gpu, scene, settings, &first, counts, anchors, question.also);
+    let forecast = match rehearsed {
+        Ok(forecast) => Ok(forecast),
+        Err(Error::Gpu(error @ gpu::Error::TooLarge { .. })) => Err(error.to_string()),
+        Err(error) => return Err(error),
+    };
+    let mut verdict = Verdict { available, forecast, remedies: vec![] };
+    if !verdict.fits() {
+        verdict.remedies = remedies(gpu, scene, settings, question, available)?;
+    }
+    Ok(verdict)
+}
+
+/// As [`survey`]; where the device has no room for that either, as if all anchors were in view.
+fn surveyed<'c>(
+    gpu: &Gpu,
+    initial: &Initial,
+    settings: &Settings,
+    cameras: impl IntoIterator<Item = &'c Camera>,
+) -> Result<Survey, Error> {
+    match survey(gpu, initial, settings, cameras) {
+        Err(gpu::Error::TooLarge { .. } | gpu::Error::OutOfMemory { .. }) => {
+            let anchors = initial.anchors.position.len() as u32;
+            Ok(Survey { anchors, visible: anchors, pairs: anchors.saturating_mul(settings.model.offsets) })
+        }
+        other => Ok(other?),
+    }
+}
+
+fn remedies(
+    gpu: &Gpu,
+    scene: &Scene,
+    settings: &Settings,
+    question: Question,
+    available: u64,
+) -> Result<Vec<Remedy>, Error> {
+    let every = scene.train.len().div_ceil(VIEWS);
+    // Bytes that a run of these settings needs, if they are as many as there are or fewer.
+    let needs = |scene: &Scene, settings: &Settings| -> Result<Option<u64>, Error> {
+        let plan = Plan::new(scene, settings);
+        let first = initial(scene, settings)?;
+        let cameras = scene.train.iter().step_by(every).map(|v| &v.camera);
+        let mut counts = surveyed(gpu, &first, settings, cameras)?;
+        if every > 1 {
+            // Not all views were looked at.
+            counts.visible = counts.visible.saturating_add(counts.visible / 10).min(counts.anchors);
+            counts.pairs = counts.pairs.saturating_add(counts.pairs / 5);
+        }
+        let anchors = question.anchors.unwrap_or_else(|| expected_anchors(gpu, &plan, settings, &first));
+        match rehearse(gpu, scene, settings, &first, counts, anchors, None) {
+            Ok(forecast) => Ok(Some(forecast.needs()).filter(|&bytes| bytes <= available)),
+            Err(Error::Gpu(gpu::Error::TooLarge { .. })) => Ok(None),
+            Err(error) => Err(error),
+        }
+    };
+    let mut found = vec![];
+    let scale = settings.scene.downscale;
+    for to in [scale + 1, scale * 2, scale * 3, scale * 4, scale * 8] {
+        let mut changed = settings.clone();
+        changed.scene.downscale = to;
+        if let Some(needs) = needs(&resized(scene, scale, to), &changed)? {
+            found.push(Remedy { change: format!("--downscale {to}"), needs });
+            break;
+        }
+    }
+    for factor in [1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0] {
+        let mut changed = settings.clone();
+        let change = if settings.model.voxel > 0.0 {
+            changed.model.voxel *= factor;
+            format!("--set model.voxel={}", changed.model.voxel)
+        } else {
+            changed.model.voxel_factor *= factor;
+            format!("--set model.voxel_factor={}", changed.model.voxel_factor)
+        };
+        if let Some(needs) = needs(scene, &changed)? {
+            found.push(Remedy { change, needs });
+            break;
+        }
+    }
+    let first = initial(scene, settings)?;
+    let plan = Plan::new(scene, settings);
+    let count = first.anchors.position.len() as u32;
+    if plan.growth && question.anchors.is_none() {
+        let expected = expected_anchors(gpu, &plan, settings, &first);
+        // In eighths of the growth, the most first.
+        for eighths in (0..8).rev() {
+            let mut changed = settings.clone();
+            changed.densify.max_anchors = count + (u64::from(expected - count) * eighths / 8) as u32;
+            if let Some(needs) = needs(scene, &changed)? {
+                found.push(Remedy {
+                    change: format!("--set densify.max_anchors={}", changed.densify.max_anchors),
+                    needs,
+                });
+                break;
+            }
+        }
+    }
+    if plan.attention {
+        let attention = &settings.model.attention;
+        let mut tokens = attention.tokens / 2;
+        while tokens > attention.min_tokens {
+            let mut changed = settings.clone();
+            changed.model.attention.tokens = tokens;
+            if let Some(needs) = needs(scene, &changed)? {
+                found.push(Remedy { change: format!("--set model.attention.tokens={tokens}"), needs });
+                break;
+            }
+            tokens /= 2;
+        }
+    }
+    Ok(found)
+}
