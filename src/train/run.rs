@@ -80,6 +80,17 @@ pub enum Error {
     },
 }
 
+impl Error {
+    /// The signal that ended the run, if one did.
+    pub fn signal(&self) -> Option<Signal> {
+        match self {
+            Self::Interrupted { signal } => Some(*signal),
+            Self::Stopped { source, .. } => source.signal(),
+            _ => None,
+        }
+    }
+}
+
 fn how_to_go_on(kept: Option<u32>, folder: &Path) -> String {
     let folder = folder.display();
     match kept {
@@ -104,6 +115,11 @@ impl Signal {
             Self::Interrupt => 2,
             Self::Terminate => 15,
         }
+    }
+
+    /// What a program that it ended returns to the shell.
+    pub fn exit_code(self) -> u8 {
+        128 + self.number()
     }
 }
 
@@ -342,6 +358,11 @@ impl<'a> Run<'a> {
     /// The step: its plan, model and stages.
     pub fn step(&self) -> &Step {
         &self.step
+    }
+
+    /// The last step that has ended.
+    pub fn done(&self) -> u32 {
+        self.history.last.step
     }
 
     /// Gives the stages room for so much, instead of the first guess; what does not fit is made room for as ever. Nothing
