@@ -23,6 +23,9 @@ pub struct Config {
     /// Steps between two checkpoints, of which the last two are kept; 0 writes one only when a run ends early. A run
     /// that has ended well keeps none.
     pub checkpoint_interval: u32,
+    /// Steps between two searches of all gradients, parameters and moments for values that are not finite. The losses and
+    /// the networks' gradients are searched in every step. 0 searches nothing: a broken model trains on.
+    pub sentinel_interval: u32,
 }
 
 /// How the next training view is drawn.
@@ -46,6 +49,7 @@ impl Default for Config {
             eval_interval: 5_000,
             save_interval: 5_000,
             checkpoint_interval: 1_000,
+            sentinel_interval: 50,
         }
     }
 }

@@ -12,6 +12,7 @@ use crate::model::anchors::{Anchors, Parameter};
 use crate::model::files;
 use crate::optimizer::adam::{self, Tensors};
 use crate::optimizer::schedule::Rate;
+use crate::primitives::finite;
 use crate::primitives::limit::Limits;
 
 use crate::render::decode::{self, AnchorGradients, DecodeBackward, GaussianGradients};
@@ -400,6 +401,11 @@ impl Step {
             weights: &gradients.weights,
         };
         decode_backward.record(rec, &forward.decode, model, gaussians, to);
+        if let Some((attend, attended)) = self.attend.as_ref().zip(attended) {
+            attend.backward(rec, attended, &gradients.feature);
+        }
+        // Whatever changes the model or is gathered for it comes behind: it obeys the flag.
+        self.watch(rec, canvas.losses.terms(), attended, step);
         if let Some(statistics) = &self.statistics {
             let drawn = Drawn {
                 slots,
@@ -412,10 +418,40 @@ impl Step {
             };
             statistics.record(rec, drawn);
         }
-        if let Some((attend, attended)) = self.attend.as_ref().zip(attended) {
-            attend.backward(rec, attended, &gradients.feature);
-        }
         self.optimize(rec, attended, step, rates);
+    }
+
+    /// Looks for values that are not finite: in the losses and the networks' gradients, into which every Gaussian's
+    /// gradients are summed, in each step; in all gradients, parameters and moments in every `sentinel_interval`-th.
+    fn watch(&self, rec: &mut Recorder<'_>, terms: &Buffer<f32>, attended: Option<Attended<'_>>, step: u32) {
+        let Self { anchors, weights, gradients, .. } = self;
+        let interval = self.config.train.sentinel_interval;
+        if interval == 0 {
+            return;
+        }
+        let flag = self.limits.overflow();
+        let network = Layout { offsets: anchors.offsets as usize }.weights() as u32;
+        finite::record(rec, terms, losses::Term::ALL.len() as u32, flag, None);
+        finite::record(rec, &gradients.weights, network, flag, None);
+        let attention = self.attend.as_ref().zip(attended);
+        if let Some((attend, attended)) = attention {
+            finite::record(rec, &attend.grad_weights, attend.weights.width, flag, Some(attended.tokens()));
+        }
+        if !step.is_multiple_of(interval) {
+            return;
+        }
+        let of_anchors = [&gradients.feature, &gradients.offset, &gradients.log_scaling];
+        for (parameter, gradient) in anchors.parameters().into_iter().zip(of_anchors) {
+            for tensor in parameter.tensors().into_iter().chain([gradient]) {
+                finite::record(rec, tensor, anchors.count * parameter.width, flag, None);
+            }
+        }
+        for tensor in weights.tensors() {
+            finite::record(rec, tensor, network, flag, None);
+        }
+        for tensor in self.attend.iter().flat_map(|attend| attend.weights.tensors()) {
+            finite::record(rec, tensor, crate::math::attention::WEIGHTS as u32, flag, None);
+        }
     }
 
     fn optimize(&self, rec: &mut Recorder<'_>, attended: Option<Attended<'_>>, step: u32, rates: Rates) {
