@@ -17,9 +17,10 @@ use super::plan::Plan;
 use super::step::{Rates, Step};
 use crate::config::Settings;
 use crate::evaluate::{self, Report, ViewMetrics};
-use crate::gpu::{self, Buffer, Gpu, Submission, Timing, Timings};
+use crate::gpu::{self, Buffer, Gpu, NotFinite, Submission, Timing, Timings};
 use crate::losses::Term;
 use crate::model::{files, init};
+use crate::primitives::finite::NOT_FINITE;
 use crate::primitives::limit::{COUNTERS, Counter};
 use crate::render::view::{Capacity, Rendered, Renderer};
 use crate::scene::Scene;
@@ -49,7 +50,7 @@ pub enum Error {
         signal: Signal,
     },
     /// Any of the others, once the run is under way.
-    #[error("{source}; {}", how_to_go_on(*kept, folder))]
+    #[error("{source}; {}", how_to_go_on(source, *kept, folder))]
     Stopped {
         /// Why.
         source: Box<Error>,
@@ -67,17 +68,27 @@ pub enum Error {
         source: std::io::Error,
     },
     /// A number stopped being one.
-    #[error(
-        "the loss of step {step} (view {view}) is {loss}: the model before it is not saved; lower the learning rates or look at that view's prior and mask"
-    )]
+    #[error("step {step} (view {view}): {}", where_from(found.as_ref()))]
     NotFinite {
         /// The step.
         step: u32,
         /// The view's name.
         view: String,
-        /// The loss.
-        loss: f32,
+        /// The first one, if it came again when the step was repeated.
+        found: Option<NotFinite>,
     },
+}
+
+fn where_from(found: Option<&NotFinite>) -> String {
+    match found {
+        Some(NotFinite { pass, tensor, index, value }) => format!(
+            "pass {pass} wrote {value} into `{tensor}` (its float {index}), the first value that is not finite; lower the \
+             learning rates, or look at that view's prior and mask"
+        ),
+        None => "values that are not finite came up, and did not when the steps were repeated from good ones: the device's \
+                 memory may be faulty"
+            .to_owned(),
+    }
 }
 
 impl Error {
@@ -91,10 +102,15 @@ impl Error {
     }
 }
 
-fn how_to_go_on(kept: Option<u32>, folder: &Path) -> String {
-    let folder = folder.display();
+fn how_to_go_on(source: &Error, kept: Option<u32>, folder: &Path) -> String {
     match kept {
-        Some(step) => format!("`gscream-vk train --resume {folder}` goes on behind step {step}"),
+        // The same step would end the same way.
+        Some(step) if matches!(source, Error::NotFinite { found: Some(_), .. }) => {
+            format!("the last good state, behind step {step}, is {}", checkpoint::path(folder, step).display())
+        }
+        Some(step) => {
+            format!("`gscream-vk train --resume {}` goes on behind step {step}", folder.display())
+        }
         None => "there is no checkpoint to go on from".to_owned(),
     }
 }
@@ -218,6 +234,17 @@ pub trait Observer {
 pub struct Silent;
 impl Observer for Silent {}
 
+/// Ends a run after so many steps.
+struct StepsLeft(u32);
+impl Observer for StepsLeft {
+    fn step(&mut self, _progress: &Progress) {
+        self.0 -= 1;
+    }
+    fn interrupted(&mut self) -> Option<Signal> {
+        (self.0 == 0).then_some(Signal::Interrupt)
+    }
+}
+
 /// Buffers in host memory that the device fills at the end of a step.
 struct Mailbox {
     losses: Buffer<f32>,
@@ -234,6 +261,8 @@ struct InFlight<'g> {
 
 /// Why [`Run::advance`] returned early.
 enum Halt {
+    /// Values are not finite behind, or at, a step; the last state known to be good, if one is.
+    Broken { step: u32, good: Option<Box<State>> },
     /// The model on the device is that behind the last step of the history.
     Good(Error),
     /// It is not, or cannot be read any more.
@@ -249,7 +278,7 @@ impl<E: Into<Error>> From<E> for Halt {
 /// What belongs to one call of [`Run::train`] alone.
 struct Session<'f> {
     folder: &'f Path,
-    log: File,
+    log: Option<File>,
     /// Seconds trained before.
     before: f64,
     started: Instant,
@@ -257,6 +286,8 @@ struct Session<'f> {
     paused: f64,
     /// Steps since the last line of the log, and when that was.
     rate: (u32, Instant),
+    /// Nothing is written, and the state before every step is kept until the step has turned out well.
+    careful: bool,
     timings: Timings,
     last_timings: Vec<Timing>,
 }
@@ -272,10 +303,23 @@ impl<'f> Session<'f> {
             File::options().append(true).open(&path)
         };
         let log = open().map_err(|source| Error::Io { path: path.clone(), source })?;
+        Ok(Self { log: Some(log), careful: false, ..Self::careful(folder, history) })
+    }
+
+    /// Writes nothing.
+    fn careful(folder: &'f Path, history: &History) -> Self {
         let now = Instant::now();
-        let (timings, last_timings) = (Timings::default(), vec![]);
-        let before = history.last.seconds;
-        Ok(Self { folder, log, before, started: now, paused: 0.0, rate: (0, now), timings, last_timings })
+        Self {
+            folder,
+            log: None,
+            before: history.last.seconds,
+            started: now,
+            paused: 0.0,
+            rate: (0, now),
+            careful: true,
+            timings: Timings::default(),
+            last_timings: vec![],
+        }
     }
 
     fn seconds(&self) -> f64 {
@@ -284,7 +328,7 @@ impl<'f> Session<'f> {
 
     fn write_line(&mut self, text: &str) -> Result<(), Error> {
         let failed = |source| Error::Io { path: self.folder.join(LOG), source };
-        self.log.write_all(text.as_bytes()).map_err(failed)
+        self.log.as_mut().map_or(Ok(()), |log| log.write_all(text.as_bytes())).map_err(failed)
     }
 }
 
@@ -293,6 +337,18 @@ pub const LOG: &str = "log.jsonl";
 
 /// Steps given to the device before the first is waited for.
 const DEPTH: usize = 2;
+
+/// A step of a run that has not begun.
+fn fresh(gpu: &Gpu, scene: &Scene, settings: &Settings) -> Result<Step, Error> {
+    let plan = Plan::new(scene, settings);
+    let points: Vec<[f32; 3]> = scene.points.iter().map(|p| p.position).collect();
+    let offsets = settings.model.offsets as usize;
+    let derived = || init::median_nearest_distance(&points).map_or(0.0, |d| d * settings.model.voxel_factor);
+    let voxel = if settings.model.voxel > 0.0 { settings.model.voxel } else { derived() };
+    let initial = init::anchors(&points, voxel, offsets)?;
+    let weights = init::weights(settings.train.seed, offsets, plan.attention);
+    Ok(Step::new(gpu, plan, settings, &initial.anchors, &weights, initial.voxel)?)
+}
 
 /// A training run.
 pub struct Run<'a> {
@@ -314,15 +370,7 @@ impl<'a> Run<'a> {
     /// # Errors
     /// When the points make no anchor or the device has no room.
     pub fn new(gpu: &'a Gpu, scene: &'a Scene, settings: &'a Settings) -> Result<Self, Error> {
-        let plan = Plan::new(scene, settings);
-        let points: Vec<[f32; 3]> = scene.points.iter().map(|p| p.position).collect();
-        let offsets = settings.model.offsets as usize;
-        let derived = || init::median_nearest_distance(&points).map_or(0.0, |d| d * settings.model.voxel_factor);
-        let voxel = if settings.model.voxel > 0.0 { settings.model.voxel } else { derived() };
-        let initial = init::anchors(&points, voxel, offsets)?;
-        let weights = init::weights(settings.train.seed, offsets, plan.attention);
-        let step = Step::new(gpu, plan, settings, &initial.anchors, &weights, initial.voxel)?;
-        Self::with(gpu, scene, settings, step, History::default())
+        Self::with(gpu, scene, settings, fresh(gpu, scene, settings)?, History::default())
     }
 
     /// The run that a checkpoint was written by, from there on.
@@ -396,7 +444,13 @@ impl<'a> Run<'a> {
             let mut rec = self.gpu.recorder()?;
             self.record(&mut rec, step)?;
             rec.submit()?.wait()?;
-            if self.gpu.read(self.step.limits.overflow())?[0] == 0 {
+            let flag = self.gpu.read(self.step.limits.overflow())?[0];
+            if flag >> NOT_FINITE != 0 {
+                self.lower()?;
+                let view = self.photographs[self.order.view(step)].name.clone();
+                return Err(Error::NotFinite { step, view, found: None });
+            }
+            if flag == 0 {
                 return Ok(());
             }
             let counters = self.gpu.read(self.step.limits.counters())?;
@@ -434,20 +488,25 @@ impl<'a> Run<'a> {
         let stopped = |source, kept| Error::Stopped { source: Box::new(source), kept, folder: folder.to_owned() };
         let report = match result {
             Ok(report) => report,
-            Err(Halt::Lost(error)) => {
-                return Err(stopped(error, checkpoint::list(folder).first().map(|(step, _)| *step)));
-            }
-            Err(Halt::Good(error)) => {
-                let step = history.last.step;
-                let kept = match self.checkpoint(folder, &history) {
-                    Ok(()) => Some(step),
+            Err(halt) => {
+                let (error, state) = match halt {
+                    Halt::Lost(error) => (error, None),
+                    Halt::Good(error) => {
+                        let model = Model::of(self.gpu, &self.step).ok();
+                        (error, model.map(|model| State { history: history.clone(), model }))
+                    }
+                    Halt::Broken { step, good } => self.explain(folder, step, good.map(|state| *state), watch),
+                };
+                let kept = state.and_then(|state| match checkpoint::write(folder, self.owner(), &state) {
+                    Ok(_) => Some(state.history.last.step),
                     // The first error is the one to act on, and likely the cause of this one.
                     Err(second) => {
                         log::info!("{second}");
-                        checkpoint::list(folder).first().map(|(step, _)| *step)
+                        None
                     }
-                };
-                return Err(stopped(error, kept));
+                });
+                let newest = || checkpoint::list(folder).first().map(|(step, _)| *step);
+                return Err(stopped(error, kept.or_else(newest)));
             }
         };
         let recent = &history.recent;
@@ -482,6 +541,7 @@ impl<'a> Run<'a> {
         let mut report = None;
         // What ends the run, once nothing is in flight any more.
         let mut halt: Option<Error> = None;
+        let mut good: Option<Box<State>> = None;
         if history.last.step > 0 && !history.told {
             match self.tell(session, history, watch) {
                 Ok(told) => report = told,
@@ -493,7 +553,15 @@ impl<'a> Run<'a> {
                 halt = watch.interrupted().map(|signal| Error::Interrupted { signal });
             }
             // What follows a change of the anchors, an evaluation, a save or a checkpoint waits until it is made.
-            let blocked = halt.is_some() || next > history.last.step + 1 && self.pauses_behind(next - 1);
+            let behind = next > history.last.step + 1;
+            let blocked = halt.is_some() || behind && (session.careful || self.pauses_behind(next - 1));
+            if session.careful && !blocked {
+                let model = Model::of(self.gpu, &self.step)?;
+                if model.not_finite().is_some() {
+                    return Err(Halt::Broken { step: history.last.step, good });
+                }
+                good = Some(Box::new(State { history: history.clone(), model }));
+            }
             if next <= iterations && in_flight.len() < DEPTH && !blocked {
                 match self.submit(next, next as usize % DEPTH) {
                     Ok(submitted) => in_flight.push_back(submitted),
@@ -506,7 +574,22 @@ impl<'a> Run<'a> {
             let ended = submission.wait()?;
             let mail = &self.mailboxes[mailbox];
             let counters = self.gpu.read(&mail.counters)?;
-            if self.gpu.read(&mail.overflow)?[0] != 0 {
+            let flag = self.gpu.read(&mail.overflow)?[0];
+            let values = self.gpu.read(&mail.losses)?;
+            if flag >> NOT_FINITE != 0 || flag == 0 && !values.iter().sum::<f32>().is_finite() {
+                // The device has skipped this step, if it saw it, and those behind it.
+                for later in in_flight.drain(..) {
+                    later.submission.wait()?;
+                }
+                self.lower()?;
+                if good.is_none() {
+                    let model = Model::of(self.gpu, &self.step)?;
+                    let whole = flag != 0 && model.not_finite().is_none();
+                    good = whole.then(|| Box::new(State { history: history.clone(), model }));
+                }
+                return Err(Halt::Broken { step, good });
+            }
+            if flag != 0 {
                 // The device has skipped this step and those behind it: grow, and take them again.
                 history.repeated += 1 + in_flight.len() as u32;
                 for later in in_flight.drain(..) {
@@ -522,7 +605,6 @@ impl<'a> Run<'a> {
             if !ended.is_empty() {
                 session.last_timings = ended;
             }
-            let values = self.gpu.read(&mail.losses)?;
             let progress = Progress {
                 step,
                 seconds: session.seconds(),
@@ -534,10 +616,6 @@ impl<'a> Run<'a> {
                 gaussians: counters[Counter::Drawn as usize],
                 pairs: counters[Counter::Pairs as usize],
             };
-            if !progress.loss.is_finite() {
-                let view = progress.view;
-                return Err(Halt::Lost(Error::NotFinite { step, view, loss: progress.loss }));
-            }
             watch.step(&progress);
             history.recent.push((progress.gaussians, progress.pairs));
             let surplus = history.recent.len().saturating_sub(self.photographs.len());
@@ -550,7 +628,7 @@ impl<'a> Run<'a> {
             if self.step.changes_anchors(step) {
                 watch.say(&self.step.change_anchors(step)?);
             }
-            if halt.is_none() && self.checkpoints(step) {
+            if halt.is_none() && !session.careful && self.checkpoints(step) {
                 let pause = Instant::now();
                 if let Err(error) = self.checkpoint(session.folder, history) {
                     halt = Some(error);
@@ -581,7 +659,7 @@ impl<'a> Run<'a> {
         let step = history.last.step;
         let last = step == self.settings.train.iterations;
         let pause = Instant::now();
-        if self.saves(step) {
+        if self.saves(step) && !session.careful {
             self.save(session.folder)?;
         }
         let mut report = None;
@@ -619,6 +697,86 @@ impl<'a> Run<'a> {
         }
         history.told = true;
         Ok(report)
+    }
+
+    /// Finds the first pass whose values are not finite and the state before it. `good` is the state before step `step`,
+    /// at which they were noticed, where that is still whole; otherwise they have been in the model for some steps, which
+    /// are repeated one by one.
+    fn explain(
+        &mut self,
+        folder: &Path,
+        step: u32,
+        good: Option<State>,
+        watch: &mut dyn Observer,
+    ) -> (Error, Option<State>) {
+        let mut noticed = (step, good);
+        if noticed.1.is_none() {
+            watch.say(&format!("step {step}: values are not finite; repeating the steps since the last good state to find the first"));
+            match self.repeat(folder, step) {
+                Ok(found) => noticed = found,
+                Err(error) => return (error, None),
+            }
+        }
+        let (step, good) = noticed;
+        let view = self.photographs[self.order.view(step)].name.clone();
+        // A state behind the step is of a repetition in which nothing was wrong.
+        let before = good.as_ref().filter(|good| good.history.last.step < step);
+        let found = before.and_then(|before| match self.first_not_finite(before, step) {
+            Ok(found) => found,
+            Err(error) => {
+                log::warn!("repeating step {step}: {error}");
+                None
+            }
+        });
+        (Error::NotFinite { step, view, found }, good)
+    }
+
+    /// Repeats the steps from the last good checkpoint, or from the first step, to `noticed`, that one included. Returns
+    /// the first whose results are not finite and the state before it; `noticed` and the state behind it if all are.
+    fn repeat(&mut self, folder: &Path, noticed: u32) -> Result<(u32, Option<State>), Error> {
+        let settings = self.settings;
+        // The stages' memory goes before a second model is made.
+        self.step.resize(Capacity { anchors: 1, visible: 1, pairs: 1 })?;
+        let candidates = checkpoint::list(folder).into_iter().filter(|(step, _)| *step < noticed);
+        let base = candidates.filter_map(|(_, path)| checkpoint::read(&path, self.owner()).ok()).next();
+        let mut history = History::default();
+        match base {
+            Some(state) => {
+                self.step = state.model.restore(self.gpu, self.step.plan.clone(), settings)?;
+                history = state.history;
+            }
+            None => self.step = fresh(self.gpu, self.scene, settings)?,
+        }
+        let mut session = Session::careful(folder, &history);
+        let mut steps = StepsLeft(noticed - history.last.step);
+        match self.advance(&mut session, &mut history, &mut steps) {
+            Err(Halt::Broken { step, good }) => Ok((step, good.map(|state| *state))),
+            Err(Halt::Good(error)) if !matches!(error, Error::Interrupted { .. }) => Err(error),
+            Err(Halt::Lost(error)) => Err(error),
+            Ok(_) | Err(Halt::Good(_)) => {
+                let model = Model::of(self.gpu, &self.step)?;
+                let finite = model.not_finite().is_none();
+                Ok((noticed, finite.then_some(State { history, model })))
+            }
+        }
+    }
+
+    /// Repeats a step pass by pass from the state before it.
+    fn first_not_finite(&mut self, before: &State, step: u32) -> Result<Option<NotFinite>, Error> {
+        self.step.resize(Capacity { anchors: 1, visible: 1, pairs: 1 })?;
+        self.step = before.model.restore(self.gpu, self.step.plan.clone(), self.settings)?;
+        loop {
+            let mut rec = self.gpu.inspected()?;
+            self.record(&mut rec, step)?;
+            let found = rec.not_finite().cloned();
+            rec.submit()?.wait()?;
+            let flag = self.gpu.read(self.step.limits.overflow())?[0];
+            if found.is_some() || flag == 0 || flag >> NOT_FINITE != 0 {
+                return Ok(found);
+            }
+            let counters = self.gpu.read(self.step.limits.counters())?;
+            self.grow(&counters)?;
+        }
     }
 
     fn every(&self, interval: u32, step: u32) -> bool {
@@ -666,6 +824,10 @@ impl<'a> Run<'a> {
     fn grow(&mut self, counters: &[u32]) -> Result<(), Error> {
         let capacity = self.step.capacity().fit(std::array::from_fn(|i| counters[i]));
         self.step.resize(capacity)?;
+        self.lower()
+    }
+
+    fn lower(&self) -> Result<(), Error> {
         let mut rec = self.gpu.recorder()?;
         self.step.limits.lower(&mut rec);
         rec.submit()?.wait()?;
