@@ -227,7 +227,10 @@ impl Model {
                 _ => {}
             }
         }
-        Ok(())
+        match self.not_finite() {
+            Some(Culprit { tensor, index, value }) => Err(format!("value {index} of its tensor `{tensor}` is {value}")),
+            None => Ok(()),
+        }
     }
 }
 

@@ -492,7 +492,8 @@ impl<'a> Run<'a> {
                 let (error, state) = match halt {
                     Halt::Lost(error) => (error, None),
                     Halt::Good(error) => {
-                        let model = Model::of(self.gpu, &self.step).ok();
+                        // What is not finite yet unnoticed is not to be gone on from.
+                        let model = Model::of(self.gpu, &self.step).ok().filter(|model| model.not_finite().is_none());
                         (error, model.map(|model| State { history: history.clone(), model }))
                     }
                     Halt::Broken { step, good } => self.explain(folder, step, good.map(|state| *state), watch),
@@ -541,12 +542,16 @@ impl<'a> Run<'a> {
         let mut report = None;
         // What ends the run, once nothing is in flight any more.
         let mut halt: Option<Error> = None;
+        // The state behind the last step, where that is kept.
         let mut good: Option<Box<State>> = None;
         if history.last.step > 0 && !history.told {
             match self.tell(session, history, watch) {
                 Ok(told) => report = told,
                 Err(error) => halt = Some(error),
             }
+        }
+        if session.careful {
+            good = Some(Box::new(State { history: history.clone(), model: Model::of(self.gpu, &self.step)? }));
         }
         while history.last.step < iterations && !(halt.is_some() && in_flight.is_empty()) {
             if halt.is_none() {
@@ -555,13 +560,6 @@ impl<'a> Run<'a> {
             // What follows a change of the anchors, an evaluation, a save or a checkpoint waits until it is made.
             let behind = next > history.last.step + 1;
             let blocked = halt.is_some() || behind && (session.careful || self.pauses_behind(next - 1));
-            if session.careful && !blocked {
-                let model = Model::of(self.gpu, &self.step)?;
-                if model.not_finite().is_some() {
-                    return Err(Halt::Broken { step: history.last.step, good });
-                }
-                good = Some(Box::new(State { history: history.clone(), model }));
-            }
             if next <= iterations && in_flight.len() < DEPTH && !blocked {
                 match self.submit(next, next as usize % DEPTH) {
                     Ok(submitted) => in_flight.push_back(submitted),
@@ -628,10 +626,20 @@ impl<'a> Run<'a> {
             if self.step.changes_anchors(step) {
                 watch.say(&self.step.change_anchors(step)?);
             }
-            if halt.is_none() && !session.careful && self.checkpoints(step) {
+            let mut state = None;
+            if session.careful || self.checkpoints(step) || self.saves(step) {
                 let pause = Instant::now();
-                if let Err(error) = self.checkpoint(session.folder, history) {
-                    halt = Some(error);
+                let model = Model::of(self.gpu, &self.step)?;
+                if model.not_finite().is_some() {
+                    return Err(Halt::Broken { step, good });
+                }
+                state = Some(Box::new(State { history: history.clone(), model }));
+                session.paused += pause.elapsed().as_secs_f64();
+            }
+            if let Some(state) = state.as_ref().filter(|_| halt.is_none() && !session.careful && self.checkpoints(step)) {
+                let pause = Instant::now();
+                if let Err(error) = checkpoint::write(session.folder, self.owner(), state) {
+                    halt = Some(error.into());
                     continue;
                 }
                 session.paused += pause.elapsed().as_secs_f64();
@@ -640,6 +648,7 @@ impl<'a> Run<'a> {
                 Ok(told) => report = told.or(report),
                 Err(error) => halt = halt.or(Some(error)),
             }
+            good = state.filter(|_| session.careful).map(|state| Box::new(State { history: history.clone(), ..*state }));
         }
         match halt {
             // It came too late to matter.
@@ -754,9 +763,7 @@ impl<'a> Run<'a> {
             Err(Halt::Good(error)) if !matches!(error, Error::Interrupted { .. }) => Err(error),
             Err(Halt::Lost(error)) => Err(error),
             Ok(_) | Err(Halt::Good(_)) => {
-                let model = Model::of(self.gpu, &self.step)?;
-                let finite = model.not_finite().is_none();
-                Ok((noticed, finite.then_some(State { history, model })))
+                Ok((noticed, Some(State { history, model: Model::of(self.gpu, &self.step)? })))
             }
         }
     }
@@ -798,13 +805,6 @@ impl<'a> Run<'a> {
 
     fn pauses_behind(&self, step: u32) -> bool {
         self.step.changes_anchors(step) || self.evaluates(step) || self.saves(step) || self.checkpoints(step)
-    }
-
-    /// Writes a checkpoint of the model as it is now.
-    fn checkpoint(&self, folder: &Path, history: &History) -> Result<(), Error> {
-        let state = State { history: history.clone(), model: Model::of(self.gpu, &self.step)? };
-        checkpoint::write(folder, self.owner(), &state)?;
-        Ok(())
     }
 
     /// Whose the checkpoints of this run are.
