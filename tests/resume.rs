@@ -26,6 +26,9 @@ fn settings() -> Settings {
     settings
 }
 
+/// Files' contents by their path within a run folder, sorted.
+type Files = Vec<(String, Vec<u8>)>;
+
 /// A folder with a scene and the settings of its runs.
 struct Place {
     folder: TempDir,
@@ -64,7 +67,7 @@ impl Place {
 
     /// What a finished run has left: every file's bytes by its path; times, memory of the process and the command line
     /// left out.
-    fn result(&self, run: &str) -> Vec<(String, Vec<u8>)> {
+    fn result(&self, run: &str) -> Files {
         let run = self.path().join(run);
         let mut files = vec![];
         let mut folders = vec![run.clone()];
@@ -162,7 +165,7 @@ fn wait_until(child: &mut Child, mut holds: impl FnMut() -> bool) -> bool {
 }
 
 /// What every run comes to: one that nothing happened to, and how long it took with all pipelines compiled.
-static WHOLE: LazyLock<(Vec<(String, Vec<u8>)>, Duration)> = LazyLock::new(|| {
+static WHOLE: LazyLock<(Files, Duration)> = LazyLock::new(|| {
     let place = Place::new(&settings());
     succeeds(place.train("first", &[]));
     let started = Instant::now();
@@ -295,7 +298,9 @@ fn a_complete_run_is_left_alone() {
     // What the new run does not write goes all the same.
     let stale = ["test/stale.png", "trace.json", "checkpoints/step-00000004.safetensors", ".log.jsonl.a1B2c3"];
     fs::create_dir(place.path().join("run/checkpoints")).expect("writable");
-    stale.map(|name| fs::write(place.path().join("run").join(name), "old").expect("writable"));
+    for name in stale {
+        fs::write(place.path().join("run").join(name), "old").expect("writable");
+    }
     fs::write(place.path().join("run/notes.txt"), "mine").expect("writable");
     succeeds(place.train("run", &["--overwrite"]));
     fs::remove_file(place.path().join("run/notes.txt")).expect("what is not the program's stays");
@@ -342,7 +347,11 @@ fn checkpoints_that_are_not_the_runs_own_are_refused() {
         ("a byte less", bytes[..bytes.len() - 1].to_vec(), "is cut off or damaged: no whole safetensors file"),
         ("a bit of a tensor", flipped(bytes.len() - 9), damaged),
         ("another step", edited("{\\\"step\\\":", "{\\\"ztep\\\":"), damaged),
-        ("another format", edited("checkpoint 1", "checkpoint 9"), "is of another format: gscream-vk checkpoint 9, where"),
+        (
+            "another format",
+            edited("checkpoint 1", "checkpoint 9"),
+            "is of another format: gscream-vk checkpoint 9, where",
+        ),
     ] {
         fs::write(&newest, contents).expect("writable");
         let folder = place.path().join("case");

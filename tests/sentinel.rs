@@ -87,7 +87,12 @@ fn an_absurd_learning_rate_is_caught_in_the_step_it_breaks() {
     type Change = fn(&mut Settings);
     let cases: [(&str, Change, &str, &[&str]); 4] = [
         // exp() overflows.
-        ("log_scaling", |s| s.optimizer.learning_rate.log_scaling = [1e-3, 1e6], "render/decode", &["position", "scale"]),
+        (
+            "log_scaling",
+            |s| s.optimizer.learning_rate.log_scaling = [1e-3, 1e6],
+            "render/decode",
+            &["position", "scale"],
+        ),
         // Sums of products overflow, forward.
         ("mlp_cov", |s| s.optimizer.learning_rate.mlp_cov = [1e-3, 1e38], "render/decode", &["rotation", "scale"]),
         ("feature", |s| s.optimizer.learning_rate.feature = [1e38, 1e38], "model/attention_project", &["qk", "value"]),

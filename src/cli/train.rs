@@ -17,7 +17,7 @@ use crate::gpu::{Gpu, Options, Timing};
 use crate::model::files::{POINT_CLOUD, WEIGHTS};
 use crate::render::view::Rendered;
 use crate::scene::Scene;
-use crate::train::checkpoint::{self, Owner};
+use crate::train::checkpoint::{self, Owner, Search};
 use crate::train::run::{LOG, Observer, Progress, Run, Signal, Summary};
 
 /// Train a scene without its object
@@ -147,28 +147,23 @@ fn resume(gpu: &Gpu, scene: &Scene, settings: &Settings, name: &str, folder: &Pa
     sweep(folder);
     let mut record = Record::read(folder)?;
     let owner = Owner::new(scene, settings);
-    let refused = |refusals: &[checkpoint::Refusal]| {
-        refusals.iter().map(|r| format!("refused: {r}")).collect::<Vec<_>>().join("\n")
-    };
-    let run = match checkpoint::latest(folder, &owner) {
-        Err(refusals) => {
-            bail!(
-                "{}: no checkpoint to go on from; `train --overwrite` starts again\n{}",
-                folder.display(),
-                refused(&refusals)
-            )
-        }
-        Ok((None, _)) => {
+    let Search { found, refused } = checkpoint::latest(folder, &owner);
+    let reasons: Vec<String> = refused.iter().map(|refusal| format!("refused: {refusal}")).collect();
+    let run = match found {
+        None if !reasons.is_empty() => bail!(
+            "{}: no checkpoint to go on from; `train --overwrite` starts again\n{}",
+            folder.display(),
+            reasons.join("\n")
+        ),
+        None => {
             eprintln!("resuming: no checkpoint yet, the run starts again");
             Run::new(gpu, scene, settings)?
         }
-        Ok((Some((path, state)), refusals)) => {
-            if !refusals.is_empty() {
-                eprintln!("{}", refused(&refusals));
-            }
+        Some((path, state)) => {
+            reasons.iter().for_each(|reason| eprintln!("{reason}"));
             eprintln!("resuming: behind step {} ({})", state.history.last.step, path.display());
             if record.device != gpu.info().name {
-                eprintln!("resuming: the run began on {}: the bytes may differ from one on a single device", record.device);
+                eprintln!("resuming: the run began on {}; another device may give other bytes", record.device);
             }
             Run::resume(gpu, scene, settings, state)?
         }

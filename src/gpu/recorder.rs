@@ -296,9 +296,8 @@ impl<'g> Recorder<'g> {
         for ((i, tensor, access), before) in written.into_iter().zip(before) {
             let mut after = self.words(slots[i])?;
             let left_alone = |after: u32, before: u32| after == if access == Access::Write { PATTERN } else { before };
-            let broken = |(after, before): (&u32, &u32)| {
-                !f32::from_bits(*after).is_finite() && !left_alone(*after, *before)
-            };
+            let broken =
+                |(after, before): (&u32, &u32)| !f32::from_bits(*after).is_finite() && !left_alone(*after, *before);
             if let Some(index) = after.iter().zip(&before).position(broken) {
                 let value = f32::from_bits(after[index]);
                 let found = NotFinite { pass: K::NAME, tensor, index, value };

@@ -475,7 +475,8 @@ pub fn path(run: &Path, step: u32) -> PathBuf {
 /// The checkpoints of a run folder with their steps, the newest first. A folder without any has none.
 pub fn list(run: &Path) -> Vec<(u32, PathBuf)> {
     let entries = std::fs::read_dir(run.join(FOLDER)).into_iter().flatten().flatten();
-    let step = |path: &Path| path.file_name()?.to_str()?.strip_prefix("step-")?.strip_suffix(".safetensors")?.parse().ok();
+    let step =
+        |path: &Path| path.file_name()?.to_str()?.strip_prefix("step-")?.strip_suffix(".safetensors")?.parse().ok();
     let mut all: Vec<(u32, PathBuf)> = entries.filter_map(|e| Some((step(&e.path())?, e.path()))).collect();
     all.sort_unstable_by(|a, b| b.cmp(a));
     all
@@ -605,7 +606,8 @@ pub fn read(path: &Path, owner: &Owner) -> Result<State, Refusal> {
             Dtype::F32 => Values::Float(bytemuck::pod_collect_to_vec(data)),
             Dtype::U32 => Values::Count(bytemuck::pod_collect_to_vec(data)),
             _ if name == LOG => {
-                log = String::from_utf8(data.to_vec()).map_err(|_| refuse("holds a log that is not text".to_owned()))?;
+                log =
+                    String::from_utf8(data.to_vec()).map_err(|_| refuse("holds a log that is not text".to_owned()))?;
                 continue;
             }
             other => return Err(refuse(format!("its tensor `{name}` is {other:?}"))),
@@ -624,19 +626,28 @@ pub fn read(path: &Path, owner: &Owner) -> Result<State, Refusal> {
     Ok(State { history: stored.history(log), model })
 }
 
-/// The newest checkpoint of a run folder that `owner` can go on from, and why newer ones were refused.
-///
-/// # Errors
-/// All refusals, when there are checkpoints and none is of use.
-pub fn latest(run: &Path, owner: &Owner) -> Result<(Option<(PathBuf, State)>, Vec<Refusal>), Vec<Refusal>> {
-    let mut refusals = vec![];
+/// What a run folder has to go on from.
+#[derive(Debug, Default)]
+pub struct Search {
+    /// The newest usable checkpoint.
+    pub found: Option<(PathBuf, State)>,
+    /// The newer ones, and why they are not; all there are where none is usable.
+    pub refused: Vec<Refusal>,
+}
+
+/// Looks for the newest checkpoint of a run folder that `owner` can go on from.
+pub fn latest(run: &Path, owner: &Owner) -> Search {
+    let mut search = Search::default();
     for (_, path) in list(run) {
         match read(&path, owner) {
-            Ok(state) => return Ok((Some((path, state)), refusals)),
-            Err(refusal) => refusals.push(refusal),
+            Ok(state) => {
+                search.found = Some((path, state));
+                break;
+            }
+            Err(refusal) => search.refused.push(refusal),
         }
     }
-    if refusals.is_empty() { Ok((None, refusals)) } else { Err(refusals) }
+    search
 }
 
 /// Removes the checkpoints of a run folder, and the folder if nothing else is in it.

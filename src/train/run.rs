@@ -85,9 +85,11 @@ fn where_from(found: Option<&NotFinite>) -> String {
             "pass {pass} wrote {value} into `{tensor}` (its float {index}), the first value that is not finite; lower the \
              learning rates, or look at that view's prior and mask"
         ),
-        None => "values that are not finite came up, and did not when the steps were repeated from good ones: the device's \
+        None => {
+            "values that are not finite came up, and did not when the steps were repeated from good ones: the device's \
                  memory may be faulty"
-            .to_owned(),
+                .to_owned()
+        }
     }
 }
 
@@ -636,7 +638,8 @@ impl<'a> Run<'a> {
                 state = Some(Box::new(State { history: history.clone(), model }));
                 session.paused += pause.elapsed().as_secs_f64();
             }
-            if let Some(state) = state.as_ref().filter(|_| halt.is_none() && !session.careful && self.checkpoints(step)) {
+            if let Some(state) = state.as_ref().filter(|_| halt.is_none() && !session.careful && self.checkpoints(step))
+            {
                 let pause = Instant::now();
                 if let Err(error) = checkpoint::write(session.folder, self.owner(), state) {
                     halt = Some(error.into());
@@ -648,7 +651,8 @@ impl<'a> Run<'a> {
                 Ok(told) => report = told.or(report),
                 Err(error) => halt = halt.or(Some(error)),
             }
-            good = state.filter(|_| session.careful).map(|state| Box::new(State { history: history.clone(), ..*state }));
+            good =
+                state.filter(|_| session.careful).map(|state| Box::new(State { history: history.clone(), ..*state }));
         }
         match halt {
             // It came too late to matter.
@@ -720,7 +724,9 @@ impl<'a> Run<'a> {
     ) -> (Error, Option<State>) {
         let mut noticed = (step, good);
         if noticed.1.is_none() {
-            watch.say(&format!("step {step}: values are not finite; repeating the steps since the last good state to find the first"));
+            watch.say(&format!(
+                "step {step}: values are not finite; repeating the steps since the last good state to find the first"
+            ));
             match self.repeat(folder, step) {
                 Ok(found) => noticed = found,
                 Err(error) => return (error, None),
