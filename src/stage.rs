@@ -32,6 +32,8 @@ pub const DECODE_BACKWARD: &str = "decode backward";
 pub const STATISTICS: &str = "statistics";
 /// Adam.
 pub const OPTIMIZER: &str = "adam";
+/// The search for values that are not finite.
+pub const SENTINEL: &str = "sentinel";
 /// Growing and pruning of anchors.
 pub const GROWTH: &str = "grow and prune";
 /// Test views.
@@ -40,7 +42,7 @@ pub const EVALUATION: &str = "evaluation";
 pub const RUN: &str = crate::gpu::ledger::NO_STAGE;
 
 /// All, in the order of a step.
-pub const ALL: [&str; 19] = [
+pub const ALL: [&str; 20] = [
     PICTURES,
     MODEL,
     CULL,
@@ -55,6 +57,7 @@ pub const ALL: [&str; 19] = [
     RASTERIZE_BACKWARD,
     PROJECT_BACKWARD,
     DECODE_BACKWARD,
+    SENTINEL,
     STATISTICS,
     OPTIMIZER,
     GROWTH,

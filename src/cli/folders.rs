@@ -4,7 +4,10 @@
 //! RUN/run.json        version, device, scene and command line: see `Record`
 //! RUN/settings.toml   every setting of the run, resolved; --config reads it
 //! RUN/model/          point_cloud.ply and weights.safetensors
+//! RUN/log.jsonl       losses, counts and speed, a JSON object per line
 //! RUN/test/NAME.png   the test views as rendered at the end
+//! RUN/metrics.json    their figures
+//! RUN/checkpoints/    until the run is complete: what it goes on from
 //! ```
 
 use std::io::Write as _;
@@ -37,6 +40,9 @@ pub struct Record {
     pub scene: String,
     /// The command line.
     pub command: String,
+    /// Steps taken, once the run is complete.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub complete: Option<u32>,
 }
 
 impl Record {
@@ -48,6 +54,7 @@ impl Record {
             device: device.to_owned(),
             scene: scene.to_owned(),
             command: command.join(" "),
+            complete: None,
         }
     }
 

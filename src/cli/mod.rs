@@ -2,7 +2,8 @@
 //!
 //! To add a command: a file with `Args` (clap) and `run(Args) -> anyhow::Result<()>`, a line in `Command` and one in
 //! [`run`]. Results go to stdout, progress and notes to stderr. The exit code is 0 when all went well, 2 when the
-//! arguments or settings make no sense, 1 when anything else went wrong.
+//! arguments or settings make no sense, 128 and the signal's number when a signal ended a run, 1 when anything else went
+//! wrong.
 
 mod ablate;
 mod devices;
@@ -34,7 +35,8 @@ Start here:
   gscream-vk eval renders --truth scene/test_images --masks scene/test_masks
   gscream-vk devices                               what can be run on
 
-Exit codes: 0 done, 1 something went wrong, 2 the arguments or settings make no sense.
+Exit codes: 0 done, 1 something went wrong, 2 the arguments or settings make no sense, 130 and 143 stopped by
+SIGINT and SIGTERM.
 Set RUST_LOG=info or debug for more on stderr."
 )]
 pub struct Arguments {
@@ -84,8 +86,12 @@ pub fn message(error: &anyhow::Error) -> String {
     text
 }
 
-/// 2 for settings that make no sense, as for arguments that do not parse; 1 otherwise.
+/// 2 for settings that make no sense, as for arguments that do not parse; 130 and 143 for SIGINT and SIGTERM; 1
+/// otherwise.
 pub fn exit_code(error: &anyhow::Error) -> ExitCode {
+    if let Some(signal) = error.downcast_ref::<crate::train::run::Error>().and_then(crate::train::run::Error::signal) {
+        return ExitCode::from(signal.exit_code());
+    }
     ExitCode::from(if error.is::<crate::config::Error>() { 2 } else { 1 })
 }
 

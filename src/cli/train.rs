@@ -1,39 +1,58 @@
 //! `gscream-vk train`.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context as _, bail, ensure};
+use atomic_write_file::AtomicWriteFile;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::folders::{MODEL, RECORD, Record, SETTINGS, TEST};
 use super::pictures;
-use super::shared::{DeviceArgs, SceneArgs, with_gpu};
-use crate::config::Settings;
+use super::shared::{DeviceArgs, SceneArgs, load_scene, with_gpu};
+use crate::config::{Settings, SettingsArgs, Source};
 use crate::evaluate::Report;
 use crate::gpu::{Gpu, Options, Timing};
+use crate::model::files::{POINT_CLOUD, WEIGHTS};
 use crate::render::view::Rendered;
 use crate::scene::Scene;
+use crate::train::checkpoint::{self, Owner, Search};
 use crate::train::forecast::{self, Question};
-use crate::train::run::{Observer, Progress, Run, Summary};
+use crate::train::run::{LOG, Observer, Progress, Run, Signal, Summary};
 
 /// Train a scene without its object
 ///
 /// Writes a run folder: the model (point_cloud.ply, weights.safetensors), log.jsonl, settings.toml, run.json, the test
 /// views as rendered at the end and their figures (metrics.json). `synthetic` is the built-in scene.
+///
+/// A run that ended early (Ctrl-C, SIGTERM, an error, a power failure) is gone on with by `--resume RUN`, to the same
+/// bytes as if nothing had happened. Until a run is complete its folder holds checkpoints: two at most, one every
+/// train.checkpoint_interval steps.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   gscream-vk train synthetic --preset demo
   gscream-vk train garden --preset lavapipe --out runs/garden
-  gscream-vk train garden --preset paper --set losses.depth.enabled=false --iterations 7000")]
+  gscream-vk train garden --preset paper --set losses.depth.enabled=false --iterations 7000
+  gscream-vk train --resume runs/garden")]
 pub(super) struct Args {
+    /// Folder of the scene, or the word `synthetic` for the built-in one
+    #[arg(value_name = "SCENE", required_unless_present = "resume")]
+    scene: Option<PathBuf>,
     #[command(flatten)]
-    scene: SceneArgs,
+    settings: SettingsArgs,
     /// Run folder; must not hold a run already [default: runs/SCENE]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Replace a run that is already in the folder
     #[arg(long)]
     overwrite: bool,
+    /// Go on with the run in this folder, from its last good checkpoint, under its own settings
+    ///
+    /// Its scene is read from where it was; SCENE says where it is now, if it was moved. Without a checkpoint yet, the
+    /// run starts again. A complete run is left as it is.
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["SettingsArgs", "out", "overwrite"])]
+    resume: Option<PathBuf>,
     /// Measure every pass: prints milliseconds per pass and writes trace.json (for chrome://tracing or Perfetto)
     #[arg(long)]
     profile: bool,
@@ -42,16 +61,37 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
-    let (scene, settings) = args.scene.load()?;
-    let name = args.scene.name();
-    let folder = args.out.clone().unwrap_or_else(|| default_folder(&name));
-    if folder.join(RECORD).exists() && !args.overwrite {
-        bail!("{}: holds a run already: choose another --out, or --overwrite", folder.display());
-    }
+    let given = |scene: &PathBuf| SceneArgs { scene: scene.clone(), settings: args.settings.clone() };
+    let given = args.scene.as_ref().map(given);
+    let (scene, settings, name, folder) = if let Some(folder) = &args.resume {
+        let record = Record::read(folder)
+            .with_context(|| format!("{}: holds no run to go on with: start one with --out", folder.display()))?;
+        if let Some(steps) = record.complete {
+            println!("{}: the run is complete ({steps} steps): nothing to do", folder.display());
+            return Ok(());
+        }
+        let settings = Settings::resolve(&[Source::File(folder.join(SETTINGS))])?;
+        let path = args.scene.clone().unwrap_or_else(|| PathBuf::from(&record.scene));
+        let name = given.map_or(record.scene, |given| given.name());
+        (load_scene(&path, &settings)?, settings, name, folder.clone())
+    } else {
+        let given = given.expect("clap asks for a scene where there is nothing to resume");
+        let (scene, settings) = given.load()?;
+        let name = given.name();
+        let folder = args.out.clone().unwrap_or_else(|| default_folder(&name));
+        if folder.join(RECORD).exists() && !args.overwrite {
+            bail!("{}: holds a run already: choose another --out, or --overwrite", folder.display());
+        }
+        (scene, settings, name, folder)
+    };
     let options = Options { timestamps: args.profile, ..args.device.options() };
     with_gpu(&options, |gpu| {
         eprintln!("device: {} ({})", gpu.info().name, gpu.info().driver);
-        let Trained { summary, report, mut written } = train(gpu, &scene, &settings, &name, &folder)?;
+        let Trained { summary, report, mut written } = if args.resume.is_some() {
+            resume(gpu, &scene, &settings, &name, &folder)?
+        } else {
+            train(gpu, &scene, &settings, &name, &folder)?
+        };
         if let Some(report) = report {
             println!("{}", report.table());
         }
@@ -82,7 +122,7 @@ pub(super) struct Trained {
     pub written: Vec<&'static str>,
 }
 
-/// Trains into `folder` and evaluates, with a progress bar on stderr.
+/// Trains into `folder`, in place of any run that is there, and evaluates, with a progress bar on stderr.
 pub(super) fn train(
     gpu: &Gpu,
     scene: &Scene,
@@ -90,38 +130,126 @@ pub(super) fn train(
     name: &str,
     folder: &Path,
 ) -> anyhow::Result<Trained> {
+    std::fs::create_dir_all(folder).with_context(|| format!("{}: cannot be made", folder.display()))?;
+    let run = start(gpu, scene, settings)?;
+    clear(folder)?;
+    let path = folder.join(SETTINGS);
+    write(&path, &settings.to_toml()).with_context(|| format!("{}: cannot be written", path.display()))?;
+    let record = Record::new(&gpu.info().name, name);
+    record.write(folder)?;
+    for left in &run.step().plan.left_out {
+        eprintln!("left out: {} ({})", left.what, left.why);
+    }
+    finish(run, settings, record, folder)
+}
+
+/// A run from its first step, with room for what it is expected to take; refused where the device has not that much.
+fn start<'a>(gpu: &'a Gpu, scene: &'a Scene, settings: &'a Settings) -> anyhow::Result<Run<'a>> {
     let verdict = forecast::forecast(gpu, scene, settings, Question::default())?;
     if let Some(why) = verdict.describe() {
         ensure!(verdict.starts(), "{}: {why}", gpu.info().name);
         eprintln!("memory: {why}");
     }
-    std::fs::create_dir_all(folder).with_context(|| format!("{}: cannot be made", folder.display()))?;
     let mut run = Run::new(gpu, scene, settings)?;
     if let Ok(forecast) = &verdict.forecast {
         run.resize(forecast.capacity)?;
         let mib = forecast.peak.div_ceil(1 << 20);
         eprintln!("memory: about {mib} MiB of device memory at most, with {} anchors at the end", forecast.anchors);
     }
-    let path = folder.join(SETTINGS);
-    std::fs::write(&path, settings.to_toml()).with_context(|| format!("{}: cannot be written", path.display()))?;
-    Record::new(&gpu.info().name, name).write(folder)?;
-    for left in &run.step().plan.left_out {
-        eprintln!("left out: {} ({})", left.what, left.why);
+    Ok(run)
+}
+
+/// Goes on with the run in `folder`.
+fn resume(gpu: &Gpu, scene: &Scene, settings: &Settings, name: &str, folder: &Path) -> anyhow::Result<Trained> {
+    sweep(folder);
+    let mut record = Record::read(folder)?;
+    let owner = Owner::new(scene, settings);
+    let Search { found, refused } = checkpoint::latest(folder, &owner);
+    let reasons: Vec<String> = refused.iter().map(|refusal| format!("refused: {refusal}")).collect();
+    let run = match found {
+        None if !reasons.is_empty() => bail!(
+            "{}: no checkpoint to go on from; `train --overwrite` starts again\n{}",
+            folder.display(),
+            reasons.join("\n")
+        ),
+        None => {
+            eprintln!("resuming: no checkpoint yet, the run starts again");
+            start(gpu, scene, settings)?
+        }
+        Some((path, state)) => {
+            reasons.iter().for_each(|reason| eprintln!("{reason}"));
+            eprintln!("resuming: behind step {} ({})", state.history.last.step, path.display());
+            if record.device != gpu.info().name {
+                eprintln!("resuming: the run began on {}; another device may give other bytes", record.device);
+            }
+            Run::resume(gpu, scene, settings, state)?
+        }
+    };
+    if record.scene != name {
+        name.clone_into(&mut record.scene);
+        record.write(folder)?;
     }
+    finish(run, settings, record, folder)
+}
+
+/// Trains to the end, evaluates, and marks the run as complete.
+fn finish(mut run: Run<'_>, settings: &Settings, record: Record, folder: &Path) -> anyhow::Result<Trained> {
     eprintln!("anchors: {}", run.step().anchors.count);
-    let mut watch = Watch { bar: bar(settings.train.iterations), pictures: folder.join(TEST), failed: None };
+    let signals = Signals::listen()?;
+    let bar = bar(settings.train.iterations, run.done());
+    let mut watch = Watch { bar, pictures: folder.join(TEST), failed: None, signals };
     let mut summary = run.train(folder, &mut watch)?;
     watch.bar.finish_and_clear();
     if let Some(error) = watch.failed {
         return Err(error.into());
     }
-    let mut written = vec![MODEL, "log.jsonl", SETTINGS, RECORD];
+    let mut written = vec![MODEL, LOG, SETTINGS, RECORD];
     let report = summary.report.take();
     if let Some(report) = &report {
         report.write_json(&folder.join(METRICS))?;
         written.extend([TEST, METRICS]);
     }
+    Record { complete: Some(summary.steps), ..record }.write(folder)?;
+    checkpoint::clear(folder)?;
     Ok(Trained { summary, report, written })
+}
+
+/// Removes what an earlier run left in the folder, the record last: until then the folder holds a run.
+fn clear(folder: &Path) -> anyhow::Result<()> {
+    sweep(folder);
+    checkpoint::clear(folder)?;
+    if !folder.join(RECORD).exists() {
+        return Ok(());
+    }
+    let gone = |path: PathBuf, result: std::io::Result<()>| match result {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            Err(error).with_context(|| format!("{}: cannot be removed", path.display()))
+        }
+        _ => Ok(()),
+    };
+    let test = folder.join(TEST);
+    gone(test.clone(), std::fs::remove_dir_all(&test))?;
+    let model = folder.join(MODEL);
+    let files = [model.join(POINT_CLOUD), model.join(WEIGHTS)];
+    for path in files.into_iter().chain([LOG, METRICS, TRACE, SETTINGS, RECORD].map(|name| folder.join(name))) {
+        gone(path.clone(), std::fs::remove_file(&path))?;
+    }
+    Ok(())
+}
+
+/// Removes what a killed run had not written to the end.
+fn sweep(folder: &Path) {
+    checkpoint::sweep(folder, |name| [LOG, METRICS, SETTINGS, RECORD].contains(&name));
+    checkpoint::sweep(&folder.join(checkpoint::FOLDER), |name| name.starts_with("step-"));
+    checkpoint::sweep(&folder.join(MODEL), |name| [POINT_CLOUD, WEIGHTS].contains(&name));
+    checkpoint::sweep(&folder.join(TEST), |name| name.ends_with(".png"));
+}
+
+/// Writes a file that appears complete or not at all.
+fn write(path: &Path, text: &str) -> std::io::Result<()> {
+    let mut file = AtomicWriteFile::open(path)?;
+    std::io::Write::write_all(&mut file, text.as_bytes())?;
+    file.commit()
 }
 
 const METRICS: &str = "metrics.json";
@@ -155,10 +283,10 @@ fn write_trace(gpu: &Gpu, summary: &Summary, path: &Path) -> anyhow::Result<()> 
     std::fs::write(path, text).with_context(|| format!("{}: cannot be written", path.display()))
 }
 
-fn bar(steps: u32) -> ProgressBar {
+fn bar(steps: u32, done: u32) -> ProgressBar {
     let template = "{bar:30} {pos}/{len}  {per_sec}  {msg}  {eta} left";
     let style = ProgressStyle::with_template(template).expect("a valid template");
-    ProgressBar::new(steps.into()).with_style(style)
+    ProgressBar::new(steps.into()).with_style(style).with_position(done.into())
 }
 
 /// Shows progress and keeps the test views.
@@ -166,6 +294,38 @@ struct Watch {
     bar: ProgressBar,
     pictures: PathBuf,
     failed: Option<pictures::Error>,
+    signals: Signals,
+}
+
+/// SIGINT and SIGTERM, remembered; a second one of a kind ends the program at once.
+struct Signals {
+    caught: [(Signal, Arc<AtomicBool>); 2],
+    registered: Vec<signal_hook::SigId>,
+}
+
+impl Signals {
+    fn listen() -> anyhow::Result<Self> {
+        let caught = [Signal::Interrupt, Signal::Terminate].map(|signal| (signal, Arc::new(AtomicBool::new(false))));
+        let mut registered = vec![];
+        for (signal, flag) in &caught {
+            let (number, code) = (signal.number().into(), signal.exit_code().into());
+            // In this order: the first time the flag is still down.
+            let shutdown = signal_hook::flag::register_conditional_shutdown(number, code, flag.clone());
+            let note = signal_hook::flag::register(number, flag.clone());
+            for id in [shutdown, note] {
+                registered.push(id.with_context(|| format!("{signal} cannot be caught"))?);
+            }
+        }
+        Ok(Self { caught, registered })
+    }
+}
+
+impl Drop for Signals {
+    fn drop(&mut self) {
+        for id in self.registered.drain(..) {
+            signal_hook::low_level::unregister(id);
+        }
+    }
 }
 
 impl Observer for Watch {
@@ -183,5 +343,9 @@ impl Observer for Watch {
         if let Err(error) = pictures::write_png(&path, picture.size, &picture.rgb) {
             self.failed.get_or_insert(error);
         }
+    }
+
+    fn interrupted(&mut self) -> Option<Signal> {
+        self.signals.caught.iter().find(|(_, flag)| flag.load(Ordering::Relaxed)).map(|(signal, _)| *signal)
     }
 }

@@ -163,14 +163,22 @@ impl Gpu {
         if data.is_empty() {
             return Ok(());
         }
-        let mut staging: Buffer<T> = self.allocate("staging", data.len(), MemoryLocation::CpuToGpu)?;
-        let bytes: &[u8] = bytemuck::cast_slice(data);
+        self.overwrite(buffer.slot(), bytemuck::cast_slice(data))
+    }
+
+    /// Overwrites the first words of a bound buffer and waits.
+    pub(super) fn write_words(&self, slot: Slot, words: &[u32]) -> Result<(), Error> {
+        self.overwrite(slot, bytemuck::cast_slice(words))
+    }
+
+    fn overwrite(&self, slot: Slot, bytes: &[u8]) -> Result<(), Error> {
+        let mut staging: Buffer<u32> = self.allocate("staging", bytes.len() / 4, MemoryLocation::CpuToGpu)?;
         if self.rehearsing().is_none() {
             let mapped = staging.mapped_mut().expect("staging memory is host visible");
             mapped[..bytes.len()].copy_from_slice(bytes);
         }
         let mut recorder = self.recorder()?;
-        recorder.copy(&staging, buffer, data.len());
+        recorder.copy_bytes(staging.slot(), slot, bytes.len() as u64);
         recorder.submit()?.wait()?;
         Ok(())
     }

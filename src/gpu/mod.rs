@@ -22,7 +22,7 @@ pub use hazards::{Entry, Schedule};
 pub use kernel::{Access, Binding, Kernel, Reference, Slot};
 pub use ledger::Used;
 pub use memory::Buffer;
-pub use recorder::{Groups, Recorder, Submission, Threads};
+pub use recorder::{Groups, NotFinite, Recorder, Submission, Threads};
 pub use timings::{Timing, Timings};
 
 /// The typed interfaces of all kernels, generated from `glsl/` by `build.rs`.

@@ -9,7 +9,7 @@ use super::check::Difference;
 use super::device::{Gpu, Inner, lock};
 use super::error::{Error, Named};
 use super::hazards::{Entry, Hazards, Id, Schedule};
-use super::kernel::{Access, Reference};
+use super::kernel::{Access, Reference, Scalar};
 use super::ledger::{NO_STAGE, Rehearsal};
 use super::memory::{Buffer, Slot};
 use super::timings::Timing;
@@ -115,6 +115,20 @@ pub struct Recorder<'g> {
     rehearsal: Option<Arc<Rehearsal>>,
     error: Option<Error>,
     differences: Option<Vec<Difference>>,
+    inspection: Option<Option<NotFinite>>,
+}
+
+/// The first value that is not finite, of an inspected recording.
+#[derive(Clone, Debug, PartialEq)]
+pub struct NotFinite {
+    /// The pass that wrote it.
+    pub pass: &'static str,
+    /// The pass's name for the array.
+    pub tensor: &'static str,
+    /// Its float in the array.
+    pub index: usize,
+    /// NaN or an infinity.
+    pub value: f32,
 }
 
 /// Work given to the device.
@@ -160,6 +174,7 @@ impl Gpu {
             passes: vec![],
             error: None,
             differences: None,
+            inspection: None,
         };
         recorder.begin()?;
         Ok(recorder)
@@ -176,6 +191,17 @@ impl Gpu {
         assert!(self.rehearsing().is_none(), "a rehearsal has no numbers to compare");
         let mut recorder = self.recorder()?;
         recorder.differences = Some(vec![]);
+        Ok(recorder)
+    }
+
+    /// A recording in which every pass runs at once, and what it wrote is searched for values that are not finite. With
+    /// the first one found the device's work ends: [`Recorder::not_finite`] names it.
+    ///
+    /// # Errors
+    /// As [`Gpu::recorder`].
+    pub fn inspected(&self) -> Result<Recorder<'_>, Error> {
+        let mut recorder = self.recorder()?;
+        recorder.inspection = Some(None);
         Ok(recorder)
     }
 }
@@ -242,6 +268,12 @@ impl<'g> Recorder<'g> {
                 assert!(a.raw != b.raw || !written, "{}: {} is bound twice, once for writing", K::NAME, a.name);
             }
         }
+        match self.inspection {
+            None => {}
+            Some(None) => return self.inspect::<K>(&constants, &slots, &push, threads),
+            // Nothing behind it is worth running.
+            Some(Some(_)) => return Ok(()),
+        }
         let inputs = if self.differences.is_some() {
             self.flush()?;
             Some(self.download(&slots)?)
@@ -261,6 +293,54 @@ impl<'g> Recorder<'g> {
             }
         }
         Ok(())
+    }
+
+    /// The first value that is not finite that a pass of this inspected recording wrote.
+    pub fn not_finite(&self) -> Option<&NotFinite> {
+        self.inspection.as_ref()?.as_ref()
+    }
+
+    /// Runs one pass and searches what it wrote. Arrays that it only writes hold a pattern meanwhile, so that what it left
+    /// alone is told from what it wrote; in the others that is what has changed.
+    fn inspect<K: Reference>(
+        &mut self,
+        constants: &K::Constants,
+        slots: &[Slot],
+        push: &K::Push,
+        threads: Threads<'_>,
+    ) -> Result<(), Error> {
+        const PATTERN: u32 = 0x7fa5_a5a5; // a NaN that no arithmetic makes
+        let written: Vec<(usize, &'static str, Access)> = (0..slots.len())
+            .filter(|&i| K::BINDINGS[i].access.writes() && K::BINDINGS[i].scalar == Scalar::F32)
+            .map(|i| (i, K::BINDINGS[i].name, K::BINDINGS[i].access))
+            .collect();
+        self.flush()?;
+        let before = written.iter().map(|(i, ..)| self.words(slots[*i])).collect::<Result<Vec<_>, _>>()?;
+        for ((i, ..), before) in written.iter().zip(&before).filter(|((.., access), _)| *access == Access::Write) {
+            self.gpu.write_words(slots[*i], &vec![PATTERN; before.len()])?;
+        }
+        self.dispatch::<K>(constants, slots, push, threads)?;
+        self.flush()?;
+        for ((i, tensor, access), before) in written.into_iter().zip(before) {
+            let mut after = self.words(slots[i])?;
+            let left_alone = |after: u32, before: u32| after == if access == Access::Write { PATTERN } else { before };
+            let broken =
+                |(after, before): (&u32, &u32)| !f32::from_bits(*after).is_finite() && !left_alone(*after, *before);
+            if let Some(index) = after.iter().zip(&before).position(broken) {
+                let value = f32::from_bits(after[index]);
+                let found = NotFinite { pass: K::NAME, tensor, index, value };
+                self.inspection.as_mut().expect("an inspected recording").get_or_insert(found);
+            }
+            if access == Access::Write {
+                after.iter_mut().zip(before).filter(|(a, _)| **a == PATTERN).for_each(|(a, before)| *a = before);
+                self.gpu.write_words(slots[i], &after)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn words(&self, slot: Slot) -> Result<Vec<u32>, Error> {
+        self.gpu.read_words(slot, slot.bytes)
     }
 
     fn download(&self, slots: &[Slot]) -> Result<Vec<Vec<u32>>, Error> {

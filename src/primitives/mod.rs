@@ -5,6 +5,7 @@
 
 pub mod compact;
 pub mod dispatch;
+pub mod finite;
 pub mod limit;
 pub mod reduce;
 pub mod scan;

@@ -48,6 +48,13 @@ pub struct Attended<'a> {
     reference: bool,
 }
 
+impl<'a> Attended<'a> {
+    /// `[2]` how many there are inside and around; both 0 where the step has no attention, and no gradient of it.
+    pub fn tokens(&self) -> &'a Buffer<u32> {
+        self.chosen.tokens
+    }
+}
+
 impl Attend {
     /// The stage for so many anchors with these initial projections.
     ///

@@ -20,6 +20,12 @@ pub struct Config {
     pub eval_interval: u32,
     /// Steps between two saves of the model, each in place of the one before; 0 saves only at the end.
     pub save_interval: u32,
+    /// Steps between two checkpoints, of which the last two are kept; 0 writes one only when a run ends early. A run
+    /// that has ended well keeps none.
+    pub checkpoint_interval: u32,
+    /// Steps between two searches of all gradients, parameters and moments for values that are not finite. The losses and
+    /// the networks' gradients are searched in every step. 0 searches nothing: a broken model trains on.
+    pub sentinel_interval: u32,
 }
 
 /// How the next training view is drawn.
@@ -42,6 +48,8 @@ impl Default for Config {
             log_interval: 100,
             eval_interval: 5_000,
             save_interval: 5_000,
+            checkpoint_interval: 1_000,
+            sentinel_interval: 50,
         }
     }
 }

@@ -1,6 +1,7 @@
 //! What a scene needs, the step, the loop, checkpoints.
 
 pub mod attend;
+pub mod checkpoint;
 pub mod config;
 pub mod forecast;
 pub mod order;

@@ -83,7 +83,7 @@ pub struct Plan {
     pub other_depth: DepthLosses,
     /// Cross-attention, from `model.attention.start` on.
     pub attention: bool,
-    /// Growing and pruning of anchors: the steps behind which the first and the last round come.
+    /// Growing and pruning of anchors.
     pub growth: bool,
     /// Likewise, with the steps behind which the first and the last round come.
     pub rounds: Option<Steps>,
@@ -91,6 +91,8 @@ pub struct Plan {
     pub counted: Option<Steps>,
     /// Culling of anchors that are out of view.
     pub cull: bool,
+    /// The search for values that are not finite.
+    pub sentinel: bool,
     /// What is trained.
     pub trained: Trained,
     /// Figures on the test views.
@@ -198,6 +200,10 @@ impl Plan {
         if !cull {
             leave("culling", "render.cull is false");
         }
+        let sentinel = settings.train.sentinel_interval > 0;
+        if !sentinel {
+            leave("sentinel", "train.sentinel_interval is 0");
+        }
         let rates = &settings.optimizer.learning_rate;
         let some = |rate: [f64; 2]| rate != [0.0; 2];
         let trained = Trained {
@@ -237,6 +243,7 @@ impl Plan {
             rounds,
             counted,
             cull,
+            sentinel,
             trained,
             evaluation,
             reference,
@@ -281,6 +288,7 @@ impl Plan {
             stage::ATTENTION => self.attention.then_some(Steps { first: settings.model.attention.start.max(1), ..all }),
             stage::DEPTH => self.depth.then_some(all),
             stage::DEPTH_GRADIENT => self.depth_gradient.then_some(all),
+            stage::SENTINEL => self.sentinel.then_some(all),
             stage::STATISTICS => self.counted,
             stage::GROWTH => self.rounds,
             stage::EVALUATION => {
@@ -302,6 +310,7 @@ impl Plan {
                 listed("depth gradient").or_else(|| listed("depth map, its gradient, alignment and depth losses"))
             }
             stage::STATISTICS | stage::GROWTH => listed("statistics, growing and pruning"),
+            stage::SENTINEL => listed("sentinel"),
             stage::EVALUATION => listed("evaluation"),
             _ => None,
         }

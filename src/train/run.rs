@@ -1,21 +1,26 @@
 //! The training loop: views in order, one submission per step, everything the host wants to know a step late.
 
+use std::cell::OnceCell;
 use std::collections::VecDeque;
+use std::fs::File;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use atomic_write_file::AtomicWriteFile;
 use serde::Serialize;
 
+use super::checkpoint::{self, History, LastFigures, Model, Owner, State};
 use super::order::Order;
 use super::photographs::{self, Photograph};
 use super::plan::Plan;
 use super::step::{Rates, Step};
 use crate::config::Settings;
 use crate::evaluate::{self, Report, ViewMetrics};
-use crate::gpu::{self, Buffer, Gpu, Submission, Timing, Timings};
+use crate::gpu::{self, Buffer, Gpu, NotFinite, Submission, Timing, Timings};
 use crate::losses::Term;
 use crate::model::{files, init};
+use crate::primitives::finite::NOT_FINITE;
 use crate::primitives::limit::{COUNTERS, Counter};
 use crate::render::view::{Capacity, Rendered};
 use crate::scene::Scene;
@@ -35,6 +40,25 @@ pub enum Error {
     /// The figures.
     #[error(transparent)]
     Evaluate(#[from] evaluate::Error),
+    /// A checkpoint.
+    #[error(transparent)]
+    Checkpoint(#[from] checkpoint::WriteError),
+    /// Somebody asked for an end.
+    #[error("stopped by {signal}")]
+    Interrupted {
+        /// How.
+        signal: Signal,
+    },
+    /// Any of the others, once the run is under way.
+    #[error("{source}; {}", how_to_go_on(source, *kept, folder))]
+    Stopped {
+        /// Why.
+        source: Box<Error>,
+        /// Step of the last checkpoint, if there is one.
+        kept: Option<u32>,
+        /// The run folder.
+        folder: PathBuf,
+    },
     /// A file of the run folder.
     #[error("{}: {source}", path.display())]
     Io {
@@ -44,21 +68,90 @@ pub enum Error {
         source: std::io::Error,
     },
     /// A number stopped being one.
-    #[error(
-        "the loss of step {step} (view {view}) is {loss}: the model before it is not saved; lower the learning rates or look at that view's prior and mask"
-    )]
+    #[error("step {step} (view {view}): {}", where_from(found.as_ref()))]
     NotFinite {
         /// The step.
         step: u32,
         /// The view's name.
         view: String,
-        /// The loss.
-        loss: f32,
+        /// The first one, if it came again when the step was repeated.
+        found: Option<NotFinite>,
     },
 }
 
+fn where_from(found: Option<&NotFinite>) -> String {
+    match found {
+        Some(NotFinite { pass, tensor, index, value }) => format!(
+            "pass {pass} wrote {value} into `{tensor}` (its float {index}), the first value that is not finite; lower the \
+             learning rates, or look at that view's prior and mask"
+        ),
+        None => {
+            "values that are not finite came up, and did not when the steps were repeated from good ones: the device's \
+                 memory may be faulty"
+                .to_owned()
+        }
+    }
+}
+
+impl Error {
+    /// The signal that ended the run, if one did.
+    pub fn signal(&self) -> Option<Signal> {
+        match self {
+            Self::Interrupted { signal } => Some(*signal),
+            Self::Stopped { source, .. } => source.signal(),
+            _ => None,
+        }
+    }
+}
+
+fn how_to_go_on(source: &Error, kept: Option<u32>, folder: &Path) -> String {
+    match kept {
+        // The same step would end the same way.
+        Some(step) if matches!(source, Error::NotFinite { found: Some(_), .. }) => {
+            format!("the last good state, behind step {step}, is {}", checkpoint::path(folder, step).display())
+        }
+        Some(step) => {
+            format!("`gscream-vk train --resume {}` goes on behind step {step}", folder.display())
+        }
+        None => "there is no checkpoint to go on from".to_owned(),
+    }
+}
+
+/// What asks a run to end early.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Signal {
+    /// SIGINT: Ctrl-C.
+    Interrupt,
+    /// SIGTERM: a scheduler, a shutdown.
+    Terminate,
+}
+
+impl Signal {
+    /// The system's number for it.
+    pub fn number(self) -> u8 {
+        match self {
+            Self::Interrupt => 2,
+            Self::Terminate => 15,
+        }
+    }
+
+    /// What a program that it ended returns to the shell.
+    pub fn exit_code(self) -> u8 {
+        128 + self.number()
+    }
+}
+
+impl std::fmt::Display for Signal {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Interrupt => "SIGINT",
+            Self::Terminate => "SIGTERM",
+        })
+    }
+}
+
 /// What the host learns of a step, once it has ended.
-#[derive(Clone, Debug, Default, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Progress {
     /// Step, counted from 1.
     pub step: u32,
@@ -133,11 +226,26 @@ pub trait Observer {
     fn say(&mut self, _line: &str) {}
     /// A test view as rendered after the last step.
     fn rendered(&mut self, _view: &str, _picture: &Rendered) {}
+    /// Whether to end behind the steps in flight, with a checkpoint; asked before every step.
+    fn interrupted(&mut self) -> Option<Signal> {
+        None
+    }
 }
 
 /// Watches nothing.
 pub struct Silent;
 impl Observer for Silent {}
+
+/// Ends a run after so many steps.
+struct StepsLeft(u32);
+impl Observer for StepsLeft {
+    fn step(&mut self, _progress: &Progress) {
+        self.0 -= 1;
+    }
+    fn interrupted(&mut self) -> Option<Signal> {
+        (self.0 == 0).then_some(Signal::Interrupt)
+    }
+}
 
 /// Buffers in host memory that the device fills at the end of a step.
 struct Mailbox {
@@ -153,8 +261,94 @@ struct InFlight<'g> {
     submission: Submission<'g>,
 }
 
+/// Why [`Run::advance`] returned early.
+enum Halt {
+    /// Values are not finite behind, or at, a step; the last state known to be good, if one is.
+    Broken { step: u32, good: Option<Box<State>> },
+    /// The model on the device is that behind the last step of the history.
+    Good(Error),
+    /// It is not, or cannot be read any more.
+    Lost(Error),
+}
+
+impl<E: Into<Error>> From<E> for Halt {
+    fn from(error: E) -> Self {
+        Self::Lost(error.into())
+    }
+}
+
+/// What belongs to one call of [`Run::train`] alone.
+struct Session<'f> {
+    folder: &'f Path,
+    log: Option<File>,
+    /// Seconds trained before.
+    before: f64,
+    started: Instant,
+    /// Seconds since then that are not training.
+    paused: f64,
+    /// Steps since the last line of the log, and when that was.
+    rate: (u32, Instant),
+    /// Nothing is written, and the state before every step is kept until the step has turned out well.
+    careful: bool,
+    timings: Timings,
+    last_timings: Vec<Timing>,
+}
+
+impl<'f> Session<'f> {
+    /// Opens the folder's log with what is known of it.
+    fn new(folder: &'f Path, history: &History) -> Result<Self, Error> {
+        let path = folder.join(LOG);
+        let open = || {
+            let mut file = AtomicWriteFile::open(&path)?;
+            file.write_all(history.log.as_bytes())?;
+            file.commit()?;
+            File::options().append(true).open(&path)
+        };
+        let log = open().map_err(|source| Error::Io { path: path.clone(), source })?;
+        Ok(Self { log: Some(log), careful: false, ..Self::careful(folder, history) })
+    }
+
+    /// Writes nothing.
+    fn careful(folder: &'f Path, history: &History) -> Self {
+        let now = Instant::now();
+        Self {
+            folder,
+            log: None,
+            before: history.last.seconds,
+            started: now,
+            paused: 0.0,
+            rate: (0, now),
+            careful: true,
+            timings: Timings::default(),
+            last_timings: vec![],
+        }
+    }
+
+    fn seconds(&self) -> f64 {
+        self.before + self.started.elapsed().as_secs_f64() - self.paused
+    }
+
+    fn write_line(&mut self, text: &str) -> Result<(), Error> {
+        let failed = |source| Error::Io { path: self.folder.join(LOG), source };
+        self.log.as_mut().map_or(Ok(()), |log| log.write_all(text.as_bytes())).map_err(failed)
+    }
+}
+
+/// The log's file within a run folder: a JSON object per line.
+pub const LOG: &str = "log.jsonl";
+
 /// Steps given to the device before the first is waited for.
 const DEPTH: usize = 2;
+
+/// A step of a run that has not begun.
+fn fresh(gpu: &Gpu, scene: &Scene, settings: &Settings) -> Result<Step, Error> {
+    let plan = Plan::new(scene, settings);
+    let points: Vec<[f32; 3]> = scene.points.iter().map(|p| p.position).collect();
+    let offsets = settings.model.offsets as usize;
+    let initial = init::from_points(&points, &settings.model)?;
+    let weights = init::weights(settings.train.seed, offsets, plan.attention);
+    Ok(Step::new(gpu, plan, settings, &initial.anchors, &weights, initial.voxel)?)
+}
 
 /// A training run.
 pub struct Run<'a> {
@@ -165,6 +359,9 @@ pub struct Run<'a> {
     step: Step,
     order: Order,
     mailboxes: Vec<Mailbox>,
+    /// What [`Run::train`] goes on from.
+    history: History,
+    owner: OnceCell<Owner>,
 }
 
 impl<'a> Run<'a> {
@@ -173,13 +370,28 @@ impl<'a> Run<'a> {
     /// # Errors
     /// When the points make no anchor or the device has no room.
     pub fn new(gpu: &'a Gpu, scene: &'a Scene, settings: &'a Settings) -> Result<Self, Error> {
-        let plan = Plan::new(scene, settings);
-        let points: Vec<[f32; 3]> = scene.points.iter().map(|p| p.position).collect();
-        let offsets = settings.model.offsets as usize;
-        let initial = init::from_points(&points, &settings.model)?;
-        let weights = init::weights(settings.train.seed, offsets, plan.attention);
-        let photographs = photographs::upload(gpu, scene, &plan)?;
-        let step = Step::new(gpu, plan, settings, &initial.anchors, &weights, initial.voxel)?;
+        Self::with(gpu, scene, settings, fresh(gpu, scene, settings)?, History::default())
+    }
+
+    /// The run that a checkpoint was written by, from there on.
+    ///
+    /// # Errors
+    /// When the device has no room.
+    pub fn resume(gpu: &'a Gpu, scene: &'a Scene, settings: &'a Settings, state: State) -> Result<Self, Error> {
+        let step = state.model.restore(gpu, Plan::new(scene, settings), settings)?;
+        Self::with(gpu, scene, settings, step, state.history)
+    }
+
+    fn with(
+        gpu: &'a Gpu,
+        scene: &'a Scene,
+        settings: &'a Settings,
+        step: Step,
+        history: History,
+    ) -> Result<Self, Error> {
+        let photographs = photographs::upload(gpu, scene, &step.plan)?;
+        // As many recordings as will ever be open at once, so that the log's bytes do not say when a run was resumed.
+        drop((0..=DEPTH).map(|_| gpu.recorder()).collect::<Result<Vec<_>, _>>()?);
         let mailboxes = (0..DEPTH)
             .map(|_| {
                 Ok(Mailbox {
@@ -190,12 +402,17 @@ impl<'a> Run<'a> {
             })
             .collect::<Result<_, gpu::Error>>()?;
         let order = Order::new(scene.train.len(), settings.train.seed, settings.train.view_order);
-        Ok(Self { gpu, scene, settings, photographs, step, order, mailboxes })
+        Ok(Self { gpu, scene, settings, photographs, step, order, mailboxes, history, owner: OnceCell::new() })
     }
 
     /// The step: its plan, model and stages.
     pub fn step(&self) -> &Step {
         &self.step
+    }
+
+    /// The last step that has ended.
+    pub fn done(&self) -> u32 {
+        self.history.last.step
     }
 
     /// Gives the stages room for so much, instead of the first guess; what does not fit is made room for as ever. Nothing
@@ -227,7 +444,13 @@ impl<'a> Run<'a> {
             let mut rec = self.gpu.recorder()?;
             self.record(&mut rec, step)?;
             rec.submit()?.wait()?;
-            if self.gpu.read(self.step.limits.overflow())?[0] == 0 {
+            let flag = self.gpu.read(self.step.limits.overflow())?[0];
+            if flag >> NOT_FINITE != 0 {
+                self.lower()?;
+                let view = self.photographs[self.order.view(step)].name.clone();
+                return Err(Error::NotFinite { step, view, found: None });
+            }
+            if flag == 0 {
                 return Ok(());
             }
             let counters = self.gpu.read(self.step.limits.counters())?;
@@ -253,65 +476,136 @@ impl<'a> Run<'a> {
         Ok(InFlight { step, view, mailbox, submission: rec.submit()? })
     }
 
-    /// Trains to the last step, writing log and model into `folder`.
+    /// Trains to the last step, writing log, model and checkpoints into `folder`.
     ///
     /// # Errors
-    /// See [`Error`]. What was written before stays.
+    /// See [`Error`]. Once under way it is [`Error::Stopped`], with a checkpoint of the last step that ended well where the
+    /// folder has room for it; what was written before stays.
     pub fn train(&mut self, folder: &Path, watch: &mut dyn Observer) -> Result<Summary, Error> {
-        let iterations = self.settings.train.iterations;
-        let log_path = folder.join("log.jsonl");
-        let io = |path: &Path| {
-            let path = path.to_owned();
-            move |source| Error::Io { path, source }
+        let mut session = Session::new(folder, &self.history)?;
+        let mut history = std::mem::take(&mut self.history);
+        let result = self.advance(&mut session, &mut history, watch);
+        let stopped = |source, kept| Error::Stopped { source: Box::new(source), kept, folder: folder.to_owned() };
+        let report = match result {
+            Ok(report) => report,
+            Err(halt) => {
+                let (error, state) = match halt {
+                    Halt::Lost(error) => (error, None),
+                    Halt::Good(error) => {
+                        // What is not finite yet unnoticed is not to be gone on from.
+                        let model = Model::of(self.gpu, &self.step).ok().filter(|model| model.not_finite().is_none());
+                        (error, model.map(|model| State { history: history.clone(), model }))
+                    }
+                    Halt::Broken { step, good } => self.explain(folder, step, good.map(|state| *state), watch),
+                };
+                let kept = state.and_then(|state| match checkpoint::write(folder, self.owner(), &state) {
+                    Ok(_) => Some(state.history.last.step),
+                    // The first error is the one to act on, and likely the cause of this one.
+                    Err(second) => {
+                        log::info!("{second}");
+                        None
+                    }
+                });
+                let newest = || checkpoint::list(folder).first().map(|(step, _)| *step);
+                return Err(stopped(error, kept.or_else(newest)));
+            }
         };
-        let mut log = std::io::BufWriter::new(std::fs::File::create(&log_path).map_err(io(&log_path))?);
-        let started = Instant::now();
-        let mut paused = 0.0;
-        let mut timings = Timings::default();
-        let mut last_timings = vec![];
+        let recent = &history.recent;
+        let mean = |f: &dyn Fn(&(u32, u32)) -> u32| {
+            recent.iter().map(|r| f64::from(f(r))).sum::<f64>() / recent.len().max(1) as f64
+        };
+        Ok(Summary {
+            steps: history.last.step,
+            seconds: history.last.seconds,
+            repeated: history.repeated,
+            anchors: self.step.anchors.count,
+            gaussians: mean(&|r| r.0),
+            pairs: mean(&|r| r.1),
+            peak_device_bytes: self.gpu.memory().1,
+            report,
+            timings: session.timings,
+            last: session.last_timings,
+        })
+    }
+
+    /// Steps until the last has ended. `history` is that of the model on the device whenever this returns anything but
+    /// [`Halt::Lost`].
+    fn advance(
+        &mut self,
+        session: &mut Session<'_>,
+        history: &mut History,
+        watch: &mut dyn Observer,
+    ) -> Result<Option<Report>, Halt> {
+        let iterations = self.settings.train.iterations;
         let mut in_flight: VecDeque<InFlight<'a>> = VecDeque::new();
-        let mut next = 1;
-        let mut done = 0;
-        let mut repeated = 0;
+        let mut next = history.last.step + 1;
         let mut report = None;
-        let mut since_line = (0u32, 0f64, Instant::now());
-        let mut recent: VecDeque<(u32, u32)> = VecDeque::new();
-        let every =
-            |interval: u32| move |step: u32| step == iterations || (interval > 0 && step.is_multiple_of(interval));
-        let (evaluates, saves) = (every(self.settings.train.eval_interval), every(self.settings.train.save_interval));
-        while done < iterations {
-            // What follows a change of the anchors, an evaluation or a save waits until it is made.
-            let pause_behind = |step: u32| self.step.changes_anchors(step) || evaluates(step) || saves(step);
-            let blocked = next > done + 1 && pause_behind(next - 1);
+        // What ends the run, once nothing is in flight any more.
+        let mut halt: Option<Error> = None;
+        // The state behind the last step, where that is kept.
+        let mut good: Option<Box<State>> = None;
+        if history.last.step > 0 && !history.told {
+            match self.tell(session, history, watch) {
+                Ok(told) => report = told,
+                Err(error) => halt = Some(error),
+            }
+        }
+        if session.careful {
+            good = Some(Box::new(State { history: history.clone(), model: Model::of(self.gpu, &self.step)? }));
+        }
+        while history.last.step < iterations && !(halt.is_some() && in_flight.is_empty()) {
+            if halt.is_none() {
+                halt = watch.interrupted().map(|signal| Error::Interrupted { signal });
+            }
+            // What follows a change of the anchors, an evaluation, a save or a checkpoint waits until it is made.
+            let behind = next > history.last.step + 1;
+            let blocked = halt.is_some() || behind && (session.careful || self.pauses_behind(next - 1));
             if next <= iterations && in_flight.len() < DEPTH && !blocked {
-                let mailbox = (next as usize) % DEPTH;
-                in_flight.push_back(self.submit(next, mailbox)?);
+                match self.submit(next, next as usize % DEPTH) {
+                    Ok(submitted) => in_flight.push_back(submitted),
+                    Err(error) => halt = Some(error),
+                }
                 next += 1;
                 continue;
             }
-            let InFlight { step, view, mailbox, submission } =
-                in_flight.pop_front().expect("a step is in flight until the last is done");
+            let Some(InFlight { step, view, mailbox, submission }) = in_flight.pop_front() else { continue };
             let ended = submission.wait()?;
             let mail = &self.mailboxes[mailbox];
             let counters = self.gpu.read(&mail.counters)?;
-            if self.gpu.read(&mail.overflow)?[0] != 0 {
-                // The device has skipped this step and those behind it: grow, and take them again.
-                repeated += 1 + in_flight.len() as u32;
+            let flag = self.gpu.read(&mail.overflow)?[0];
+            let values = self.gpu.read(&mail.losses)?;
+            if flag >> NOT_FINITE != 0 || flag == 0 && !values.iter().sum::<f32>().is_finite() {
+                // The device has skipped this step, if it saw it, and those behind it.
                 for later in in_flight.drain(..) {
                     later.submission.wait()?;
                 }
-                self.grow(&counters)?;
+                self.lower()?;
+                if good.is_none() {
+                    let model = Model::of(self.gpu, &self.step)?;
+                    let whole = flag != 0 && model.not_finite().is_none();
+                    good = whole.then(|| Box::new(State { history: history.clone(), model }));
+                }
+                return Err(Halt::Broken { step, good });
+            }
+            if flag != 0 {
+                // The device has skipped this step and those behind it: grow, and take them again.
+                history.repeated += 1 + in_flight.len() as u32;
+                for later in in_flight.drain(..) {
+                    later.submission.wait()?;
+                }
+                if let Err(error) = self.grow(&counters) {
+                    halt = Some(error);
+                }
                 next = step;
                 continue;
             }
-            timings.add(&ended);
+            session.timings.add(&ended);
             if !ended.is_empty() {
-                last_timings = ended;
+                session.last_timings = ended;
             }
-            let values = self.gpu.read(&mail.losses)?;
             let progress = Progress {
                 step,
-                seconds: started.elapsed().as_secs_f64() - paused,
+                seconds: session.seconds(),
                 view: self.photographs[view].name.clone(),
                 loss: values.iter().sum(),
                 losses: Term::ALL.iter().map(|t| t.name()).zip(values.iter().copied()).collect(),
@@ -320,75 +614,206 @@ impl<'a> Run<'a> {
                 gaussians: counters[Counter::Drawn as usize],
                 pairs: counters[Counter::Pairs as usize],
             };
-            if !progress.loss.is_finite() {
-                let view = progress.view;
-                return Err(Error::NotFinite { step, view, loss: progress.loss });
-            }
-            recent.push_back((progress.gaussians, progress.pairs));
-            if recent.len() > self.photographs.len() {
-                recent.pop_front();
-            }
-            done = step;
             watch.step(&progress);
-            since_line.0 += 1;
-            since_line.1 += f64::from(progress.loss);
-            if self.step.changes_anchors(done) {
-                let change = self.step.change_anchors(done)?;
-                watch.say(&change);
+            history.recent.push((progress.gaussians, progress.pairs));
+            let surplus = history.recent.len().saturating_sub(self.photographs.len());
+            history.recent.drain(..surplus);
+            history.since_line.0 += 1;
+            history.since_line.1 += f64::from(progress.loss);
+            history.last = progress;
+            history.told = false;
+            session.rate.0 += 1;
+            if self.step.changes_anchors(step) {
+                watch.say(&self.step.change_anchors(step)?);
             }
-            let pause = Instant::now();
-            if saves(done) {
-                self.save(folder)?;
-            }
-            if evaluates(done) {
-                let last = done == iterations;
-                report = self
-                    .evaluate(|view, picture| {
-                        if last {
-                            watch.rendered(view, picture)
-                        }
-                    })?
-                    .or(report);
-                if let Some(mean) = report.as_ref().and_then(|r| r.mean.as_ref()) {
-                    let mean = &mean.metrics;
-                    let masked = mean.mask.as_ref().map_or(String::new(), |m| format!(", masked {:.2} dB", m.psnr));
-                    watch.say(&format!("step {done}: PSNR {:.2} dB{masked} on the test views", mean.full.psnr));
+            let mut state = None;
+            if session.careful || self.checkpoints(step) || self.saves(step) {
+                let pause = Instant::now();
+                let model = Model::of(self.gpu, &self.step)?;
+                if model.not_finite().is_some() {
+                    return Err(Halt::Broken { step, good });
                 }
+                state = Some(Box::new(State { history: history.clone(), model }));
+                session.paused += pause.elapsed().as_secs_f64();
             }
-            paused += pause.elapsed().as_secs_f64();
-            if done.is_multiple_of(self.settings.train.log_interval) || done == iterations {
-                let (steps, loss, since) = since_line;
-                let figures = report.as_ref().and_then(|r| r.mean.as_ref()).map(|m| &m.metrics);
-                let line = Line {
-                    progress: &progress,
-                    mean_loss: loss / f64::from(steps),
-                    steps_per_second: f64::from(steps) / (since.elapsed().as_secs_f64()),
-                    psnr: figures.map(|m| m.full.psnr),
-                    masked_psnr: figures.and_then(|m| m.mask.as_ref()).map(|m| m.psnr),
-                    device_bytes: self.gpu.memory().0,
-                    host_bytes: host_bytes(),
-                };
-                let text = serde_json::to_string(&line).expect("plain numbers and strings");
-                writeln!(log, "{text}").and_then(|()| log.flush()).map_err(io(&log_path))?;
-                since_line = (0, 0.0, Instant::now());
+            if let Some(state) = state.as_ref().filter(|_| halt.is_none() && !session.careful && self.checkpoints(step))
+            {
+                let pause = Instant::now();
+                if let Err(error) = checkpoint::write(session.folder, self.owner(), state) {
+                    halt = Some(error.into());
+                    continue;
+                }
+                session.paused += pause.elapsed().as_secs_f64();
+            }
+            match self.tell(session, history, watch) {
+                Ok(told) => report = told.or(report),
+                Err(error) => halt = halt.or(Some(error)),
+            }
+            good =
+                state.filter(|_| session.careful).map(|state| Box::new(State { history: history.clone(), ..*state }));
+        }
+        match halt {
+            // It came too late to matter.
+            Some(Error::Interrupted { .. }) if history.last.step == iterations && history.told => Ok(report),
+            Some(error) => Err(Halt::Good(error)),
+            None => Ok(report),
+        }
+    }
+
+    /// Makes what is written of the last step: the model's files, the evaluation, the line of the log.
+    fn tell(
+        &mut self,
+        session: &mut Session<'_>,
+        history: &mut History,
+        watch: &mut dyn Observer,
+    ) -> Result<Option<Report>, Error> {
+        let step = history.last.step;
+        let last = step == self.settings.train.iterations;
+        let pause = Instant::now();
+        if self.saves(step) && !session.careful {
+            self.save(session.folder)?;
+        }
+        let mut report = None;
+        if self.evaluates(step) {
+            report = self.evaluate(|view, picture| {
+                if last {
+                    watch.rendered(view, picture)
+                }
+            })?;
+            if let Some(mean) = report.as_ref().and_then(|r| r.mean.as_ref()) {
+                let mean = &mean.metrics;
+                let masked = mean.mask.as_ref().map_or(String::new(), |m| format!(", masked {:.2} dB", m.psnr));
+                watch.say(&format!("step {step}: PSNR {:.2} dB{masked} on the test views", mean.full.psnr));
+                history.figures =
+                    Some(LastFigures { psnr: mean.full.psnr, masked_psnr: mean.mask.as_ref().map(|m| m.psnr) });
             }
         }
-        let seconds = started.elapsed().as_secs_f64() - paused;
-        let mean = |f: &dyn Fn(&(u32, u32)) -> u32| {
-            recent.iter().map(|r| f64::from(f(r))).sum::<f64>() / recent.len().max(1) as f64
-        };
-        Ok(Summary {
-            steps: iterations,
-            seconds,
-            repeated,
-            anchors: self.step.anchors.count,
-            gaussians: mean(&|r| r.0),
-            pairs: mean(&|r| r.1),
-            peak_device_bytes: self.gpu.memory().1,
-            report,
-            timings,
-            last: last_timings,
-        })
+        session.paused += pause.elapsed().as_secs_f64();
+        if step.is_multiple_of(self.settings.train.log_interval) || last {
+            let (steps, loss) = history.since_line;
+            let line = Line {
+                progress: &history.last,
+                mean_loss: loss / f64::from(steps),
+                steps_per_second: f64::from(session.rate.0) / session.rate.1.elapsed().as_secs_f64(),
+                psnr: history.figures.map(|f| f.psnr),
+                masked_psnr: history.figures.and_then(|f| f.masked_psnr),
+                device_bytes: self.gpu.memory().0,
+                host_bytes: host_bytes(),
+            };
+            let text = serde_json::to_string(&line).expect("plain numbers and strings") + "\n";
+            session.write_line(&text)?;
+            history.log.push_str(&text);
+            history.since_line = (0, 0.0);
+            session.rate = (0, Instant::now());
+        }
+        history.told = true;
+        Ok(report)
+    }
+
+    /// Finds the first pass whose values are not finite and the state before it. `good` is the state before step `step`,
+    /// at which they were noticed, where that is still whole; otherwise they have been in the model for some steps, which
+    /// are repeated one by one.
+    fn explain(
+        &mut self,
+        folder: &Path,
+        step: u32,
+        good: Option<State>,
+        watch: &mut dyn Observer,
+    ) -> (Error, Option<State>) {
+        let mut noticed = (step, good);
+        if noticed.1.is_none() {
+            watch.say(&format!(
+                "step {step}: values are not finite; repeating the steps since the last good state to find the first"
+            ));
+            match self.repeat(folder, step) {
+                Ok(found) => noticed = found,
+                Err(error) => return (error, None),
+            }
+        }
+        let (step, good) = noticed;
+        let view = self.photographs[self.order.view(step)].name.clone();
+        // A state behind the step is of a repetition in which nothing was wrong.
+        let before = good.as_ref().filter(|good| good.history.last.step < step);
+        let found = before.and_then(|before| match self.first_not_finite(before, step) {
+            Ok(found) => found,
+            Err(error) => {
+                log::warn!("repeating step {step}: {error}");
+                None
+            }
+        });
+        (Error::NotFinite { step, view, found }, good)
+    }
+
+    /// Repeats the steps from the last good checkpoint, or from the first step, to `noticed`, that one included. Returns
+    /// the first whose results are not finite and the state before it; `noticed` and the state behind it if all are.
+    fn repeat(&mut self, folder: &Path, noticed: u32) -> Result<(u32, Option<State>), Error> {
+        let settings = self.settings;
+        // The stages' memory goes before a second model is made.
+        self.step.resize(Capacity { anchors: 1, visible: 1, pairs: 1 })?;
+        let candidates = checkpoint::list(folder).into_iter().filter(|(step, _)| *step < noticed);
+        let base = candidates.filter_map(|(_, path)| checkpoint::read(&path, self.owner()).ok()).next();
+        let mut history = History::default();
+        match base {
+            Some(state) => {
+                self.step = state.model.restore(self.gpu, self.step.plan.clone(), settings)?;
+                history = state.history;
+            }
+            None => self.step = fresh(self.gpu, self.scene, settings)?,
+        }
+        let mut session = Session::careful(folder, &history);
+        let mut steps = StepsLeft(noticed - history.last.step);
+        match self.advance(&mut session, &mut history, &mut steps) {
+            Err(Halt::Broken { step, good }) => Ok((step, good.map(|state| *state))),
+            Err(Halt::Good(error)) if !matches!(error, Error::Interrupted { .. }) => Err(error),
+            Err(Halt::Lost(error)) => Err(error),
+            Ok(_) | Err(Halt::Good(_)) => {
+                Ok((noticed, Some(State { history, model: Model::of(self.gpu, &self.step)? })))
+            }
+        }
+    }
+
+    /// Repeats a step pass by pass from the state before it.
+    fn first_not_finite(&mut self, before: &State, step: u32) -> Result<Option<NotFinite>, Error> {
+        self.step.resize(Capacity { anchors: 1, visible: 1, pairs: 1 })?;
+        self.step = before.model.restore(self.gpu, self.step.plan.clone(), self.settings)?;
+        loop {
+            let mut rec = self.gpu.inspected()?;
+            self.record(&mut rec, step)?;
+            let found = rec.not_finite().cloned();
+            rec.submit()?.wait()?;
+            let flag = self.gpu.read(self.step.limits.overflow())?[0];
+            if found.is_some() || flag == 0 || flag >> NOT_FINITE != 0 {
+                return Ok(found);
+            }
+            let counters = self.gpu.read(self.step.limits.counters())?;
+            self.grow(&counters)?;
+        }
+    }
+
+    fn every(&self, interval: u32, step: u32) -> bool {
+        step == self.settings.train.iterations || (interval > 0 && step.is_multiple_of(interval))
+    }
+
+    fn evaluates(&self, step: u32) -> bool {
+        self.every(self.settings.train.eval_interval, step)
+    }
+
+    fn saves(&self, step: u32) -> bool {
+        self.every(self.settings.train.save_interval, step)
+    }
+
+    fn checkpoints(&self, step: u32) -> bool {
+        let interval = self.settings.train.checkpoint_interval;
+        interval > 0 && self.every(interval, step)
+    }
+
+    fn pauses_behind(&self, step: u32) -> bool {
+        self.step.changes_anchors(step) || self.evaluates(step) || self.saves(step) || self.checkpoints(step)
+    }
+
+    /// Whose the checkpoints of this run are.
+    pub fn owner(&self) -> &Owner {
+        self.owner.get_or_init(|| Owner::new(self.scene, self.settings))
     }
 
     /// Writes the model as it is now into `folder/model`, in place of the one before.
@@ -403,6 +828,10 @@ impl<'a> Run<'a> {
     fn grow(&mut self, counters: &[u32]) -> Result<(), Error> {
         let capacity = self.step.capacity().fit(std::array::from_fn(|i| counters[i]));
         self.step.resize(capacity)?;
+        self.lower()
+    }
+
+    fn lower(&self) -> Result<(), Error> {
         let mut rec = self.gpu.recorder()?;
         self.step.limits.lower(&mut rec);
         rec.submit()?.wait()?;

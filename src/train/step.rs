@@ -12,6 +12,7 @@ use crate::model::anchors::{Anchors, Parameter};
 use crate::model::files;
 use crate::optimizer::adam::{self, Tensors};
 use crate::optimizer::schedule::Rate;
+use crate::primitives::finite;
 use crate::primitives::limit::Limits;
 
 use crate::render::decode::{self, DecodeBackward, GaussianGradients, WantedGradients};
@@ -134,10 +135,11 @@ pub struct Step {
     /// Nothing while anchors change or views are drawn for their figures: those take the room.
     stages: Option<Stages>,
     canvases: Vec<Canvas>,
-    statistics: Option<Statistics>,
-    voxel: f64,
-    attend: Option<Attend>,
-    attention_weights: Option<Vec<f32>>,
+    pub(super) statistics: Option<Statistics>,
+    pub(super) voxel: f64,
+    pub(super) attend: Option<Attend>,
+    /// Initial projections of an attention whose time has not come.
+    pub(super) attention_weights: Option<Vec<f32>>,
     config: Settings,
     adam: adam::Config,
     near: f32,
@@ -476,6 +478,12 @@ impl Step {
         };
         rec.stage(stage::DECODE_BACKWARD);
         decode_backward.record(rec, &forward.decode, model, gaussians, to);
+        rec.stage(stage::ATTENTION);
+        if let Some(((attend, attended), grad_feature)) = self.attend.as_ref().zip(attended).zip(to.feature) {
+            attend.backward(rec, attended, grad_feature);
+        }
+        // Whatever changes the model or is gathered for it comes behind: it obeys the flag.
+        self.watch(rec, canvas.losses.terms(), attended, step);
         if let Some(statistics) = &self.statistics {
             let drawn = Drawn {
                 slots,
@@ -489,11 +497,44 @@ impl Step {
             rec.stage(stage::STATISTICS);
             statistics.record(rec, drawn);
         }
-        rec.stage(stage::ATTENTION);
-        if let Some(((attend, attended), grad_feature)) = self.attend.as_ref().zip(attended).zip(to.feature) {
-            attend.backward(rec, attended, grad_feature);
-        }
         self.optimize(rec, attended, step, rates);
+    }
+
+    /// Looks for values that are not finite: in the losses and the networks' gradients, into which every Gaussian's
+    /// gradients are summed, in each step; in all gradients, parameters and moments in every `sentinel_interval`-th.
+    fn watch(&self, rec: &mut Recorder<'_>, terms: &Buffer<f32>, attended: Option<Attended<'_>>, step: u32) {
+        let Self { anchors, weights, .. } = self;
+        let gradients = &self.stages().gradients;
+        let interval = self.config.train.sentinel_interval;
+        if interval == 0 {
+            return;
+        }
+        rec.stage(stage::SENTINEL);
+        let flag = self.limits.overflow();
+        let network = Layout { offsets: anchors.offsets as usize }.weights() as u32;
+        finite::record(rec, terms, losses::Term::ALL.len() as u32, flag, None);
+        if let Some(gradient) = &gradients.weights {
+            finite::record(rec, gradient, network, flag, None);
+        }
+        let attention = self.attend.as_ref().zip(attended);
+        if let Some((attend, attended)) = attention {
+            finite::record(rec, &attend.grad_weights, attend.weights.width, flag, Some(attended.tokens()));
+        }
+        if !step.is_multiple_of(interval) {
+            return;
+        }
+        let of_anchors = [&gradients.feature, &gradients.offset, &gradients.log_scaling];
+        for (parameter, gradient) in anchors.parameters().into_iter().zip(of_anchors) {
+            for tensor in parameter.tensors().into_iter().chain(gradient) {
+                finite::record(rec, tensor, anchors.count * parameter.width, flag, None);
+            }
+        }
+        for tensor in weights.tensors() {
+            finite::record(rec, tensor, network, flag, None);
+        }
+        for tensor in self.attend.iter().flat_map(|attend| attend.weights.tensors()) {
+            finite::record(rec, tensor, crate::math::attention::WEIGHTS as u32, flag, None);
+        }
     }
 
     fn optimize(&self, rec: &mut Recorder<'_>, attended: Option<Attended<'_>>, step: u32, rates: Rates) {

@@ -1,0 +1,461 @@
+//! A run is the same again and never lost: killed at any moment, stopped by a signal, out of disk, damaged checkpoints.
+
+#[allow(dead_code)]
+mod common;
+
+use std::fs;
+use std::os::unix::process::ExitStatusExt as _;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::LazyLock;
+use std::time::{Duration, Instant};
+
+use assert_cmd::cargo::cargo_bin;
+use gscream_vk::config::Settings;
+use gscream_vk::train::checkpoint;
+use gscream_vk::train::config::ViewOrder;
+use rand::{RngExt, SeedableRng};
+use tempfile::TempDir;
+
+/// Growth, pruning, statistics and attention in the first steps; a checkpoint every third.
+fn settings() -> Settings {
+    let mut settings = common::settings(36);
+    let train = &mut settings.train;
+    train.view_order = ViewOrder::Shuffled;
+    (train.log_interval, train.eval_interval, train.save_interval, train.checkpoint_interval) = (5, 12, 9, 3);
+    settings
+}
+
+/// Files' contents by their path within a run folder, sorted.
+type Files = Vec<(String, Vec<u8>)>;
+
+/// A folder with a scene and the settings of its runs.
+struct Place {
+    folder: TempDir,
+}
+
+impl Place {
+    fn new(settings: &Settings) -> Self {
+        let folder = common::folder();
+        fs::write(folder.path().join("settings.toml"), settings.to_toml()).expect("a writable folder");
+        Self { folder }
+    }
+
+    fn path(&self) -> &Path {
+        self.folder.path()
+    }
+
+    /// The program within the folder. Pipelines are compiled once for all tests.
+    fn program(&self, arguments: &[&str]) -> Command {
+        let mut command = Command::new(cargo_bin!("gscream-vk"));
+        command.args(arguments).current_dir(self.path()).env("XDG_CACHE_HOME", env!("CARGO_TARGET_TMPDIR"));
+        command.env_remove("RUST_LOG").stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        command
+    }
+
+    fn train(&self, out: &str, more: &[&str]) -> Command {
+        self.program(&[&["train", "scene", "--config", "settings.toml", "--out", out], more].concat())
+    }
+
+    fn resume(&self, run: &str) -> Command {
+        self.program(&["train", "--resume", run])
+    }
+
+    fn checkpoints(&self, run: &str) -> Vec<u32> {
+        checkpoint::list(&self.path().join(run)).into_iter().map(|(step, _)| step).collect()
+    }
+
+    /// What a finished run has left: every file's bytes by its path; times, memory of the process and the command line
+    /// left out.
+    fn result(&self, run: &str) -> Files {
+        let run = self.path().join(run);
+        let mut files = vec![];
+        let mut folders = vec![run.clone()];
+        while let Some(next) = folders.pop() {
+            for entry in fs::read_dir(next).expect("a folder") {
+                let path = entry.expect("readable").path();
+                if path.is_dir() {
+                    folders.push(path);
+                    continue;
+                }
+                let mut bytes = fs::read(&path).expect("readable");
+                let name = path.strip_prefix(&run).expect("below it").to_string_lossy().into_owned();
+                if name == "run.json" {
+                    continue;
+                }
+                if name == "log.jsonl" {
+                    let text = String::from_utf8(bytes).expect("text");
+                    bytes = text.lines().map(without_times).collect::<String>().into_bytes();
+                }
+                files.push((name, bytes));
+            }
+        }
+        files.sort();
+        files
+    }
+}
+
+/// A line of the log but for seconds, speed and the process's own memory.
+fn without_times(line: &str) -> String {
+    let serde_json::Value::Object(mut fields) = serde_json::from_str(line).expect("a line of JSON") else {
+        panic!("{line} is no object")
+    };
+    for time in ["seconds", "steps_per_second", "host_bytes"] {
+        assert!(fields.remove(time).is_some(), "{line} has no {time}");
+    }
+    // Numbers as they were written.
+    let mut text = line.to_owned();
+    for time in ["seconds", "steps_per_second", "host_bytes"] {
+        let start = text.find(&format!("\"{time}\":")).expect("it was there");
+        let end = text[start..].find([',', '}']).expect("an object ends") + start;
+        text.replace_range(start..end, "");
+    }
+    text + "\n"
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+fn output(mut command: Command) -> Output {
+    command.output().expect("the program starts")
+}
+
+fn succeeds(command: Command) -> Output {
+    let output = output(command);
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    output
+}
+
+/// Fails with this code and exactly one error, which it returns.
+fn fails(command: Command, code: i32) -> String {
+    let output = output(command);
+    let stderr = text(&output.stderr);
+    assert_eq!(output.status.code(), Some(code), "{stderr}");
+    assert_eq!(stderr.matches("error:").count(), 1, "{stderr}");
+    assert!(!stderr.contains("panicked"), "{stderr}");
+    stderr
+}
+
+fn assert_same(got: &[(String, Vec<u8>)], want: &[(String, Vec<u8>)], what: &str) {
+    let names = |files: &[(String, Vec<u8>)]| files.iter().map(|(name, _)| name.clone()).collect::<Vec<_>>();
+    assert_eq!(names(got), names(want), "{what}");
+    for ((name, got), (_, want)) in got.iter().zip(want) {
+        let lines = || {
+            let (got, want) = (text(got), text(want));
+            let differ = got.lines().zip(want.lines()).find(|(a, b)| a != b);
+            differ.map_or_else(String::new, |(a, b)| format!(":\n{a}\n{b}"))
+        };
+        let detail = if name.ends_with("jsonl") { lines() } else { String::new() };
+        assert!(got == want, "{what}: {name} differs ({} and {} bytes){detail}", got.len(), want.len());
+    }
+}
+
+/// Waits until the condition holds or the program has ended; false in the second case.
+fn wait_until(child: &mut Child, mut holds: impl FnMut() -> bool) -> bool {
+    loop {
+        if holds() {
+            return true;
+        }
+        if child.try_wait().expect("a child").is_some() {
+            return holds();
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
+/// What every run comes to: one that nothing happened to, and how long it took with all pipelines compiled.
+static WHOLE: LazyLock<(Files, Duration)> = LazyLock::new(|| {
+    let place = Place::new(&settings());
+    succeeds(place.train("first", &[]));
+    let started = Instant::now();
+    succeeds(place.train("whole", &[]));
+    let duration = started.elapsed();
+    let whole = place.result("whole");
+    assert_same(&place.result("first"), &whole, "twice the same");
+    let log = whole.iter().find(|(name, _)| name == "log.jsonl").map(|(_, bytes)| text(bytes)).expect("a log");
+    assert_eq!(log.lines().count(), 8, "{log}");
+    assert!(whole.iter().all(|(name, _)| !name.starts_with("checkpoints")), "a complete run keeps no checkpoints");
+    (whole, duration)
+});
+
+fn assert_whole(place: &Place, run: &str, what: &str) {
+    assert_same(&place.result(run), &WHOLE.0, what);
+}
+
+/// Starts a run and signals it once it has written a checkpoint of at least that step.
+fn stopped(place: &Place, run: &str, step: u32, signal: &str) -> Output {
+    let mut child = place.train(run, &[]).spawn().expect("the program starts");
+    let there = wait_until(&mut child, || place.checkpoints(run).first().is_some_and(|newest| *newest >= step));
+    assert!(there, "{}", text(&child.wait_with_output().expect("a child").stderr));
+    send(&child, signal);
+    child.wait_with_output().expect("a child")
+}
+
+fn send(child: &Child, signal: &str) {
+    let status = Command::new("kill").args(["-s", signal, &child.id().to_string()]).status();
+    assert!(status.expect("kill starts").success());
+}
+
+/// A run that was stopped with two checkpoints.
+fn half(place: &Place, run: &str) {
+    let output = stopped(place, run, 6, "INT");
+    assert_eq!(output.status.code(), Some(130), "{}", text(&output.stderr));
+    assert_eq!(place.checkpoints(run).len(), 2);
+}
+
+#[test]
+fn killed_at_any_moment_it_comes_to_the_same_end() {
+    const MOMENTS: u32 = 20;
+    let whole = WHOLE.1;
+    let place = Place::new(&settings());
+    let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(20);
+    let (mut runs, mut resumed) = (0, 0);
+    let mut run = String::new();
+    for moment in 0..MOMENTS {
+        // One in each twentieth of a whole run, from its first instant to its last; where the program was quicker than
+        // that, at the same moment of a new run.
+        let delay = whole.mul_f64((f64::from(moment) + rng.random::<f64>()) / f64::from(MOMENTS));
+        for attempt in 0.. {
+            assert!(attempt < 10, "no run lasts {delay:?}");
+            let mut child = if run.is_empty() {
+                runs += 1;
+                run = format!("run{runs}");
+                place.train(&run, &[])
+            } else if place.path().join(&run).join("run.json").exists() {
+                resumed += 1;
+                place.resume(&run)
+            } else {
+                // Killed before it had begun.
+                fails(place.resume(&run), 1);
+                place.train(&run, &[])
+            }
+            .spawn()
+            .expect("the program starts");
+            std::thread::sleep(delay);
+            child.kill().expect("a child");
+            let output = child.wait_with_output().expect("a child");
+            if output.status.signal() == Some(9) {
+                // A run is killed a few times before it may end.
+                if moment % 3 == 2 && place.path().join(&run).join("run.json").exists() {
+                    succeeds(place.resume(&run));
+                    assert_whole(&place, &run, &format!("killed last after {delay:?}"));
+                    run.clear();
+                }
+                break;
+            }
+            assert!(output.status.success(), "{}", text(&output.stderr));
+            assert_whole(&place, &run, "ended before it could be killed");
+            run.clear();
+        }
+    }
+    if !run.is_empty() {
+        succeeds(place.resume(&run));
+        assert_whole(&place, &run, "at last");
+    }
+    println!("{MOMENTS} kills of {runs} runs, {resumed} of them resumed before");
+}
+
+#[test]
+fn a_barrier_after_every_pass_changes_no_byte() {
+    let place = Place::new(&settings());
+    succeeds(place.train("serial", &["--serialize"]));
+    assert_whole(&place, "serial", "--serialize");
+}
+
+#[test]
+fn signals_end_a_run_with_a_checkpoint() {
+    let place = Place::new(&settings());
+    for (run, signal, name, code) in [("int", "INT", "SIGINT", 130), ("term", "TERM", "SIGTERM", 143)] {
+        let output = stopped(&place, run, 3, signal);
+        let stderr = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(code), "{stderr}");
+        let newest = place.checkpoints(run)[0];
+        let line = format!("error: stopped by {name}; `gscream-vk train --resume {run}` goes on behind step {newest}");
+        assert_eq!(stderr.lines().last(), Some(line.as_str()));
+        assert!(!stderr.contains("panicked"), "{stderr}");
+        succeeds(place.resume(run));
+        assert_whole(&place, run, signal);
+    }
+}
+
+#[test]
+fn a_complete_run_is_left_alone() {
+    let place = Place::new(&settings());
+    succeeds(place.train("run", &[]));
+    let times = || {
+        let files = place.result("run").into_iter().map(|(name, _)| name).chain(["run.json".to_owned()]);
+        let time = |name: String| fs::metadata(place.path().join("run").join(&name)).and_then(|m| m.modified());
+        files.map(|name| time(name).expect("a file")).collect::<Vec<_>>()
+    };
+    let before = times();
+    let output = succeeds(place.resume("run"));
+    assert_eq!(text(&output.stdout), "run: the run is complete (36 steps): nothing to do\n");
+    assert_eq!(times(), before);
+    fails(place.resume("scene"), 1);
+    fails(place.program(&["train", "--resume", "run", "--seed", "2"]), 2);
+
+    // What the new run does not write goes all the same.
+    let stale = ["test/stale.png", "trace.json", "checkpoints/step-00000004.safetensors", ".log.jsonl.a1B2c3"];
+    fs::create_dir(place.path().join("run/checkpoints")).expect("writable");
+    for name in stale {
+        fs::write(place.path().join("run").join(name), "old").expect("writable");
+    }
+    fs::write(place.path().join("run/notes.txt"), "mine").expect("writable");
+    succeeds(place.train("run", &["--overwrite"]));
+    fs::remove_file(place.path().join("run/notes.txt")).expect("what is not the program's stays");
+    assert_whole(&place, "run", "--overwrite");
+}
+
+/// Copies a run folder.
+fn copy(from: &Path, to: &Path) {
+    fs::create_dir(to).expect("writable");
+    for entry in fs::read_dir(from).expect("a folder") {
+        let path = entry.expect("readable").path();
+        let target = to.join(path.file_name().expect("a name"));
+        if path.is_dir() {
+            copy(&path, &target);
+        } else {
+            fs::copy(&path, &target).expect("writable");
+        }
+    }
+}
+
+#[test]
+fn checkpoints_that_are_not_the_runs_own_are_refused() {
+    let place = Place::new(&settings());
+    half(&place, "half");
+    let [newest, before] = <[u32; 2]>::try_from(place.checkpoints("half")).expect("two");
+    let run = place.path().join("half");
+    let (newest, before) = (checkpoint::path(&run, newest), checkpoint::path(&run, before));
+    let bytes = fs::read(&newest).expect("a checkpoint");
+    let name = |path: &PathBuf| path.file_name().expect("a name").to_string_lossy().into_owned();
+
+    let flipped = |at: usize| {
+        let mut bytes = bytes.clone();
+        bytes[at] ^= 1;
+        bytes
+    };
+    let edited = |from: &str, to: &str| {
+        let at = bytes.windows(from.len()).position(|w| w == from.as_bytes()).expect("it is in the header");
+        [&bytes[..at], to.as_bytes(), &bytes[at + from.len()..]].concat()
+    };
+    let damaged = "is damaged: its contents do not have the hash written into it";
+    for (case, contents, reason) in [
+        ("half of it", bytes[..bytes.len() / 2].to_vec(), "is cut off or damaged: no whole safetensors file"),
+        ("nothing", vec![], "is cut off or damaged: no whole safetensors file"),
+        ("a byte less", bytes[..bytes.len() - 1].to_vec(), "is cut off or damaged: no whole safetensors file"),
+        ("a bit of a tensor", flipped(bytes.len() - 9), damaged),
+        ("another step", edited("{\\\"step\\\":", "{\\\"ztep\\\":"), damaged),
+        (
+            "another format",
+            edited("checkpoint 1", "checkpoint 9"),
+            "is of another format: gscream-vk checkpoint 9, where",
+        ),
+    ] {
+        fs::write(&newest, contents).expect("writable");
+        let folder = place.path().join("case");
+        copy(&run, &folder);
+        let output = succeeds(place.resume("case"));
+        let stderr = text(&output.stderr);
+        assert!(stderr.contains(&format!("refused: case/checkpoints/{}: {reason}", name(&newest))), "{case}: {stderr}");
+        assert!(stderr.contains(&format!("(case/checkpoints/{})", name(&before))), "{case}: {stderr}");
+        assert_whole(&place, "case", case);
+        fs::remove_dir_all(folder).expect("writable");
+    }
+
+    // The one of a run with other settings, and the one before it of this.
+    let mut other = settings();
+    other.train.seed = 7;
+    fs::write(place.path().join("settings.toml"), other.to_toml()).expect("writable");
+    half(&place, "other");
+    fs::write(place.path().join("settings.toml"), settings().to_toml()).expect("writable");
+    let foreign = place.path().join("other");
+    fs::copy(checkpoint::path(&foreign, place.checkpoints("other")[0]), &newest).expect("writable");
+    copy(&run, &place.path().join("case"));
+    let stderr = text(&succeeds(place.resume("case")).stderr);
+    let reason = "is of a run with other settings: train.seed was 7 and is 0";
+    assert!(stderr.contains(reason), "{stderr}");
+    assert_whole(&place, "case", reason);
+
+    // Nothing but those: the run is not begun again without a word.
+    fs::copy(&newest, &before).expect("writable");
+    let stderr = fails(place.resume("half"), 1);
+    assert!(stderr.contains("error: half: no checkpoint to go on from; `train --overwrite` starts again"), "{stderr}");
+    assert_eq!(stderr.matches(reason).count(), 2, "{stderr}");
+    assert_eq!(place.checkpoints("half").len(), 2, "they are left alone");
+}
+
+#[test]
+fn another_scene_is_refused_and_a_moved_one_is_not() {
+    let place = Place::new(&settings());
+    half(&place, "run");
+    let photograph = place.path().join("scene/images/train_002.png");
+    let aside = place.path().join("aside.png");
+    let before = place.checkpoints("run");
+    fs::rename(&photograph, &aside).expect("writable");
+    let stderr = fails(place.resume("run"), 1);
+    assert!(stderr.contains("is of another scene: the train view train_002 is not there"), "{stderr}");
+    image::RgbImage::new(48, 36).save(&photograph).expect("writable");
+    let stderr = fails(place.resume("run"), 1);
+    assert!(stderr.contains("is of another scene: the train view train_002 is another"), "{stderr}");
+    fs::write(&photograph, "no picture").expect("writable");
+    fails(place.resume("run"), 1);
+    assert_eq!(place.checkpoints("run"), before);
+    fs::rename(&aside, &photograph).expect("writable");
+    fs::rename(place.path().join("scene"), place.path().join("moved")).expect("writable");
+    let stderr = fails(place.resume("run"), 1);
+    assert!(stderr.contains("there is no such folder"), "{stderr}");
+    succeeds(place.program(&["train", "moved", "--resume", "run"]));
+    assert_whole(&place, "run", "a moved scene");
+}
+
+#[test]
+fn without_room_for_a_checkpoint_the_last_one_stays() {
+    let place = Place::new(&settings());
+    half(&place, "run");
+    let before = place.checkpoints("run");
+    let bytes = |step: u32| fs::read(checkpoint::path(&place.path().join("run"), step)).expect("a checkpoint");
+    let kept = before.iter().map(|step| bytes(*step)).collect::<Vec<_>>();
+    // Files of at most 64 blocks: the log fits, a checkpoint does not. The system then fails the write like a full disk
+    // does, unless its signal is left to kill the program.
+    let mut limited = Command::new("sh");
+    limited.args(["-c", "trap '' XFSZ; ulimit -f 64; exec \"$0\" train --resume run"]).arg(cargo_bin!("gscream-vk"));
+    limited.current_dir(place.path()).env("XDG_CACHE_HOME", env!("CARGO_TARGET_TMPDIR"));
+    let stderr = fails(limited, 1);
+    assert!(stderr.contains("the checkpoint cannot be written: File too large"), "{stderr}");
+    assert!(stderr.contains(&format!("`gscream-vk train --resume run` goes on behind step {}", before[0])), "{stderr}");
+    assert_eq!(place.checkpoints("run"), before);
+    assert!(before.iter().map(|step| bytes(*step)).eq(kept), "the checkpoints are as they were");
+    succeeds(place.resume("run"));
+    assert_whole(&place, "run", "room was made");
+}
+
+#[test]
+fn folders_that_cannot_be_written_are_one_clear_error() {
+    let place = Place::new(&settings());
+    fs::write(place.path().join("file"), "").expect("writable");
+    let stderr = fails(place.train("file/run", &[]), 1);
+    assert!(stderr.contains("error: file/run: cannot be made"), "{stderr}");
+    // A file where the checkpoints would go.
+    fs::create_dir(place.path().join("run")).expect("writable");
+    fs::write(place.path().join("run/checkpoints"), "").expect("writable");
+    let stderr = fails(place.train("run", &[]), 1);
+    assert!(stderr.contains("step-00000003.safetensors: the checkpoint cannot be written"), "{stderr}");
+    assert!(stderr.contains("there is no checkpoint to go on from"), "{stderr}");
+    fs::remove_file(place.path().join("run/checkpoints")).expect("writable");
+    let output = succeeds(place.resume("run"));
+    assert!(text(&output.stderr).contains("resuming: no checkpoint yet, the run starts again"));
+    assert_whole(&place, "run", "the folder was made writable");
+
+    // The pictures' folder, which is written last: everything before it is kept.
+    fs::create_dir(place.path().join("late")).expect("writable");
+    fs::write(place.path().join("late/test"), "").expect("writable");
+    let stderr = fails(place.train("late", &[]), 1);
+    assert!(stderr.contains("the picture cannot be written"), "{stderr}");
+    assert_eq!(place.checkpoints("late")[0], 36);
+    fs::remove_file(place.path().join("late/test")).expect("writable");
+    let output = succeeds(place.resume("late"));
+    assert!(text(&output.stderr).contains("resuming: behind step 36"));
+    assert_whole(&place, "late", "only the last evaluation was missing");
+}
