@@ -16,7 +16,6 @@ layout(push_constant, scalar) uniform Push {
   uint n;                  // elements from there
   float rate;              // learning rate
   float epsilon;           // added to the root of the corrected second moment
-  float beta1;             // decay of the first moment
   float complement1;       // 1 - beta1
   float root_decay;        // 1 - sqrt(beta2)
   float root_complement;   // sqrt(1 - beta2)
@@ -31,7 +30,9 @@ void main() {
   for (uint k = 0u; k < VECTORS; k++, i += gl_WorkGroupSize.x) {
     if (4u * i >= end) return;
     vec4 g = gradient[i], old_value = value[i], old_first = first[i], old_root = root[i];
-    vec4 m = push.beta1 * old_first + push.complement1 * g;
+    // beta1 m + (1 - beta1) g by one constant: rounded apart, the two would not sum to one, and the moment of a steady
+    // gradient would be off by 2^-25 / (1 - beta1) of itself.
+    vec4 m = old_first - push.complement1 * old_first + push.complement1 * g;
     vec4 a = old_root - push.root_decay * old_root; // sqrt(beta2) r: the small constant carries more digits of beta2
     vec4 b = push.root_complement * abs(g);
     vec4 large = max(a, b), ratio = min(a, b) / max(large, vec4(1e-37)); // both 0: 0; below 1e-37 epsilon decides alone
