@@ -23,7 +23,7 @@ layout(push_constant, scalar) uniform Push {
 void main() {
   // Without a valid pixel every term is zero.
   float inverse = sums[0] > 0.0 ? 1.0 / sums[0] : 0.0;
-  vec2 mean = vec2(sums[1], sums[2]) * inverse;
+  precise vec2 mean = vec2(sums[1], sums[2]) * inverse; // as in `align_fit`
   float unit = alignable_unit(sums[0], sums[1]);
   vec4 moments = vec4(0.0);
   for (uint i = 0u; i < RUN; ++i) {

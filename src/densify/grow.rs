@@ -904,13 +904,13 @@ mod tests {
         let (all, unlimited) = grow(0);
         assert!(unlimited.added > 200 && unlimited.refused == 0);
         let (some, limited) = grow(600);
-        assert_eq!(limited, Grown { added: 100, refused: unlimited.added - 100 });
+        assert_eq!(limited, Grown { added: 100, refused: unlimited.added - 100, beyond: 0 });
         assert_eq!(some.position.len(), 600);
         assert!(bits(&some).len() == 100 && bits(&some).is_subset(&bits(&all)));
         // A fair choice, not the first ones in the order of the cells: among the first 100 about 100 of 100 / all.
         let first: HashSet<[u32; 3]> = all.position[500..600].iter().map(|p| p.map(f32::to_bits)).collect();
         assert!(bits(&some).intersection(&first).count() < 80);
         assert_eq!(grow(600).0, some, "twice the same");
-        assert_eq!(grow(400).1, Grown { added: 0, refused: unlimited.added });
+        assert_eq!(grow(400).1, Grown { added: 0, refused: unlimited.added, beyond: 0 });
     }
 }

@@ -58,20 +58,24 @@ pub struct Fit {
     pub scale: f64,
     /// Shift q.
     pub shift: f64,
-    /// Mean of x over valid pixels.
+    /// Mean of x over valid pixels, but for `mean_rest`.
     pub mean: f64,
-    /// The aligned value at the mean: `scale * mean + shift`.
-    pub centre: f64,
+    /// Aligned value less prior at the two means.
+    pub level: f64,
     /// Slope w, signed.
     pub slope: f64,
     /// One over the sum of squared distances from the mean, in [`unit`]s; 0 when the fit is singular.
     pub inverse_spread: f64,
-    /// Mean prior over valid pixels.
+    /// Mean prior over valid pixels, but for `prior_rest`; 0 when the fit is singular.
     pub mean_prior: f64,
     /// One over the number of valid pixels; 0 without any.
     pub inverse_count: f64,
     /// [`unit`]s per x.
     pub unit: f64,
+    /// What `mean` lacks: its rounding.
+    pub mean_rest: f64,
+    /// What `mean_prior` lacks.
+    pub prior_rest: f64,
 }
 
 impl Fit {
@@ -79,10 +83,11 @@ impl Fit {
     /// mean: eight float32 roundings) has no scale, no shift and no gradient. The test is of a ratio: scaling the scene or
     /// the prior does not change what is singular.
     ///
-    /// The computed spread S is right to `c u` with u = 2^-24 and c about 30 additions, since distances from the mean are
-    /// formed before they are squared (Chan, Golub and LeVeque 1983) and the mean's own error is taken out. So w is right
-    /// to `c u (1 + 1 / r)` with r the correlation of x and prior: nothing depends on how far from zero x lies, but
-    /// what the rounding of x itself, u times mean / deviation, has done to it.
+    /// Distances from the means are formed before they are squared and multiplied (Chan, Golub and LeVeque 1983), and the
+    /// means' own rounding is taken out of the moments. With u = 2^-24, c = 50 roundings on a term's way through the
+    /// sums, k = mean / deviation of x and r the correlation of x and prior, S is right to `c u (1 + (c u k)^2)` of itself
+    /// (what the means lack is at most c u of them) and w to `1 + 1 / r` times that. Differences and gradients use
+    /// distances from the same rounded means and are right to a few u of their own terms: plain moments would lose k^2 u.
     pub fn of(sums: Sums) -> Self {
         let n = sums[0];
         if n.is_nan() || n <= 0.0 {
@@ -90,18 +95,20 @@ impl Fit {
         }
         let unit = unit(n, sums[1]);
         let (correction, correction_prior) = (sums[3] / n, sums[4] / n);
-        let (mean, mean_prior) = (sums[1] / n + correction / unit, sums[2] / n + correction_prior);
+        let (mean, mean_prior) = (sums[1] / n, sums[2] / n);
+        let (mean_rest, prior_rest) = (correction / unit, correction_prior);
         let spread = sums[5] - sums[3] * correction;
         let rounding = mean * unit * 2.0_f64.powi(-21);
-        let means = Self { mean, mean_prior, inverse_count: 1.0 / n, unit, ..Self::default() };
+        let means = Self { mean, inverse_count: 1.0 / n, unit, mean_rest, prior_rest, ..Self::default() };
         if spread > n * rounding * rounding {
             let slope = (sums[6] - sums[3] * correction_prior) / spread * unit;
             Self {
                 scale: slope.abs(),
-                shift: mean_prior - slope * mean,
-                centre: mean_prior + (slope.abs() - slope) * mean,
+                shift: mean_prior - slope * mean + (prior_rest - slope * mean_rest),
+                level: prior_rest - slope * mean_rest + (slope.abs() - slope) * mean,
                 slope,
                 inverse_spread: 1.0 / spread,
+                mean_prior,
                 ..means
             }
         } else {
@@ -110,20 +117,46 @@ impl Fit {
     }
 
     /// In the order in which the kernels keep it.
-    pub fn to_array(self) -> [f64; 9] {
-        let Self { scale, shift, mean, centre, slope, inverse_spread, mean_prior, inverse_count, unit } = self;
-        [scale, shift, mean, centre, slope, inverse_spread, mean_prior, inverse_count, unit]
+    pub fn to_array(self) -> [f64; 11] {
+        let Self { scale, shift, mean, level, slope, inverse_spread, mean_prior, inverse_count, .. } = self;
+        let Self { unit, mean_rest, prior_rest, .. } = self;
+        [
+            scale,
+            shift,
+            mean,
+            level,
+            slope,
+            inverse_spread,
+            mean_prior,
+            inverse_count,
+            unit,
+            mean_rest,
+            prior_rest,
+        ]
     }
 
     /// Inverse of [`Fit::to_array`].
-    pub fn from_array(values: [f64; 9]) -> Self {
-        let [scale, shift, mean, centre, slope, inverse_spread, mean_prior, inverse_count, unit] = values;
-        Self { scale, shift, mean, centre, slope, inverse_spread, mean_prior, inverse_count, unit }
+    pub fn from_array(values: [f64; 11]) -> Self {
+        let [scale, shift, mean, level, slope, inverse_spread, mean_prior, inverse_count, unit, mean_rest, prior_rest] =
+            values;
+        Self {
+            scale,
+            shift,
+            mean,
+            level,
+            slope,
+            inverse_spread,
+            mean_prior,
+            inverse_count,
+            unit,
+            mean_rest,
+            prior_rest,
+        }
     }
 
     /// Aligned value less prior.
     pub fn difference(&self, x: f64, prior: f64) -> f64 {
-        self.scale * (x - self.mean) - (prior - self.centre)
+        self.scale * (x - self.mean) - (prior - self.mean_prior) + self.level
     }
 
     /// `dL/dx` of a pixel from `grad_aligned` = dL/d(aligned) there, with the sums of grad_aligned and of
@@ -132,8 +165,9 @@ impl Fit {
     pub fn gradient(&self, grad_aligned: f64, sums: [f64; 2], x: f64, prior: f64, valid: f64) -> f64 {
         let sign = if self.slope == 0.0 { 0.0 } else { self.slope.signum() };
         let grad_slope = sign * sums[1] + (sign - 1.0) * self.mean * self.unit * sums[0];
+        let (dx, dp) = (x - self.mean - self.mean_rest, prior - self.mean_prior - self.prior_rest);
         let by_slope =
-            grad_slope * self.inverse_spread * self.unit * (prior - self.mean_prior - 2.0 * self.slope * (x - self.mean));
+            grad_slope * self.inverse_spread * self.unit * (dp - 2.0 * self.slope * dx);
         self.scale * grad_aligned + valid * (by_slope - self.slope * sums[0] * self.inverse_count)
     }
 }

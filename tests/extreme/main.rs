@@ -3,6 +3,11 @@
 //! Each case states its guarantee in words; `run` fails where it does not hold. The table of all of them is a golden file
 //! (`tests/snapshots/extreme__guarantees.snap`), so that a weaker guarantee is a line of a diff.
 
+mod densify;
+mod losses;
+mod optimizer;
+mod primitives;
+
 use gscream_vk::gpu::{Gpu, testing};
 use libtest_mimic::{Arguments, Trial};
 
@@ -20,7 +25,7 @@ pub struct Case {
 
 /// Every case.
 fn cases() -> Vec<&'static Case> {
-    let stages: [&[Case]; 0] = [];
+    let stages = [losses::CASES, optimizer::CASES, densify::CASES, primitives::CASES];
     stages.into_iter().flatten().collect()
 }
 
