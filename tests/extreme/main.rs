@@ -3,9 +3,14 @@
 //! Each case states its guarantee in words; `run` fails where it does not hold. The table of all of them is a golden file
 //! (`tests/snapshots/extreme__guarantees.snap`), so that a weaker guarantee is a line of a diff.
 
+mod attention;
+#[allow(dead_code)]
+#[path = "../common/mod.rs"]
+mod common;
 mod densify;
 mod losses;
 mod optimizer;
+mod poison;
 mod primitives;
 
 use gscream_vk::gpu::{Gpu, testing};
@@ -25,7 +30,8 @@ pub struct Case {
 
 /// Every case.
 fn cases() -> Vec<&'static Case> {
-    let stages = [losses::CASES, optimizer::CASES, densify::CASES, primitives::CASES];
+    let stages =
+        [losses::CASES, attention::CASES, optimizer::CASES, densify::CASES, primitives::CASES, poison::CASES];
     stages.into_iter().flatten().collect()
 }
 
