@@ -37,6 +37,9 @@ void main() {
     vec4 b = push.root_complement * abs(g);
     vec4 large = max(a, b), ratio = min(a, b) / max(large, vec4(1e-37)); // both 0: 0; below 1e-37 epsilon decides alone
     vec4 r = large * sqrt(1.0 + ratio * ratio);
+    // Largest and smallest pass over what is not a number: a lost moment or gradient must not look whole again.
+    vec4 sum = a + b;
+    r = mix(r, sum, equal(floatBitsToUint(sum) & 0x7f800000u, uvec4(0x7f800000u)));
     vec4 v = old_value - push.rate * ((push.correction * m) / (push.root_correction * r + push.epsilon));
     if (4u * i < push.offset || 4u * i + 4u > end) { // the ends of a range that starts or stops within a vector
       uvec4 element = 4u * i + uvec4(0, 1, 2, 3);

@@ -14,8 +14,8 @@ const U: f64 = 1.0 / (1 << 24) as f64;
 pub const CASES: &[Case] = &[
     Case {
         stage: "attention",
-        case: "logits of +-1e4, hundreds apart",
-        guarantee: "shares are exactly 0 and 1: attended features to 1e-5 of float64's; no gradient in the similarity but rounding",
+        case: "logits of 19,600, 0 and -9,800",
+        guarantee: "shares are exactly 0 and 1: attended features to 1e-5 of float64's; gradient of the similarity 0 to rounding",
         run: saturated,
     },
     Case {
@@ -27,13 +27,13 @@ pub const CASES: &[Case] = &[
     Case {
         stage: "attention",
         case: "one token against 2,000, and 2,000 against one",
-        guarantee: "float64's features and gradients to 2e-5; the one's share is exactly 1",
+        guarantee: "float64's features and gradients to 2e-5 + 2 n u (running sums over n tokens); the one's share is exactly 1",
         run: one_against_many,
     },
     Case {
         stage: "attention",
         case: "identical tokens, 300 against 200, and features of 0",
-        guarantee: "every share 1 / n: features of float64 to 2e-5, the gradient of the similarity 0 to rounding",
+        guarantee: "every share 1 / n: float64's features and gradients to 2e-5 + 2 n u, the gradient of the similarity 0 to rounding",
         run: identical,
     },
     Case {
@@ -44,7 +44,7 @@ pub const CASES: &[Case] = &[
     },
     Case {
         stage: "attention",
-        case: "a feature or a weight that is not a number, infinite or 3e38",
+        case: "a feature that is not a number, infinite or 3e38, a weight that is not a number or infinite",
         guarantee: "a poisoned token reaches the other side's tokens and weights, never its own side's; nothing outside the tokens is written",
         run: not_a_number,
     },
@@ -168,10 +168,10 @@ fn largest_logit(inputs: &Inputs) -> f64 {
         .fold(0.0, f64::max)
 }
 
-/// Both sides' queries and keys are the features themselves, 8 times over, times 40: logits are 200 times the scalar
-/// products of one-hot features of size 7, so 0 or about +-1e4.
+/// Queries and keys of a head are the features twice over, times 28.28: logits are 200 times the features' products.
+/// Every token is like one of the other side (19,600), half opposite to two (-9,800), and like nobody else (0).
 fn saturated(gpu: &Gpu) {
-    let mut inputs = Inputs::new([24, 32], 1);
+    let mut inputs = Inputs::new([32, 32], 1);
     for side in 0..2 {
         let matrix = &mut inputs.weights[SIDES[side].to_qk..][..INNER * FEATURE];
         for (row, weights) in matrix.chunks_mut(FEATURE).enumerate() {
@@ -180,20 +180,16 @@ fn saturated(gpu: &Gpu) {
         }
         for (token, feature) in inputs.features[side].chunks_mut(FEATURE).enumerate() {
             feature.fill(0.0);
-            feature[token % FEATURE] = 7.0;
+            feature[token] = 7.0;
+            feature[(token + 1) % FEATURE] = -7.0;
         }
     }
-    // Some tokens have nobody like them but an opposite: -1e4 there, 0 everywhere else.
-    for token in 0..4 {
-        inputs.features[0][token * FEATURE + token] = -7.0;
-    }
-    assert!(largest_logit(&inputs) > 9e3, "{}", largest_logit(&inputs));
-    // Around tokens 24 and above find nobody like them either: shares of 1 / 24, which float32 sums like any other.
+    assert!((1.9e4..2e4).contains(&largest_logit(&inputs)), "{}", largest_logit(&inputs));
     let (got, want) = inputs.compare(gpu, "saturated", 1e-5);
     // The similarity's gradient is nothing where shares are 0 and 1.
     let to_qk = |g: &[f64]| g[..2 * INNER * FEATURE].iter().fold(0.0f64, |m, g| m.max(g.abs()));
     let (got, want) = (to_qk(&double(&got.grad_weights)), to_qk(&want.grad_weights));
-    println!("largest gradient of the similarity {got:e}, {want:e}");
+    assert!(want == 0.0 && got < 1e-4, "gradient of the similarity {got:e}, {want:e}");
 }
 
 /// A logit is a sum of 64 products of projections, each a sum of 32 products: 16 + 3 and 8 + 3 roundings on a term's way,
@@ -268,7 +264,7 @@ fn enormous(gpu: &Gpu) {
 fn one_against_many(gpu: &Gpu) {
     for n in [[1, 2000], [2000, 1], [1, 1]] {
         let inputs = Inputs::new(n, 3);
-        let (got, _) = inputs.compare(gpu, &format!("{n:?}"), 2e-5);
+        let (got, _) = inputs.compare(gpu, &format!("{n:?}"), 2e-5 + 2.0 * 2000.0 * U);
         // The many attend to the one alone: all of them get the same.
         let many = if n[0] > 1 { 0 } else { 1 };
         let rows: Vec<&[f32]> = got.updated[many][..n[many] * FEATURE].chunks(FEATURE).collect();
@@ -282,7 +278,7 @@ fn identical(gpu: &Gpu) {
         let first = features[..FEATURE].to_vec();
         features.chunks_mut(FEATURE).for_each(|f| f.copy_from_slice(&first));
     }
-    let (got, want) = inputs.compare(gpu, "identical", 2e-5);
+    let (got, want) = inputs.compare(gpu, "identical", 2e-5 + 2.0 * 300.0 * U);
     let of = |g: &[f64], at: std::ops::Range<usize>| g[at].iter().fold(0.0f64, |m, g| m.max(g.abs()));
     let (qk, rest) = (0..2 * INNER * FEATURE, 2 * INNER * FEATURE..WEIGHTS);
     assert!(of(&want.grad_weights, qk.clone()) < 1e-9 * of(&want.grad_weights, rest.clone()));
@@ -324,16 +320,19 @@ fn not_a_number(gpu: &Gpu) {
             for updated in got.updated.iter().zip(n).map(|(updated, n)| &updated[n * FEATURE..]) {
                 assert!(updated.iter().all(|v| v.to_bits() == UNWRITTEN.to_bits()), "written beyond the tokens");
             }
+            if poison == 3e38 {
+                continue; // a number: it may well have no share in anything
+            }
             // Not hidden: what attends to it says so.
             assert!(got.updated[1 - side][..n[1 - side] * FEATURE].iter().any(|v| !v.is_finite()), "{poison}: hidden");
             assert!(got.grad_weights.iter().any(|v| !v.is_finite()), "{poison}: hidden from the weights");
         }
-        for (name, _, at) in exact::TENSORS {
+        for (name, _, at) in exact::TENSORS.into_iter().filter(|_| poison != 3e38) {
             let mut inputs = Inputs::new(n, 8);
             inputs.weights[at + 7] = poison;
             let got = inputs.run(gpu, 33, counts);
             let used = || got.updated.iter().zip(n).flat_map(|(updated, n)| &updated[..n * FEATURE]);
-            assert!(used().any(|v| !v.is_finite() || v.abs() > 1e30), "{name} = {poison} is hidden");
+            assert!(used().any(|v| !v.is_finite()), "{name} = {poison} is hidden");
         }
     }
 }
