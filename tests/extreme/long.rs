@@ -20,7 +20,7 @@ pub const CASES: &[Case] = &[Case {
 
 fn small() -> Scene {
     let folder = tempfile::tempdir().expect("a temporary folder");
-    let options = synthetic::Options { seed: 2, width: 16, height: 12, train_views: 4, test_views: 1, points: 40 };
+    let options = synthetic::Options { seed: 2, width: 16, height: 16, train_views: 4, test_views: 1, points: 40 };
     let path: PathBuf = folder.path().join("scene");
     synthetic::write(&path, &options).expect("a writable folder");
     let mut scene = scene::load(&path, &scene::Config::default()).expect("a scene that was just written");
@@ -32,12 +32,14 @@ fn settings() -> Settings {
     let mut settings = common::settings(STEPS);
     settings.train.log_interval = 1000;
     settings.train.save_interval = 0;
-    settings.model.voxel_factor = 1.5;
+    settings.model.voxel_factor = 2.5;
     settings.model.offsets = 4;
     let densify = &mut settings.densify;
     (densify.statistics_from, densify.from, densify.until, densify.every) = (500, 1000, 10_000, 500);
+    densify.max_anchors = 48;
     (densify.min_slot_visits, densify.min_anchor_visits) = (40, 80);
-    settings.model.attention.start = 5000;
+    settings.model.attention.start = 19_800;
+
     settings
 }
 
@@ -48,6 +50,9 @@ struct Watch {
 
 impl Observer for Watch {
     fn step(&mut self, progress: &Progress) {
+        if progress.step % 2000 == 0 {
+            println!("{progress:?}");
+        }
         self.steps.push(progress.clone());
     }
     fn say(&mut self, line: &str) {

@@ -8,6 +8,7 @@ mod attention;
 #[path = "../common/mod.rs"]
 mod common;
 mod densify;
+mod inputs;
 mod long;
 mod losses;
 mod optimizer;
@@ -32,7 +33,7 @@ pub struct Case {
 /// Every case.
 fn cases() -> Vec<&'static Case> {
     let stages =
-        [losses::CASES, attention::CASES, optimizer::CASES, densify::CASES, primitives::CASES, poison::CASES, long::CASES];
+        [losses::CASES, attention::CASES, optimizer::CASES, densify::CASES, primitives::CASES, inputs::CASES, poison::CASES, long::CASES];
     stages.into_iter().flatten().collect()
 }
 
