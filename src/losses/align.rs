@@ -371,7 +371,8 @@ mod tests {
                     testing::assert_twin(align_moments::Kernel, &gpu, case, push, threads);
                 }
                 for slope in [0.1_f32, -0.1, 0.0] {
-                    let fit = vec![slope.abs(), 0.3, 2.9, 0.5, slope, 1.0 / n as f32, 0.6, 1.0 / n as f32, 0.25, 1e-3, -2e-3];
+                    let fit =
+                        vec![slope.abs(), 0.3, 2.9, 0.5, slope, 1.0 / n as f32, 0.6, 1.0 / n as f32, 0.25, 1e-3, -2e-3];
                     let case = align_backward::Arrays {
                         grad_aligned: grad_aligned.clone(),
                         rendered: rendered.clone(),

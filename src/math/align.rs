@@ -120,19 +120,7 @@ impl Fit {
     pub fn to_array(self) -> [f64; 11] {
         let Self { scale, shift, mean, level, slope, inverse_spread, mean_prior, inverse_count, .. } = self;
         let Self { unit, mean_rest, prior_rest, .. } = self;
-        [
-            scale,
-            shift,
-            mean,
-            level,
-            slope,
-            inverse_spread,
-            mean_prior,
-            inverse_count,
-            unit,
-            mean_rest,
-            prior_rest,
-        ]
+        [scale, shift, mean, level, slope, inverse_spread, mean_prior, inverse_count, unit, mean_rest, prior_rest]
     }
 
     /// Inverse of [`Fit::to_array`].
@@ -166,8 +154,7 @@ impl Fit {
         let sign = if self.slope == 0.0 { 0.0 } else { self.slope.signum() };
         let grad_slope = sign * sums[1] + (sign - 1.0) * self.mean * self.unit * sums[0];
         let (dx, dp) = (x - self.mean - self.mean_rest, prior - self.mean_prior - self.prior_rest);
-        let by_slope =
-            grad_slope * self.inverse_spread * self.unit * (dp - 2.0 * self.slope * dx);
+        let by_slope = grad_slope * self.inverse_spread * self.unit * (dp - 2.0 * self.slope * dx);
         self.scale * grad_aligned + valid * (by_slope - self.slope * sums[0] * self.inverse_count)
     }
 }

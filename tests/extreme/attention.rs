@@ -111,11 +111,7 @@ impl Inputs {
         let grads = attention.backward(&mut rec, &tokens, pair("features"), &weights, pair("upstream"), &grad_weights);
         rec.submit().and_then(|s| s.wait()).expect("the device runs it");
         let read = |pair: Pair<'_>| [pair.inside, pair.around].map(|b| gpu.read(b).expect("read"));
-        Got {
-            updated: read(updated),
-            grad_features: read(grads),
-            grad_weights: gpu.read(&grad_weights).expect("read"),
-        }
+        Got { updated: read(updated), grad_features: read(grads), grad_weights: gpu.read(&grad_weights).expect("read") }
     }
 
     fn exact(&self) -> Want {
@@ -214,9 +210,8 @@ fn enormous(gpu: &Gpu) {
             for i in 0..n[side] {
                 let mut moved = vec![0.0; INNER];
                 for h in 0..HEADS {
-                    let logits: Vec<f64> = (0..n[1 - side])
-                        .map(|j| dot(exact::head(q, i, h), exact::head(k, j, h)) / 8.0)
-                        .collect();
+                    let logits: Vec<f64> =
+                        (0..n[1 - side]).map(|j| dot(exact::head(q, i, h), exact::head(k, j, h)) / 8.0).collect();
                     let magnitude = (0..n[1 - side])
                         .map(|j| dot(exact::head(qa, i, h), exact::head(ka, j, h)) / 8.0)
                         .fold(0.0, f64::max);
@@ -239,7 +234,8 @@ fn enormous(gpu: &Gpu) {
             }
         }
         // Values of one all over: what is attended is then the sum of the shares.
-        let mut ones = Inputs { weights: inputs.weights.clone(), features: inputs.features.clone(), ..Inputs::new(n, 7) };
+        let mut ones =
+            Inputs { weights: inputs.weights.clone(), features: inputs.features.clone(), ..Inputs::new(n, 7) };
         for side in 0..2 {
             let Inputs { weights, features, .. } = &mut ones;
             weights[SIDES[side].to_v..][..INNER * FEATURE].fill(0.0);

@@ -383,7 +383,11 @@ impl Maps {
         let of_x = if self.quantity == Quantity::Depth { 0.0 } else { 3.0 * U * condition };
         let relative = (SUM * U * (1.0 + (SUM * U * condition).powi(2)) + of_x) * (1.0 + 1.0 / correlation.abs());
         let w = f64::from(got.fit[4]);
-        assert!((w - fit.slope).abs() <= relative * fit.slope.abs(), "{name}: w {w:e}, {:e} +- {relative:e}", fit.slope);
+        assert!(
+            (w - fit.slope).abs() <= relative * fit.slope.abs(),
+            "{name}: w {w:e}, {:e} +- {relative:e}",
+            fit.slope
+        );
         assert_eq!(got.fit[0], got.fit[4].abs(), "{name}");
         // A loss is a mean of differences, each right to a few roundings of what cancels in it.
         let scale = fit.scale * fit.mean.abs() / condition * (1.0 + 1.0 / correlation.abs()) + fit.level.abs();
@@ -431,14 +435,8 @@ fn depth_masks(gpu: &Gpu) {
         let n = maps.pixels();
         Maps { valid: vec![0.0; n], ..maps.clone() }.singular(gpu, "no valid pixel");
         Maps { valid: (0..n).map(|i| f32::from(i == 900)).collect(), ..maps.clone() }.singular(gpu, "one valid pixel");
-        let one = Maps {
-            size: [1, 1],
-            rendered: vec![2.0],
-            prior: vec![0.4],
-            valid: vec![1.0],
-            weight: vec![1.0],
-            quantity,
-        };
+        let one =
+            Maps { size: [1, 1], rendered: vec![2.0], prior: vec![0.4], valid: vec![1.0], weight: vec![1.0], quantity };
         one.singular(gpu, "1 x 1");
         maps.compare(gpu, "all valid");
     }

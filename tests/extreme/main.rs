@@ -32,8 +32,16 @@ pub struct Case {
 
 /// Every case.
 fn cases() -> Vec<&'static Case> {
-    let stages =
-        [losses::CASES, attention::CASES, optimizer::CASES, densify::CASES, primitives::CASES, inputs::CASES, poison::CASES, long::CASES];
+    let stages = [
+        losses::CASES,
+        attention::CASES,
+        optimizer::CASES,
+        densify::CASES,
+        primitives::CASES,
+        inputs::CASES,
+        poison::CASES,
+        long::CASES,
+    ];
     stages.into_iter().flatten().collect()
 }
 

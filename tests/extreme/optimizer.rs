@@ -73,9 +73,7 @@ impl Device {
 
     fn read(&self, gpu: &Gpu) -> Vec<State> {
         let [value, _, first, root] = [0, 1, 2, 3].map(|i| gpu.read(&self.tensors[i]).expect("read"));
-        (0..self.n)
-            .map(|i| State { value: value[i].into(), first: first[i].into(), root: root[i].into() })
-            .collect()
+        (0..self.n).map(|i| State { value: value[i].into(), first: first[i].into(), root: root[i].into() }).collect()
     }
 }
 
@@ -155,7 +153,10 @@ fn slow_decays(gpu: &Gpu) {
             }
         }
         for (got, want) in device.read(gpu).iter().zip(&exact) {
-            assert!((got.value - want.value).abs() <= 1e-5 * want.value.abs() + 200.0 * U, "{beta1}: {got:?}, {want:?}");
+            assert!(
+                (got.value - want.value).abs() <= 1e-5 * want.value.abs() + 200.0 * U,
+                "{beta1}: {got:?}, {want:?}"
+            );
             // 200 roundings of what is stored, none of the decay itself.
             assert!((got.first - want.first).abs() <= 200.0 * U * want.first, "{beta1}: {got:?}, {want:?}");
         }
@@ -200,8 +201,7 @@ fn no_drift(gpu: &Gpu) {
                     .collect()
             })
             .collect();
-        let uploaded: Vec<Buffer<f32>> =
-            rows.iter().map(|row| gpu.upload("gradients", row).expect("upload")).collect();
+        let uploaded: Vec<Buffer<f32>> = rows.iter().map(|row| gpu.upload("gradients", row).expect("upload")).collect();
         let mut rec = gpu.recorder().expect("recorder");
         for (k, row) in uploaded.iter().enumerate() {
             let t = batch * BATCH + k as u32 + 1;
@@ -220,7 +220,8 @@ fn no_drift(gpu: &Gpu) {
                 let kept = config.beta2 * (old.root / exact[i].root.max(1e-300)).powi(2);
                 bound[i] = bound[i] * kept + 11.0 * U;
                 // The first moment's, of magnitudes.
-                total[i] = config.beta1 * total[i] + 4.0 * U * (config.beta1 * remembered[i] + (1.0 - config.beta1) * g);
+                total[i] =
+                    config.beta1 * total[i] + 4.0 * U * (config.beta1 * remembered[i] + (1.0 - config.beta1) * g);
             }
         }
         for (i, got) in device.read(gpu).iter().enumerate() {
@@ -254,7 +255,10 @@ fn ends_of_the_schedule(_: &Gpu) {
                 for step in [1, steps / 2, steps.saturating_sub(1)] {
                     let between = rate.at(step, steps);
                     let slack = 1.0 + 1e-12;
-                    assert!(between >= initial.min(last) / slack && between <= initial.max(last) * slack, "{between:e}");
+                    assert!(
+                        between >= initial.min(last) / slack && between <= initial.max(last) * slack,
+                        "{between:e}"
+                    );
                     assert!((between as f32).is_finite());
                 }
             }
