@@ -30,8 +30,8 @@ void main() {
   for (uint k = 0u; k < VECTORS; k++, i += gl_WorkGroupSize.x) {
     if (4u * i >= end) return;
     vec4 g = gradient[i], old_value = value[i], old_first = first[i], old_root = root[i];
-    // beta1 m + (1 - beta1) g by one constant: rounded apart, the two would not sum to one, and the moment of a steady
-    // gradient would be off by 2^-25 / (1 - beta1) of itself.
+    // beta1 m + (1 - beta1) g by one constant: rounded apart, the two do not sum to one, and the moment of a steady gradient
+    // strays by up to 2^-25 / (1 - beta1) of itself. So it stays within a unit in the last place.
     vec4 m = old_first - push.complement1 * old_first + push.complement1 * g;
     vec4 a = old_root - push.root_decay * old_root; // sqrt(beta2) r: the small constant carries more digits of beta2
     vec4 b = push.root_complement * abs(g);

@@ -168,8 +168,8 @@ fn largest_logit(inputs: &Inputs) -> f64 {
 /// Every token is like one of the other side (19,600), half opposite to two (-9,800), and like nobody else (0).
 fn saturated(gpu: &Gpu) {
     let mut inputs = Inputs::new([32, 32], 1);
-    for side in 0..2 {
-        let matrix = &mut inputs.weights[SIDES[side].to_qk..][..INNER * FEATURE];
+    for (side, offsets) in SIDES.iter().enumerate() {
+        let matrix = &mut inputs.weights[offsets.to_qk..][..INNER * FEATURE];
         for (row, weights) in matrix.chunks_mut(FEATURE).enumerate() {
             weights.fill(0.0);
             weights[row % FEATURE] = 28.284_271;
@@ -248,8 +248,8 @@ fn enormous(gpu: &Gpu) {
             out[..INNER].fill(1.0 / INNER as f32);
         }
         let got = ones.run(gpu, 200, n.map(|n| n as u32));
-        for side in 0..2 {
-            for token in got.updated[side][..n[side] * FEATURE].chunks(FEATURE) {
+        for (updated, n) in got.updated.iter().zip(n) {
+            for token in updated[..n * FEATURE].chunks(FEATURE) {
                 assert!((token[0] - 1.0).abs() < 1e-5, "shares sum to {}", token[0]);
             }
         }

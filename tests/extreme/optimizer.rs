@@ -27,8 +27,8 @@ pub const CASES: &[Case] = &[
     },
     Case {
         stage: "optimizer: adam",
-        case: "decays of 0, 0.99999 and 1 - 1e-9",
-        guarantee: "moments of a steady gradient g go to g: the decays' digits are kept as 1 - beta; update within 1e-5 of float64's",
+        case: "decays of 0, 0.9 and up to 1 - 1e-9, 3,000 steps of a steady gradient",
+        guarantee: "the first moment stays within 4 u of the gradient: the decay is one constant, 1 - beta; first update within 2e-6 of float64's",
         run: slow_decays,
     },
     Case {
@@ -139,28 +139,37 @@ fn many_steps(gpu: &Gpu) {
     }
 }
 
+/// At its fixed point a moment loses (1 - beta) of itself, gets as much again, and is rounded twice: what the first rounding
+/// did, the second undoes but for a tie, which goes to even and then stays. One unit in the last place, 2 u.
 fn slow_decays(gpu: &Gpu) {
-    for (beta1, beta2) in [(0.0, 0.0), (0.99999, 0.999999), (1.0 - 1e-9, 1.0 - 1e-9)] {
-        let config = Config { beta1, beta2, ..Config::default() };
-        // From the moments that a gradient of 0.3 ends with, and from rest.
-        let steady = State { value: 0.0, first: 0.3, root: 0.3 };
-        let mut exact = [steady, State::default()];
-        let device = Device::new(gpu, &exact);
-        for t in 1..=200 {
-            device.step(gpu, &config, &[0.3; 2], t, 1e-3);
-            for state in &mut exact {
-                *state = step(*state, 0.3f32.into(), &factors(&config, t, 1e-3));
+    let mut rng = Pcg64Mcg::seed_from_u64(9);
+    let gradient: Vec<f32> = (0..256).map(|_| rng.random_range(0.01..1.0)).collect();
+    for beta in [0.0, 0.9, 0.999, 0.9999, 0.99999, 1.0 - 1e-9] {
+        let config = Config { beta1: beta, beta2: beta, ..Config::default() };
+        let steady: Vec<State> =
+            gradient.iter().map(|&g| State { value: 0.0, first: g.into(), root: g.into() }).collect();
+        let device = Device::new(gpu, &steady);
+        let [value, grad, first, root] = &device.tensors;
+        gpu.write(grad, &gradient).expect("write");
+        let tensors = Tensors { value, gradient: grad, first, root };
+        for batch in 0..30 {
+            let mut rec = gpu.recorder().expect("recorder");
+            for t in 1..=100 {
+                adam::record(&mut rec, &config, tensors, &device.overflow, (0, 256), (100 * batch + t, 1e-3));
             }
+            rec.submit().and_then(|s| s.wait()).expect("the device runs it");
         }
-        for (got, want) in device.read(gpu).iter().zip(&exact) {
-            assert!(
-                (got.value - want.value).abs() <= 1e-5 * want.value.abs() + 200.0 * U,
-                "{beta1}: {got:?}, {want:?}"
-            );
-            // 200 roundings of what is stored, none of the decay itself.
-            assert!((got.first - want.first).abs() <= 200.0 * U * want.first, "{beta1}: {got:?}, {want:?}");
+        for (got, &g) in device.read(gpu).iter().zip(&gradient) {
+            let g = f64::from(g);
+            assert!((got.first - g).abs() <= 4.0 * U * g, "{beta}: {got:?}, {g}");
         }
-        assert!((exact[0].first - 0.3).abs() < 1e-7);
+        // The first step from rest.
+        let device = Device::new(gpu, &vec![State::default(); 256]);
+        device.step(gpu, &config, &gradient, 1, 1e-3);
+        for (got, &g) in device.read(gpu).iter().zip(&gradient) {
+            let want = step(State::default(), g.into(), &factors(&config, 1, 1e-3));
+            assert!((got.value - want.value).abs() <= 2e-6 * want.value.abs(), "{beta}: {got:?}, {want:?}");
+        }
     }
 }
 
