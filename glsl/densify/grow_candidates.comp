@@ -13,7 +13,7 @@ layout(binding = 2, scalar) readonly buffer Position { vec3 position[]; };      
 layout(binding = 3, scalar) readonly buffer Offset { vec3 offset[]; };            // [anchor, offset]
 layout(binding = 4, scalar) readonly buffer LogScaling { float log_scaling[]; };  // [anchor, 6]
 layout(binding = 5, scalar) writeonly buffer Flags { uint flags[]; };             // [anchor, offset] 1: a candidate
-layout(binding = 6, scalar) buffer Bounds { int bounds[]; };                      // [6] lowest cell x, y, z; highest
+layout(binding = 6, scalar) buffer Bounds { int bounds[]; };                      // [7] lowest cell x, y, z; highest; Gaussians beyond the grid
 layout(push_constant, scalar) uniform Push {
   uint slots;         // anchors times offsets
   uint offsets;       // Gaussians per anchor
@@ -47,6 +47,8 @@ void main() {
             atomicMax(bounds[3u + i], high[i]);
           }
         }
+      } else {
+        atomicAdd(bounds[6], 1);
       }
     }
   }

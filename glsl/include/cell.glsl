@@ -1,7 +1,9 @@
 // Cells of a cubic grid around the origin: cell c holds what is nearest to c times its side.
 
-// Cells up to here either way; further out (and where a coordinate is not a number) there are none.
-const float CELL_LIMIT = 536870912.0; // 2^29
+// Cells up to here either way; further out (and where a coordinate is not a number) there are none. An anchor in the
+// centre of cell c must be found in c again, or every round would put one more there: its position is c times the side,
+// both rounded, and is multiplied by the rounded inverse and rounded, four times 2^-24 of c, which must stay below 1/2.
+const float CELL_LIMIT = 2e6;
 
 // One product and one rounding to the nearest, ties to even: the same on every device.
 vec3 cell_coordinates(vec3 p, float inverse_size) {

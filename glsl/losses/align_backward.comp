@@ -10,8 +10,8 @@ const uint RUN = 8u;
 layout(local_size_x = 64) in;
 layout(binding = 0, scalar) readonly buffer GradAligned { float grad_aligned[]; }; // [pixel] of all depth losses
 layout(binding = 1, scalar) readonly buffer Rendered { float rendered[]; };        // [pixel] rendered depth
-layout(binding = 2, scalar) readonly buffer Fit { float fit[]; };                  // [8] of `align_fit`
-layout(binding = 3, scalar) writeonly buffer Partial { float partial[]; };         // [2 * group] sums of: grad_aligned, grad_aligned * dx
+layout(binding = 2, scalar) readonly buffer Fit { float fit[]; };                  // [11] of `align_fit`
+layout(binding = 3, scalar) writeonly buffer Partial { float partial[]; };         // [2 * group] sums of: grad_aligned, grad_aligned * dx with dx in units
 layout(push_constant, scalar) uniform Push {
   uint pixels; // width * height
   float near;  // of disparities; 0: the prior is a depth
@@ -22,7 +22,7 @@ void main() {
     uint pixel = (group_index() * RUN + i) * 64u + gl_LocalInvocationID.x;
     if (pixel >= push.pixels) break;
     float g = grad_aligned[pixel];
-    sums.xy += vec2(g, g * (alignable(rendered[pixel], push.near) - fit[2]));
+    sums.xy += vec2(g, g * ((alignable(rendered[pixel], push.near) - fit[2] - fit[9]) * fit[8]));
   }
   vec4 total = group_sum(sums);
   uint groups = (push.pixels + 64u * RUN - 1u) / (64u * RUN);

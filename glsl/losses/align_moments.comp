@@ -12,7 +12,7 @@ layout(local_size_x = 64) in;
 layout(binding = 0, scalar) readonly buffer Rendered { float rendered[]; }; // [pixel] rendered depth
 layout(binding = 1, scalar) readonly buffer Prior { float prior[]; };       // [pixel] prior depth or disparity
 layout(binding = 2, scalar) readonly buffer Sums { float sums[]; };         // [3] of `align_means`
-layout(binding = 3, scalar) writeonly buffer Partial { float partial[]; };  // [4 * group] sums of valid times: dx, dp, dx^2, dx dp
+layout(binding = 3, scalar) writeonly buffer Partial { float partial[]; };  // [4 * group] sums of valid times: dx, dp, dx^2, dx dp, with dx in `alignable_unit`s
 #ifdef MASKED
 layout(binding = 4, scalar) readonly buffer Valid { float valid[]; }; // [pixel] 1 where the fit looks
 #endif
@@ -23,12 +23,14 @@ layout(push_constant, scalar) uniform Push {
 void main() {
   // Without a valid pixel every term is zero.
   float inverse = sums[0] > 0.0 ? 1.0 / sums[0] : 0.0;
-  vec2 mean = vec2(sums[1], sums[2]) * inverse;
+  precise vec2 mean = vec2(sums[1], sums[2]) * inverse; // as in `align_fit`
+  float unit = alignable_unit(sums[0], sums[1]);
   vec4 moments = vec4(0.0);
   for (uint i = 0u; i < RUN; ++i) {
     uint pixel = (group_index() * RUN + i) * 64u + gl_LocalInvocationID.x;
     if (pixel >= push.pixels) break;
     vec2 d = vec2(alignable(rendered[pixel], push.near), prior[pixel]) - mean;
+    d.x *= unit;
     vec4 term = vec4(d, d.x * d.x, d.x * d.y);
 #ifdef MASKED
     term *= valid[pixel];

@@ -11,7 +11,7 @@ const uint RUN = 8u;
 layout(local_size_x = 64) in;
 layout(binding = 0, scalar) readonly buffer Rendered { float rendered[]; };      // [pixel] rendered depth
 layout(binding = 1, scalar) readonly buffer Prior { float prior[]; };            // [pixel] prior depth or disparity
-layout(binding = 2, scalar) readonly buffer Fit { float fit[]; };                // [8] of `align_fit`
+layout(binding = 2, scalar) readonly buffer Fit { float fit[]; };                // [11] of `align_fit`
 layout(binding = 3, scalar) writeonly buffer Difference { float difference[]; }; // [pixel] aligned - prior
 layout(binding = 4, scalar) writeonly buffer GradAligned { float grad_aligned[]; }; // [pixel] of the loss by the aligned value
 layout(binding = 5, scalar) writeonly buffer Partial { float partial[]; };       // [group] the loss
@@ -29,7 +29,8 @@ void main() {
     uint pixel = (group_index() * RUN + i) * 64u + gl_LocalInvocationID.x;
     if (pixel >= push.pixels) break;
     float x = alignable(rendered[pixel], push.near);
-    float d = fit[0] * (x - fit[2]) - (prior[pixel] - fit[3]);
+    // Distances from the means first: neither x nor prior loses digits to how far from zero they are.
+    float d = fit[0] * (x - fit[2]) - (prior[pixel] - fit[6]) + fit[3];
     float scale = push.factor;
 #ifdef WEIGHTED
     scale *= weight[pixel];

@@ -16,7 +16,6 @@ layout(push_constant, scalar) uniform Push {
   uint n;                  // elements from there
   float rate;              // learning rate
   float epsilon;           // added to the root of the corrected second moment
-  float beta1;             // decay of the first moment
   float complement1;       // 1 - beta1
   float root_decay;        // 1 - sqrt(beta2)
   float root_complement;   // sqrt(1 - beta2)
@@ -31,11 +30,16 @@ void main() {
   for (uint k = 0u; k < VECTORS; k++, i += gl_WorkGroupSize.x) {
     if (4u * i >= end) return;
     vec4 g = gradient[i], old_value = value[i], old_first = first[i], old_root = root[i];
-    vec4 m = push.beta1 * old_first + push.complement1 * g;
+    // beta1 m + (1 - beta1) g by one constant: rounded apart, the two do not sum to one, and the moment of a steady gradient
+    // strays by up to 2^-25 / (1 - beta1) of itself. So it stays within a unit in the last place.
+    vec4 m = old_first - push.complement1 * old_first + push.complement1 * g;
     vec4 a = old_root - push.root_decay * old_root; // sqrt(beta2) r: the small constant carries more digits of beta2
     vec4 b = push.root_complement * abs(g);
     vec4 large = max(a, b), ratio = min(a, b) / max(large, vec4(1e-37)); // both 0: 0; below 1e-37 epsilon decides alone
     vec4 r = large * sqrt(1.0 + ratio * ratio);
+    // Largest and smallest pass over what is not a number: a lost moment or gradient must not look whole again.
+    vec4 sum = a + b;
+    r = mix(r, sum, equal(floatBitsToUint(sum) & 0x7f800000u, uvec4(0x7f800000u)));
     vec4 v = old_value - push.rate * ((push.correction * m) / (push.root_correction * r + push.epsilon));
     if (4u * i < push.offset || 4u * i + 4u > end) { // the ends of a range that starts or stops within a vector
       uvec4 element = 4u * i + uvec4(0, 1, 2, 3);

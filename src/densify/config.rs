@@ -75,10 +75,10 @@ impl Config {
         )
         .map_err(|invalid| invalid.against("from"))?;
         ensure(
-            self.gradient_threshold.is_finite() && self.gradient_threshold > 0.0,
+            self.gradient_threshold > 0.0 && self.gradient_threshold <= 1e30,
             "gradient_threshold",
             self.gradient_threshold,
-            "must be positive",
+            "must be positive, at most 1e30",
         )?;
         ensure((1..=8).contains(&self.levels), "levels", self.levels, "must be between 1 and 8")?;
         // A cell smaller than the voxel would let two anchors share one.

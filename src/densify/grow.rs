@@ -27,10 +27,13 @@ fn pcg4d(words: [u32; 4]) -> [u32; 4] {
     mix(mix(words).map(|word| word ^ (word >> 16)))
 }
 
-/// A cell of a grid, in float32 as on the device; none beyond 2^29 cells from the origin.
+/// Cells either way, see `cell.glsl`: further out float32 does not tell a cell's centre from its neighbour's.
+pub const CELL_LIMIT: f32 = 2e6;
+
+/// A cell of a grid, in float32 as on the device; none beyond [`CELL_LIMIT`] cells from the origin.
 fn cell(p: [f32; 3], inverse_size: f32) -> Option<[i32; 3]> {
     let q = p.map(|x| (x * inverse_size).round_ties_even());
-    q.iter().all(|x| x.abs() <= 536_870_912.0).then(|| q.map(|x| x as i32))
+    q.iter().all(|x| x.abs() <= CELL_LIMIT).then(|| q.map(|x| x as i32))
 }
 
 /// Where the Gaussian of slot s = anchor * offsets + k lies, in float32 as on the device but for the exponential.
@@ -73,6 +76,7 @@ impl Reference for grow_candidates::Kernel {
             if judged && hash >> (31 - push.level) != 0 {
                 let p = gaussian_position(host.position, host.offset, host.log_scaling, s, push.offsets);
                 found = cell(p, push.inverse_size);
+                host.bounds[6] += i32::from(found.is_none());
             }
             host.flags[s] = found.is_some().into();
             for (i, x) in found.into_iter().flatten().enumerate() {
@@ -189,6 +193,9 @@ pub struct Grown {
     pub added: u32,
     /// Cells that asked for an anchor when there was no room for more (`max_anchors`, or the device's).
     pub refused: u32,
+    /// Gaussians that asked for an anchor more than [`CELL_LIMIT`] cells from the origin (or at no place at all: a
+    /// coordinate is not a number), over all levels.
+    pub beyond: u32,
 }
 
 /// Of one round: where its random numbers come from, and its grid.
@@ -234,6 +241,7 @@ fn fold(seed: u64) -> u32 {
 }
 
 /// The candidates of a level among the Gaussians of the first `judged` anchors, sorted into cells; `None` without any.
+/// Also how many lie beyond the grid.
 fn cells(
     gpu: &Gpu,
     anchors: &Anchors,
@@ -242,7 +250,7 @@ fn cells(
     config: &Config,
     round: Round,
     level: u32,
-) -> Result<Option<Cells>, Error> {
+) -> Result<(Option<Cells>, u32), Error> {
     let (_, inverse_size, _) = sizes(config, round.voxel, level);
     let offsets = anchors.offsets;
     let slots = judged * offsets;
@@ -253,7 +261,7 @@ fn cells(
     let flags = gpu.buffer("candidate_flags", slots as usize)?;
     let listed = gpu.buffer("candidates", slots as usize)?;
     let count = gpu.buffer("candidate_count", 1)?;
-    let bounds = gpu.upload("candidate_bounds", &[i32::MAX, i32::MAX, i32::MAX, i32::MIN, i32::MIN, i32::MIN])?;
+    let bounds = gpu.upload("candidate_bounds", &[i32::MAX, i32::MAX, i32::MAX, i32::MIN, i32::MIN, i32::MIN, 0])?;
     let compact = Compact::new(gpu, slots)?;
     let mut rec = gpu.recorder()?;
     let buffers = grow_candidates::Buffers {
@@ -279,10 +287,11 @@ fn cells(
     compact.record(&mut rec, &flags, &listed, &count, Count::Host(slots));
     rec.submit()?.wait()?;
     let found = gpu.read(&count)?[0];
-    if found == 0 {
-        return Ok(None);
-    }
     let bounds = gpu.read(&bounds)?;
+    let beyond = bounds[6] as u32;
+    if found == 0 {
+        return Ok((None, beyond));
+    }
     let [low, high]: [[i32; 3]; 2] = [0, 3].map(|at| std::array::from_fn(|i| bounds[at + i]));
     let bits: [u32; 3] = std::array::from_fn(|i| ((high[i] - low[i]) as u32).checked_ilog2().map_or(0, |top| top + 1));
 
@@ -355,7 +364,8 @@ fn cells(
     compact.record(&mut rec, &flags, &free, &free_count, Count::Device(&cell_count));
     rec.submit()?.wait()?;
     let free_count = gpu.read(&free_count)?[0];
-    Ok(Some(Cells { found, low, bits, candidates, order, heads, cells, cell_count, free, free_count }))
+    let cells = Cells { found, low, bits, candidates, order, heads, cells, cell_count, free, free_count };
+    Ok((Some(cells), beyond))
 }
 
 /// The free cells in an order drawn by lot: the first of them are a fair choice.
@@ -409,7 +419,9 @@ pub fn run(
         limit => limit.min(Anchors::most(gpu, anchors.offsets)),
     };
     for level in 0..config.levels {
-        let Some(mut cells) = cells(gpu, anchors, statistics, judged, config, round, level)? else { continue };
+        let (cells, beyond) = cells(gpu, anchors, statistics, judged, config, round, level)?;
+        grown.beyond += beyond;
+        let Some(mut cells) = cells else { continue };
         let added = cells.free_count.min(most.saturating_sub(anchors.count));
         grown.refused += cells.free_count - added;
         if added == 0 {
@@ -545,7 +557,7 @@ mod tests {
             offset: model.offset.as_chunks().0.to_vec(),
             log_scaling: model.log_scaling.into_flattened(),
             flags: vec![PATTERN; n * offsets + 3],
-            bounds: vec![i32::MAX, i32::MAX, i32::MAX, i32::MIN, i32::MIN, i32::MIN],
+            bounds: vec![i32::MAX, i32::MAX, i32::MAX, i32::MIN, i32::MIN, i32::MIN, 0],
         }
     }
 
@@ -835,7 +847,7 @@ mod tests {
             assert_eq!(runs[0], runs[1], "twice the same");
             let added = grow_plainly(&mut model, &mut gathered, &config, round);
             println!("{n} anchors x {offsets}: {added} new");
-            assert_eq!(runs[0].2, Grown { added, refused: 0 });
+            assert_eq!(runs[0].2, Grown { added, ..Grown::default() });
             assert_eq!(runs[0].0.position, model.position);
             assert_eq!(runs[0].0, model);
             assert_eq!(runs[0].1, gathered);
@@ -849,11 +861,11 @@ mod tests {
         let mut rng = Pcg64Mcg::seed_from_u64(4);
         let mut integers =
             |n: usize, limit: i32| -> Vec<f32> { (0..n).map(|_| rng.random_range(-limit..limit) as f32).collect() };
-        // Integers that float32 holds exactly, scales of 1: 26 bits for each coordinate.
+        // Integers that float32 holds exactly, scales of 1: 22 bits for each coordinate.
         let model = files::Anchors {
             position: integers(3 * 200, 100).as_chunks().0.to_vec(),
             feature: integers(32 * 200, 100).as_chunks().0.to_vec(),
-            offset: integers(3 * 2000, (1 << 24) - 200),
+            offset: integers(3 * 2000, 2_000_000 - 200),
             offsets_per_anchor: 10,
             log_scaling: vec![[0.0; 6]; 200],
         };
@@ -889,13 +901,13 @@ mod tests {
         let (all, unlimited) = grow(0);
         assert!(unlimited.added > 200 && unlimited.refused == 0);
         let (some, limited) = grow(600);
-        assert_eq!(limited, Grown { added: 100, refused: unlimited.added - 100 });
+        assert_eq!(limited, Grown { added: 100, refused: unlimited.added - 100, beyond: 0 });
         assert_eq!(some.position.len(), 600);
         assert!(bits(&some).len() == 100 && bits(&some).is_subset(&bits(&all)));
         // A fair choice, not the first ones in the order of the cells: among the first 100 about 100 of 100 / all.
         let first: HashSet<[u32; 3]> = all.position[500..600].iter().map(|p| p.map(f32::to_bits)).collect();
         assert!(bits(&some).intersection(&first).count() < 80);
         assert_eq!(grow(600).0, some, "twice the same");
-        assert_eq!(grow(400).1, Grown { added: 0, refused: unlimited.added });
+        assert_eq!(grow(400).1, Grown { added: 0, refused: unlimited.added, beyond: 0 });
     }
 }

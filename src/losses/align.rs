@@ -9,7 +9,7 @@ use crate::gpu::kernels::losses::{
     align_moments_masked,
 };
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
-use crate::math::align::{Fit, alignable, alignable_slope};
+use crate::math::align::{Fit, alignable, alignable_slope, unit};
 
 use super::sum;
 
@@ -109,9 +109,10 @@ fn moments_reference(
     // The means of the device's sums, in float32 as there: the distances' sums are these means' rounding.
     let inverse = if sums[0] > 0.0 { 1.0 / sums[0] } else { 0.0 };
     let mean = [f64::from(sums[1] * inverse), f64::from(sums[2] * inverse)];
+    let unit = unit(sums[0].into(), sums[1].into());
     partial_sums(push.pixels, partial, |i| {
         let v = valid.map_or(1.0, |v| f64::from(v[i]));
-        let dx = alignable(rendered[i].into(), push.near.into()) - mean[0];
+        let dx = (alignable(rendered[i].into(), push.near.into()) - mean[0]) * unit;
         let dp = f64::from(prior[i]) - mean[1];
         [v * dx, v * dp, v * dx * dx, v * dx * dp]
     });
@@ -160,7 +161,7 @@ impl Reference for align_backward::Kernel {
         let fit = read_fit(host.fit);
         partial_sums(push.pixels, host.partial, |i| {
             let g = f64::from(host.grad_aligned[i]);
-            [g, g * (alignable(host.rendered[i].into(), push.near.into()) - fit.mean)]
+            [g, g * (alignable(host.rendered[i].into(), push.near.into()) - fit.mean - fit.mean_rest) * fit.unit]
         });
     }
     fn check(_binding: &'static str) -> Check {
@@ -242,13 +243,13 @@ impl Align {
             partial: gpu.buffer("align_partial", 4 * groups(pixels) as usize)?,
             sums: gpu.buffer("align_sums", 7)?,
             grad_sums: gpu.buffer("grad_align_sums", 2)?,
-            fit: gpu.buffer("fit", 8)?,
+            fit: gpu.buffer("fit", 11)?,
             grad_depth: gpu.buffer("grad_depth", pixels as usize)?,
         })
     }
 
-    /// Records the fit of `rendered` \[pixel\] to the prior and returns it: |w|, q, mean x, the aligned value there, w,
-    /// `1 / sum dx^2`, mean prior, 1 / n. The last four are of use to [`Align::backward`] only.
+    /// Records the fit of `rendered` \[pixel\] to the prior and returns it: |w|, q, mean x, aligned less prior at the means,
+    /// w, `1 / sum dx^2`, mean prior, 1 / n, units per x, what the means lack. All but the first two are of use to [`Align::backward`] only.
     pub fn forward(&self, rec: &mut Recorder<'_>, rendered: &Buffer<f32>, prior: Prior<'_>) -> &Buffer<f32> {
         let Self { pixels, partial, sums, fit, .. } = self;
         let (pixels, near) = (*pixels, prior.quantity.near());
@@ -370,7 +371,8 @@ mod tests {
                     testing::assert_twin(align_moments::Kernel, &gpu, case, push, threads);
                 }
                 for slope in [0.1_f32, -0.1, 0.0] {
-                    let fit = vec![slope.abs(), 0.3, 2.9, 0.5, slope, 1.0 / n as f32, 0.6, 1.0 / n as f32];
+                    let fit =
+                        vec![slope.abs(), 0.3, 2.9, 0.5, slope, 1.0 / n as f32, 0.6, 1.0 / n as f32, 0.25, 1e-3, -2e-3];
                     let case = align_backward::Arrays {
                         grad_aligned: grad_aligned.clone(),
                         rendered: rendered.clone(),
@@ -420,7 +422,7 @@ mod tests {
             vec![100.0, f32::NAN, 50.0, f32::NAN, 0.0, f32::NAN, f32::NAN],
         ];
         for (i, sums) in cases.into_iter().enumerate() {
-            let case = align_fit::Arrays { sums, fit: vec![UNWRITTEN; 8] };
+            let case = align_fit::Arrays { sums, fit: vec![UNWRITTEN; 11] };
             testing::assert_twin(align_fit::Kernel, &gpu, case.clone(), (), 1u32);
             let fit = testing::run_once::<align_fit::Kernel>(&gpu, &case, (), 1u32).fit;
             assert_eq!(fit[0] == 0.0 && fit[1] == 0.0 && fit[5] == 0.0, i > 0, "{i}: {fit:?}");

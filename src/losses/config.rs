@@ -97,7 +97,8 @@ impl Config {
             ("depth.gradient.other_weight", self.depth.gradient.other_weight),
         ];
         for (key, weight) in weights {
-            ensure(weight.is_finite() && weight >= 0.0, key, weight, "must be zero or a positive number")?;
+            // Beyond, a loss leaves float32.
+            ensure((0.0..=1e30).contains(&weight), key, weight, "must be zero or a positive number, at most 1e30")?;
         }
         let scales = self.depth.gradient.scales;
         ensure((1..=8).contains(&scales), "depth.gradient.scales", scales, "must be between 1 and 8")

@@ -245,7 +245,7 @@ mod tests {
             quantity: Quantity,
             gradient_valid: bool,
             checked: bool,
-        ) -> ([f64; 8], [f32; 2], Vec<f32>) {
+        ) -> ([f64; 11], [f32; 2], Vec<f32>) {
             let Self { size, rendered, prior, valid, weight } = self;
             let upload = |name, data: &[f32]| gpu.upload(name, data).expect("upload");
             let (rendered, prior) = (upload("rendered", rendered), upload("prior", prior));

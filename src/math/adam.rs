@@ -17,7 +17,6 @@ pub struct State {
 pub struct Factors {
     pub rate: f64,
     pub epsilon: f64,
-    pub beta1: f64,
     pub complement1: f64,
     pub root_decay: f64,
     pub root_complement: f64,
@@ -27,7 +26,7 @@ pub struct Factors {
 
 /// One step. `hypot` neither under- nor overflows where the square of a gradient would.
 pub fn step(state: State, gradient: f64, f: &Factors) -> State {
-    let first = f.beta1 * state.first + f.complement1 * gradient;
+    let first = state.first - f.complement1 * state.first + f.complement1 * gradient;
     let root = (state.root - f.root_decay * state.root).hypot(f.root_complement * gradient);
     let value = state.value - f.rate * (f.correction * first / (f.root_correction * root + f.epsilon));
     State { value, first, root }

@@ -37,7 +37,6 @@ impl Config {
             n,
             rate: rate as f32,
             epsilon: self.epsilon as f32,
-            beta1: self.beta1 as f32,
             complement1: (1.0 - self.beta1) as f32,
             root_decay: (1.0 - self.beta2.sqrt()) as f32,
             root_complement: (1.0 - self.beta2).sqrt() as f32,
@@ -65,7 +64,6 @@ impl Reference for adam::Kernel {
         let factors = math::adam::Factors {
             rate: push.rate.into(),
             epsilon: push.epsilon.into(),
-            beta1: push.beta1.into(),
             complement1: push.complement1.into(),
             root_decay: push.root_decay.into(),
             root_complement: push.root_complement.into(),
@@ -190,7 +188,6 @@ mod tests {
             let factors = math::adam::Factors {
                 rate: 1.0,
                 epsilon: 1e-15,
-                beta1: b1,
                 complement1: 1.0 - b1,
                 root_decay: 1.0 - b2.sqrt(),
                 root_complement: (1.0 - b2).sqrt(),

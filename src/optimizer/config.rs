@@ -67,7 +67,13 @@ impl Config {
             format_args!("{:?}", self.betas),
             "must be two numbers, at least 0 and below 1",
         )?;
-        ensure(self.epsilon.is_finite() && self.epsilon > 0.0, "epsilon", self.epsilon, "must be positive")?;
+        // In float32 as the device has it: below, epsilon is zero there, and 0 / 0 what a gradient of zero makes.
+        ensure(
+            (1e-37..=1e30).contains(&self.epsilon),
+            "epsilon",
+            self.epsilon,
+            "must be between 1e-37 and 1e30, as float32 holds it",
+        )?;
         let rates = &self.learning_rate;
         let groups = [
             ("learning_rate.offset", rates.offset),
@@ -79,12 +85,13 @@ impl Config {
             ("learning_rate.attention", rates.attention),
         ];
         for (key, rate) in groups {
-            let positive = rate.iter().all(|end| end.is_finite() && *end > 0.0);
+            // An infinite rate times an update of zero is not a number.
+            let positive = rate.iter().all(|end| (1e-37..=1e30).contains(end));
             ensure(
                 positive || rate == [0.0, 0.0],
                 key,
                 format_args!("{rate:?}"),
-                "must be [initial, final], both positive (the decay between them is log-linear) or both 0",
+                "must be [initial, final], both positive (1e-37 to 1e30; the decay between them is log-linear) or both 0",
             )?;
         }
         Ok(())

@@ -67,6 +67,11 @@ const MODELS: [(&str, usize); 12] = [
 /// How many of [`MODELS`] this crate projects with; the rest are refused by name.
 const PROJECTED: usize = 5;
 
+/// Finite in float32 too, in which the device has it.
+fn is_finite(v: f64) -> bool {
+    (v as f32).is_finite()
+}
+
 impl Intrinsics {
     /// From the parameters of one of the first [`PROJECTED`] models.
     fn new(model: usize, p: &[f64], size: [u32; 2]) -> Intrinsics {
@@ -81,7 +86,7 @@ impl Intrinsics {
 
     /// One clause on what makes the camera unusable, if anything does.
     fn fault(&self) -> Option<String> {
-        let finite = self.focal.iter().chain(&self.principal).chain(&self.distortion).all(|v| v.is_finite());
+        let finite = self.focal.iter().chain(&self.principal).chain(&self.distortion).all(|v| is_finite(*v));
         if !finite {
             Some("a parameter is not a finite number".into())
         } else if self.focal.iter().any(|f| *f <= 0.0) {
@@ -295,7 +300,7 @@ fn binary_images(path: &Path) -> Result<Vec<Image>, Error> {
 }
 
 fn pose(name: String, quaternion: [f64; 4], translation: [f64; 3], camera: u32) -> Option<Image> {
-    let finite = translation.iter().all(|v| v.is_finite());
+    let finite = translation.iter().all(|v| is_finite(*v));
     rotation(quaternion).filter(|_| finite).map(|rotation| Image { name, rotation, translation, camera })
 }
 

@@ -327,6 +327,13 @@ impl Step {
                 grown.refused
             ));
         }
+        if grown.beyond > 0 {
+            text.push_str(&format!(
+                "; {} Gaussians lie more than {:.0e} cells from the origin, where none grows: move the scene or raise model.voxel",
+                grown.beyond,
+                densify::grow::CELL_LIMIT
+            ));
+        }
         Ok(text)
     }
 

@@ -3,8 +3,19 @@
 //! Each case states its guarantee in words; `run` fails where it does not hold. The table of all of them is a golden file
 //! (`tests/snapshots/extreme__guarantees.snap`), so that a weaker guarantee is a line of a diff.
 
+mod attention;
+#[allow(dead_code)]
+#[path = "../common/mod.rs"]
+mod common;
 mod decode;
+mod densify;
+mod inputs;
+mod long;
+mod losses;
+mod optimizer;
 mod picture;
+mod poison;
+mod primitives;
 mod project;
 mod screen;
 
@@ -25,7 +36,20 @@ pub struct Case {
 
 /// Every case.
 fn cases() -> Vec<&'static Case> {
-    let stages: [&[Case]; _] = [project::CASES, screen::CASES, decode::CASES, picture::CASES];
+    let stages: [&[Case]; _] = [
+        project::CASES,
+        screen::CASES,
+        decode::CASES,
+        picture::CASES,
+        losses::CASES,
+        attention::CASES,
+        optimizer::CASES,
+        densify::CASES,
+        primitives::CASES,
+        inputs::CASES,
+        poison::CASES,
+        long::CASES,
+    ];
     stages.into_iter().flatten().collect()
 }
 
