@@ -142,6 +142,22 @@ impl Gpu {
         Ok(())
     }
 
+    /// Overwrites a bound buffer from its start with raw words, and waits.
+    pub(super) fn write_words(&self, slot: Slot, words: &[u32]) -> Result<(), Error> {
+        let bytes = 4 * words.len() as u64;
+        assert!(bytes <= slot.bytes, "{}: {bytes} bytes into {}", slot.name, slot.bytes);
+        if words.is_empty() {
+            return Ok(());
+        }
+        let mut staging: Buffer<u32> = self.allocate("staging", words.len(), MemoryLocation::CpuToGpu)?;
+        let mapped = staging.mapped_mut().expect("staging memory is host visible");
+        mapped[..4 * words.len()].copy_from_slice(bytemuck::cast_slice(words));
+        let mut recorder = self.recorder()?;
+        recorder.copy_bytes(staging.slot(), slot, bytes);
+        recorder.submit()?.wait()
+            .map(|_| ())
+    }
+
     /// The contents of a buffer, after all submitted work that writes it was waited for.
     ///
     /// # Errors

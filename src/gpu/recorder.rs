@@ -1,5 +1,7 @@
 //! Recording passes: barriers, labels, timestamps and crash markers come from one function.
 
+use std::collections::BTreeMap;
+
 use ash::vk;
 use gpu_allocator::vulkan::Allocation;
 
@@ -109,6 +111,14 @@ pub struct Recorder<'g> {
     passes: Vec<&'static str>,
     error: Option<Error>,
     differences: Option<Vec<Difference>>,
+    trace: Option<Trace>,
+}
+
+/// What a traced recording keeps.
+struct Trace {
+    wanted: &'static [&'static str],
+    found: BTreeMap<&'static str, Vec<u32>>,
+    twins: bool,
 }
 
 /// Work given to the device.
@@ -121,6 +131,8 @@ pub struct Submission<'g> {
     pub schedule: Schedule,
     /// GPU against twin, of a checked recording.
     pub differences: Vec<Difference>,
+    /// The wanted buffers of a traced recording by name, as the last pass that wrote them left them.
+    pub trace: BTreeMap<&'static str, Vec<u32>>,
 }
 
 impl Gpu {
@@ -141,6 +153,7 @@ impl Gpu {
             passes: vec![],
             error: None,
             differences: None,
+            trace: None,
         };
         recorder.begin()?;
         Ok(recorder)
@@ -153,6 +166,28 @@ impl Gpu {
     pub fn checked(&self) -> Result<Recorder<'_>, Error> {
         let mut recorder = self.recorder()?;
         recorder.differences = Some(vec![]);
+        Ok(recorder)
+    }
+
+    /// A recording in which every pass runs at once, and which keeps the words of the buffers of these names. Elements
+    /// that no pass writes are zero: a kernel that only writes such a buffer finds it zeroed the first time.
+    ///
+    /// # Errors
+    /// As [`Gpu::recorder`].
+    pub fn traced(&self, wanted: &'static [&'static str]) -> Result<Recorder<'_>, Error> {
+        let mut recorder = self.recorder()?;
+        recorder.trace = Some(Trace { wanted, found: BTreeMap::new(), twins: false });
+        Ok(recorder)
+    }
+
+    /// As [`Gpu::traced`], but the CPU twins run in the kernels' place: the reference path, float64 within a pass and
+    /// float32 in the buffers between passes. Fills and copies remain the device's.
+    ///
+    /// # Errors
+    /// As [`Gpu::recorder`].
+    pub fn reference(&self, wanted: &'static [&'static str]) -> Result<Recorder<'_>, Error> {
+        let mut recorder = self.recorder()?;
+        recorder.trace = Some(Trace { wanted, found: BTreeMap::new(), twins: true });
         Ok(recorder)
     }
 }
@@ -214,21 +249,46 @@ impl<'g> Recorder<'g> {
                 assert!(a.raw != b.raw || !written, "{}: {} is bound twice, once for writing", K::NAME, a.name);
             }
         }
-        let inputs = if self.differences.is_some() {
+        if self.differences.is_none() && self.trace.is_none() {
+            return self.dispatch::<K>(&constants, &slots, &push, threads);
+        }
+        self.flush()?;
+        let wanted = |trace: &Trace, i: usize| K::BINDINGS[i].access.writes() && trace.wanted.contains(&slots[i].name);
+        if let Some(trace) = &self.trace {
+            let fresh = |i: &usize| {
+                let only_written = K::BINDINGS[*i].access == Access::Write;
+                only_written && wanted(trace, *i) && !trace.found.contains_key(slots[*i].name)
+            };
+            let fresh: Vec<usize> = (0..slots.len()).filter(fresh).collect();
+            fresh.into_iter().for_each(|i| self.fill_slot(slots[i], 0));
             self.flush()?;
-            Some(self.download(&slots)?)
-        } else {
-            None
-        };
-        self.dispatch::<K>(&constants, &slots, &push, threads)?;
-        if let Some(mut words) = inputs {
-            self.flush()?;
-            let got = self.download(&slots)?;
+        }
+        let twins = self.trace.as_ref().is_some_and(|trace| trace.twins);
+        let mut words = if twins || self.differences.is_some() { self.download(&slots)? } else { vec![] };
+        if twins {
             K::reference(K::host(&mut words), push, constants);
-            for ((binding, got), want) in K::BINDINGS.iter().zip(&got).zip(&words) {
+            for ((slot, words), binding) in slots.iter().zip(&words).zip(K::BINDINGS) {
                 if binding.access.writes() {
-                    let difference = Difference::of_words(K::NAME, binding, got, want, K::check(binding.name));
-                    self.differences.as_mut().expect("checked mode").push(difference);
+                    self.gpu.write_words(*slot, words)?;
+                }
+            }
+        } else {
+            self.dispatch::<K>(&constants, &slots, &push, threads)?;
+            self.flush()?;
+        }
+        if let Some(differences) = &mut self.differences {
+            K::reference(K::host(&mut words), push, constants);
+            for ((binding, slot), want) in K::BINDINGS.iter().zip(&slots).zip(&words) {
+                if binding.access.writes() {
+                    let got = self.gpu.read_words(*slot, slot.bytes)?;
+                    differences.push(Difference::of_words(K::NAME, binding, &got, want, K::check(binding.name)));
+                }
+            }
+        }
+        if let Some(trace) = &mut self.trace {
+            for i in 0..slots.len() {
+                if wanted(trace, i) {
+                    trace.found.insert(slots[i].name, self.gpu.read_words(slots[i], slots[i].bytes)?);
                 }
             }
         }
@@ -302,7 +362,10 @@ impl<'g> Recorder<'g> {
 
     /// Sets every word of a buffer.
     pub fn fill<T: bytemuck::Pod>(&mut self, buffer: &Buffer<T>, word: u32) {
-        let slot = buffer.slot();
+        self.fill_slot(buffer.slot(), word);
+    }
+
+    fn fill_slot(&mut self, slot: Slot, word: u32) {
         let inner = self.gpu.inner().clone();
         self.pass("fill", &[(slot.id(), slot.name, Access::Write)], |commands| {
             // SAFETY: a live buffer with transfer usage.
@@ -450,6 +513,7 @@ impl<'g> Recorder<'g> {
             passes: std::mem::take(&mut self.passes),
             schedule: std::mem::take(&mut self.schedule),
             differences: self.differences.take().unwrap_or_default(),
+            trace: self.trace.take().map(|trace| trace.found).unwrap_or_default(),
         };
         submission.start()?;
         Ok(submission)
@@ -469,6 +533,7 @@ impl<'g> Recorder<'g> {
             passes,
             schedule: Schedule::default(),
             differences: vec![],
+            trace: BTreeMap::new(),
         };
         submission.start()?;
         submission.wait()?;

@@ -133,6 +133,14 @@ pub trait Observer {
     fn say(&mut self, _line: &str) {}
     /// A test view as rendered after the last step.
     fn rendered(&mut self, _view: &str, _picture: &Rendered) {}
+    /// Steps to evaluate at besides those of the settings.
+    fn samples(&self) -> Vec<u32> {
+        vec![]
+    }
+    /// A test view (by its index) as rendered in any evaluation; the clock stands still.
+    fn compared(&mut self, _view: usize, _picture: &Rendered) {}
+    /// An evaluation behind `progress` has ended; its seconds are those of training alone.
+    fn evaluated(&mut self, _progress: &Progress, _report: &Report) {}
 }
 
 /// Watches nothing.
@@ -280,7 +288,9 @@ impl<'a> Run<'a> {
         let mut recent: VecDeque<(u32, u32)> = VecDeque::new();
         let every =
             |interval: u32| move |step: u32| step == iterations || (interval > 0 && step.is_multiple_of(interval));
-        let (evaluates, saves) = (every(self.settings.train.eval_interval), every(self.settings.train.save_interval));
+        let (at_interval, saves) = (every(self.settings.train.eval_interval), every(self.settings.train.save_interval));
+        let samples = watch.samples();
+        let evaluates = |step: u32| at_interval(step) || samples.contains(&step);
         while done < iterations {
             // What follows a change of the anchors, an evaluation or a save waits until it is made.
             let pause_behind = |step: u32| self.step.changes_anchors(step) || evaluates(step) || saves(step);
@@ -343,14 +353,19 @@ impl<'a> Run<'a> {
                 self.save(folder)?;
             }
             if evaluates(done) {
-                let last = done == iterations;
+                let (last, mut index) = (done == iterations, 0);
                 report = self
                     .evaluate(|view, picture| {
+                        watch.compared(index, picture);
+                        index += 1;
                         if last {
                             watch.rendered(view, picture)
                         }
                     })?
                     .or(report);
+                if let Some(report) = &report {
+                    watch.evaluated(&progress, report);
+                }
                 if let Some(mean) = report.as_ref().and_then(|r| r.mean.as_ref()) {
                     let mean = &mean.metrics;
                     let masked = mean.mask.as_ref().map_or(String::new(), |m| format!(", masked {:.2} dB", m.psnr));
