@@ -18,5 +18,6 @@ pub mod model;
 pub mod optimizer;
 pub mod primitives;
 pub mod render;
+pub mod report;
 pub mod scene;
 pub mod train;

@@ -154,8 +154,7 @@ impl Gpu {
         mapped[..4 * words.len()].copy_from_slice(bytemuck::cast_slice(words));
         let mut recorder = self.recorder()?;
         recorder.copy_bytes(staging.slot(), slot, bytes);
-        recorder.submit()?.wait()
-            .map(|_| ())
+        recorder.submit()?.wait().map(|_| ())
     }
 
     /// The contents of a buffer, after all submitted work that writes it was waited for.

@@ -1,0 +1,330 @@
+//! The report as one page: no scripts, nothing from elsewhere, good on a screen and on paper.
+
+use maud::{DOCTYPE, Markup, PreEscaped, html};
+
+use super::figures;
+use super::kernels::{Distance, Kernels, VariantFigures};
+use super::statistics::Spread;
+use super::training::Training;
+use super::{Omitted, Report};
+
+/// The drawn figures.
+#[derive(Debug, Default)]
+pub struct Drawings {
+    /// Picture and gradients.
+    pub whole: String,
+    /// By stage.
+    pub stages: String,
+    /// Training.
+    pub training: String,
+}
+
+const STYLE: &str = "
+:root { color-scheme: light; }
+* { box-sizing: border-box; }
+body { margin: 0 auto; padding: 2rem 1.5rem 4rem; max-width: 64rem; color: #222; background: #fff;
+  font: 16px/1.5 system-ui, sans-serif; }
+h1 { font-size: 1.9rem; line-height: 1.2; margin: 0 0 .3rem; }
+h2 { font-size: 1.35rem; margin: 2.6rem 0 .6rem; padding-top: .6rem; border-top: 1px solid #ccc; }
+h3 { font-size: 1.05rem; margin: 1.8rem 0 .4rem; }
+p, li { max-width: 46rem; }
+.lead { color: #555; margin-top: 0; }
+figure { margin: 1.2rem 0; }
+figure svg { display: block; width: 100%; height: auto; }
+figcaption { color: #555; font-size: .88rem; max-width: 46rem; margin-top: .3rem; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; margin: .6rem 0; }
+th, td { padding: .22rem .7rem .22rem 0; text-align: left; vertical-align: top; border-bottom: 1px solid #e6e6e6; }
+thead th { border-bottom: 1px solid #888; font-weight: 600; }
+th { font-weight: 500; }
+.n { text-align: right; white-space: nowrap; }
+.r { color: #777; white-space: nowrap; }
+code, pre { font-family: ui-monospace, monospace; font-size: .82rem; }
+pre { background: #f7f7f7; padding: .8rem 1rem; overflow-x: auto; white-space: pre-wrap; overflow-wrap: anywhere; }
+.settings { columns: 2; column-gap: 2rem; }
+tr.out td, tr.out th { color: #777; }
+.mark { color: #a33c00; }
+@page { size: A4; margin: 14mm; }
+@media print {
+  body { padding: 0; max-width: none; font-size: 10pt; }
+  h2 { break-after: avoid; } h3 { break-after: avoid; }
+  figure, tr { break-inside: avoid; } table { font-size: 8pt; } pre { font-size: 7.5pt; background: none; padding: 0; }
+  .wide { overflow: visible; }
+}
+";
+
+/// A number with its exact value behind what is shown.
+fn value(value: f64, shown: String) -> Markup {
+    if !value.is_finite() {
+        return html! { "not finite" };
+    }
+    html! { data value=(value) { (shown) } }
+}
+
+/// Three significant digits, but no more than a table needs.
+fn short(value: f64) -> String {
+    if value == 0.0 {
+        return "0".to_owned();
+    }
+    let digits = (2.0 - value.abs().log10().floor()).clamp(0.0, 6.0) as usize;
+    format!("{value:.digits$}")
+}
+
+/// A small number as people write it.
+fn scientific(value: f64) -> Markup {
+    if value == 0.0 {
+        return html! { "0" };
+    }
+    let text = format!("{value:.1e}");
+    let (mantissa, exponent) = text.split_once('e').unwrap_or((&text, "0"));
+    html! { (mantissa) "·10" sup { (exponent.replace('-', "−")) } }
+}
+
+fn error(distance: Option<&Distance>) -> Markup {
+    match distance {
+        Some(d) if d.relative.is_finite() => html! { data value=(d.relative) { (scientific(d.relative)) } },
+        Some(_) => html! { "not finite" },
+        None => html! { "–" },
+    }
+}
+
+fn time(spread: &Spread) -> Markup {
+    html! {
+        (value(spread.median, short(spread.median)))
+        " " span.r { "[" (short(spread.lower)) ", " (short(spread.upper)) "]" }
+    }
+}
+
+fn figure(svg: &str, caption: &Markup) -> Markup {
+    html! { figure { (PreEscaped(svg)) figcaption { (caption) } } }
+}
+
+fn by(dominated: Option<&String>) -> Markup {
+    html! { @if let Some(by) = dominated { span.mark { "superfluous" } ": " (by) } }
+}
+
+fn changes(changes: &[String]) -> Markup {
+    html! { @for change in changes { code { (change) } br; } }
+}
+
+fn left_out(omitted: &[Omitted]) -> Markup {
+    html! {
+        @if !omitted.is_empty() {
+            p { "Not measured: " @for (i, o) in omitted.iter().enumerate() { @if i > 0 { "; " } (o.variant) " (" (o.why) ")" } "." }
+        }
+    }
+}
+
+/// The page.
+pub fn page(report: &Report, drawings: &Drawings) -> String {
+    let Report { scene, device, .. } = report;
+    let title = format!("Error against run time: {} on {}", scene.name, device.name);
+    html! {
+        (DOCTYPE)
+        html lang="en" {
+            head {
+                meta charset="utf-8";
+                meta name="viewport" content="width=device-width, initial-scale=1";
+                title { (title) }
+                style { (PreEscaped(STYLE)) }
+            }
+            body {
+                h1 { "Error against run time" }
+                p.lead { (scene.name) " on " (device.name) }
+                (facts(report))
+                @if let Some(kernels) = &report.kernels { (of_kernels(kernels, drawings)) }
+                @if let Some(training) = &report.training { (of_training(training, drawings)) }
+                h2 { "Settings" }
+                p { "Every setting of the first choice, \"as set\"; the others change what is listed beside their names." }
+                pre.settings { (report.settings.to_toml().trim()) }
+            }
+        }
+    }
+    .into_string()
+}
+
+fn facts(report: &Report) -> Markup {
+    let Report { scene, device, .. } = report;
+    let [width, height] = scene.size;
+    html! {
+        table {
+            tbody {
+                tr { th { "Device" } td { (device.name) " (" (device.kind) "), Vulkan " (device.api) ", subgroups of " (device.subgroup_size) } }
+                tr { th { "Driver" } td { (device.driver) } }
+                tr { th { "Scene" } td {
+                    (scene.train_views) " training views of " (width) " × " (height) " pixels, " (scene.masks) " masks, "
+                    (scene.priors) " depth priors, " @if scene.reference { "one" } @else { "no" } " inpainted view; "
+                    (scene.test_views) " held-out views; " (scene.points) " points"
+                } }
+                tr { th { "Program" } td { "gscream-vk " (report.version) } }
+                tr { th { "Command" } td { code { (report.command) } } }
+                tr { th { "Numbers" } td { "report.json, and as tables kernels.csv, tensors.csv, training.csv" } }
+            }
+        }
+    }
+}
+
+fn of_kernels(kernels: &Kernels, drawings: &Drawings) -> Markup {
+    let Kernels { warm_up, step, views, repetitions, anchors, variants, omitted } = kernels;
+    let base = &variants[0];
+    html! {
+        h2 { "One training step" }
+        p {
+            "Every choice starts from the same model of " (anchors) " anchors, trained for " (warm_up) " steps, and runs step "
+            (step) " on " (views.len()) " views (" (views.join(", ")) "). Times are medians of " (repetitions)
+            " rounds, in which all choices take turns, after one that is not counted; they come from the device's timestamp \
+             queries. Errors are distances from the float64 reference path "
+            em { "under the settings of the first choice" }
+            ": the Euclidean norm of the difference, divided by that of the reference, of all views together. A choice \
+             that computes something else on purpose shows that as its error."
+        }
+        (figure(&drawings.whole, &html! {
+            "Left: error of the picture (rgb) against the time from the step's first pass to the finished picture. Right: \
+             the largest error of any of the model's gradients against the time of the whole step. A choice is hollow \
+             where another is in nothing worse and in something better: picture, gradients and time of the step \
+             together, errors within 10 % and times whose quartiles overlap counting as equal."
+        }))
+        div.wide { table {
+            thead { tr {
+                th { "choice" } th { "sets" } th.n { "picture, ms" } th.n { "step, ms" } th.n { "of the first" }
+                th.n { "picture error" } th.n { "gradient error" } th { "worst in" } th {}
+            } }
+            tbody { @for v in variants { (row(v, base)) } }
+        } }
+        (left_out(omitted))
+        h3 { "By stage" }
+        (figure(&drawings.stages, &html! {
+            "Error of what a stage leaves behind, the errors of the stages before it included, against the milliseconds \
+             in its passes. A panel shows the first choice and those that differ from it there."
+        }))
+        div.wide { table {
+            thead { tr {
+                th { "stage, as set" } th.n { "ms" } th.n { "share" } th.n { "error so far" } th { "worst in" }
+                th.n { "its own error" } th { "worst in" }
+            } }
+            tbody {
+                @let total: f64 = base.stages.iter().map(|s| s.milliseconds.median).sum();
+                @for s in &base.stages { tr {
+                    th { (s.stage.name()) }
+                    td.n { (time(&s.milliseconds)) }
+                    td.n { (format!("{:.1} %", 100.0 * s.milliseconds.median / total)) }
+                    td.n { (error(s.error.as_ref())) }
+                    td { @if let Some(e) = &s.error { (e.tensor) } }
+                    td.n { @match &s.kernel_error {
+                        Some(own) if own.relative.is_finite() => data value=(own.relative) { (scientific(own.relative)) },
+                        Some(_) => "not finite",
+                        None => "–",
+                    } }
+                    td { @if let Some(own) = &s.kernel_error { @if own.relative > 0.0 {
+                        (own.pass.rsplit('/').next().unwrap_or(&own.pass)) ": " (own.tensor)
+                    } } }
+                } }
+            }
+        } }
+        p { "\"Error so far\" is that of the stage's output on the way from the model; of sorting, whose output is an order, \
+             that of the picture. \"Its own error\" is that of its kernels on the inputs they were given." }
+        @if variants.len() > 1 {
+            h3 { "Where the choices differ" }
+            div.wide { table {
+                thead { tr { th { "stage" } th { "choice" } th.n { "ms" } th.n { "error so far" } th { "worst in" } th {} } }
+                tbody {
+                    @for s in &base.stages {
+                        @let differing = variants.iter().skip(1).filter_map(|v| {
+                            let own = v.stages.iter().find(|own| own.stage == s.stage)?;
+                            figures::differs(own, s).then_some((v, own))
+                        });
+                        @for (v, own) in differing { tr.out[own.dominated_by.is_some()] {
+                            th { (s.stage.name()) } td { (v.name) } td.n { (time(&own.milliseconds)) }
+                            td.n { (error(own.error.as_ref())) }
+                            td { @if let Some(e) = &own.error { (e.tensor) } }
+                            td { (by(own.dominated_by.as_ref())) }
+                        } }
+                    }
+                }
+            } }
+        }
+    }
+}
+
+fn row(v: &VariantFigures, base: &VariantFigures) -> Markup {
+    let ratio = v.step_milliseconds.median / base.step_milliseconds.median;
+    html! {
+        tr.out[v.dominated_by.is_some()] {
+            th { (v.name) }
+            td { (changes(&v.changes)) }
+            td.n { (time(&v.picture_milliseconds)) }
+            td.n { (time(&v.step_milliseconds)) }
+            td.n { (format!("{:.0} %", 100.0 * ratio)) }
+            td.n { (error(Some(&v.picture_error))) }
+            td.n { (error(Some(&v.gradient_error))) }
+            td { (v.gradient_error.tensor) }
+            td { (by(v.dominated_by.as_ref())) }
+        }
+    }
+}
+
+fn of_training(training: &Training, drawings: &Drawings) -> Markup {
+    let Training { iterations, test_views, variants, omitted, steps } = training;
+    let seeds = variants.first().map_or(0, |v| v.runs.len());
+    html! {
+        h2 { "Training" }
+        p {
+            "Every choice trains for " (iterations) " steps, " (seeds) @if seeds == 1 { " seed" } @else { " seeds" }
+            " each. Figures are means over " (test_views) " held-out views, the same photographs for all choices, taken at "
+            (steps.len()) " steps while the clock stands still: seconds are those of training alone. The colour loss is \
+             (1 − w) L1 + w (1 − SSIM) of the whole picture with " code { "losses.ssim_weight" } " as w."
+            @if seeds == 1 { " With one seed nothing is known of the spread: small differences mean nothing." }
+        }
+        (figure(&drawings.training, &html! {
+            "Figures on held-out views during training. The grey band joins the points on the Pareto front: nothing measured \
+             here was better in less time."
+        }))
+        div.wide { table {
+            thead { tr {
+                th { "choice" } th { "sets" } th.n { "seconds" } th.n { "steps/s" } th.n { "PSNR, dB" }
+                th.n { "masked PSNR, dB" } th.n { "SSIM" } th.n { "loss" } th.n { "anchors" } th {}
+            } }
+            tbody { @for v in variants { @if let Some(end) = v.points.last() {
+                @let m = &end.mean;
+                tr.out[v.dominated_by.is_some()] {
+                    th { (v.name) }
+                    td { (changes(&v.changes)) }
+                    td.n { (value(m.seconds, format!("{:.1}", m.seconds))) }
+                    td.n { (format!("{:.2}", f64::from(m.step) / m.seconds)) }
+                    td.n { (value(m.psnr, format!("{:.2}", m.psnr))) (range(Some(end.psnr_range), 2)) }
+                    td.n { @if let Some(psnr) = m.masked_psnr { (value(psnr, format!("{psnr:.2}"))) } @else { "–" } (range(end.masked_psnr_range, 2)) }
+                    td.n { (value(m.ssim, format!("{:.4}", m.ssim))) }
+                    td.n { (value(m.loss, format!("{:.4}", m.loss))) (range(Some(end.loss_range), 4)) }
+                    td.n { (m.anchors) }
+                    td { (by(v.dominated_by.as_ref())) }
+                }
+            } } }
+        } }
+        (left_out(omitted))
+    }
+}
+
+/// Extremes over the seeds, where there are several.
+fn range(range: Option<[f64; 2]>, digits: usize) -> Markup {
+    html! {
+        @if let Some([low, high]) = range { @if low < high {
+            " " span.r { "[" (format!("{low:.digits$}")) ", " (format!("{high:.digits$}")) "]" }
+        } }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_as_shown() {
+        assert_eq!(
+            [0.0, 0.01234, 1.2345, 12.345, 123.45, 1234.5].map(short),
+            ["0", "0.0123", "1.23", "12.3", "123", "1234"]
+        );
+        assert_eq!(scientific(1.26e-7).into_string(), "1.3·10<sup>−7</sup>");
+        assert_eq!(scientific(0.0).into_string(), "0");
+        assert_eq!(value(f64::NAN, "?".into()).into_string(), "not finite");
+    }
+}
