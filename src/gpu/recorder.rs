@@ -286,10 +286,9 @@ impl<'g> Recorder<'g> {
             }
         }
         if let Some(trace) = &mut self.trace {
-            for i in 0..slots.len() {
-                if wanted(trace, i) {
-                    trace.found.insert(slots[i].name, self.gpu.read_words(slots[i], slots[i].bytes)?);
-                }
+            let written: Vec<&Slot> = (0..slots.len()).filter(|i| wanted(trace, *i)).map(|i| &slots[i]).collect();
+            for slot in written {
+                trace.found.insert(slot.name, self.gpu.read_words(*slot, slot.bytes)?);
             }
         }
         Ok(())

@@ -1,7 +1,7 @@
 //! What is drawn: the measurements as figures.
 
 use super::kernels::{Distance, Kernels, StageFigures, VariantFigures};
-use super::pareto::SAME_ERROR;
+use super::pareto::{self, SAME_ERROR};
 use super::plots::{Axis, Figure, Mark, Panel, Scale, Series};
 use super::stages::Stage;
 use super::statistics::Spread;
@@ -56,12 +56,12 @@ pub fn whole(kernels: &Kernels) -> Figure {
     }
 }
 
-/// True where a choice changes something in a stage: its error, or its time beyond the quartiles.
+/// True where a choice changes something in a stage: its error, or its time as most rounds agree.
 pub fn differs(stage: &StageFigures, base: &StageFigures) -> bool {
     let error = |s: &StageFigures| s.error.as_ref().map_or(0.0, |e| e.relative);
     let (a, b) = (error(stage), error(base));
-    let (x, y) = (&stage.milliseconds, &base.milliseconds);
-    a > b * SAME_ERROR || b > a * SAME_ERROR || x.upper < y.lower || y.upper < x.lower
+    let time = stage.time_ratio.is_none_or(|ratio| pareto::is_longer(&ratio) || pareto::is_shorter(&ratio));
+    a > b * SAME_ERROR || b > a * SAME_ERROR || time
 }
 
 /// A diagram per stage, with the choices that change something in it.

@@ -5,6 +5,7 @@
 //! them. Errors are those of what the stages leave behind, against the reference path ([`Gpu::reference`]: the twins,
 //! float64 within a pass) *under the settings as they are*: a choice that computes something else shows that as its error.
 
+use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, HashMap};
 use std::rc::Rc;
 
@@ -54,6 +55,8 @@ pub struct StageFigures {
     pub stage: Stage,
     /// Milliseconds per step in its passes.
     pub milliseconds: Spread,
+    /// These in terms of those of the first choice, round by round; absent where that has no such stage.
+    pub time_ratio: Option<Spread>,
     /// What the stage leaves behind against the reference path, whatever came before it included. Of `bin` that of the
     /// picture, which is what another order changes; absent where nothing is compared.
     pub error: Option<Distance>,
@@ -89,6 +92,8 @@ pub struct VariantFigures {
     pub picture_error: Distance,
     /// Milliseconds of the whole step.
     pub step_milliseconds: Spread,
+    /// These in terms of those of the first choice, round by round.
+    pub time_ratio: Spread,
     /// The worst of the model's gradients against those of the reference path.
     pub gradient_error: Distance,
     /// A choice that makes this one superfluous: picture, gradients and time of the step together.
@@ -162,10 +167,10 @@ pub fn measure(
     let mut benches = vec![];
     for variant in &variants {
         let plan = Plan::new(scene, &variant.settings);
-        if !photographs.contains_key(&plan.depth) {
-            photographs.insert(plan.depth, Rc::new(photographs::upload(gpu, &subset, plan.depth)?));
-        }
-        let photographs = photographs[&plan.depth].clone();
+        let photographs = match photographs.entry(plan.depth) {
+            Entry::Occupied(there) => there.get().clone(),
+            Entry::Vacant(free) => free.insert(Rc::new(photographs::upload(gpu, &subset, plan.depth)?)).clone(),
+        };
         benches.push(Bench::new(gpu, scene, variant, plan, photographs, &warm, step)?);
     }
 
@@ -200,6 +205,7 @@ pub fn measure(
         }
     }
 
+    let first = &times[0];
     let mut figures: Vec<VariantFigures> = variants
         .into_iter()
         .zip(times.iter().zip(errors.iter().zip(&own)))
@@ -209,13 +215,14 @@ pub fn measure(
             picture_milliseconds: Spread::of(&times.picture),
             picture_error: errors.worst(|_, name| name == "rgb").unwrap_or(EXACT),
             step_milliseconds: Spread::of(&times.step),
+            time_ratio: pareto::ratio(&times.step, &first.step),
             gradient_error: errors.worst(|_, name| GRADIENTS.contains(&name)).unwrap_or(EXACT),
             dominated_by: None,
-            stages: of_stages(times, errors, own),
+            stages: of_stages(times, first, errors, own),
             tensors: errors.list(),
         })
         .collect();
-    mark_dominated(&mut figures);
+    mark_dominated(&mut figures, &times);
     Ok(Kernels {
         warm_up: options.warm_up,
         step,
@@ -230,45 +237,50 @@ pub fn measure(
 /// No difference at all: what was not even compared is not drawn from.
 const EXACT: Distance = Distance { relative: 0.0, largest: 0.0, tensor: "" };
 
-fn of_stages(times: &Times, errors: &Tensors, own: &BTreeMap<Stage, OwnError>) -> Vec<StageFigures> {
+fn of_stages(times: &Times, first: &Times, errors: &Tensors, own: &BTreeMap<Stage, OwnError>) -> Vec<StageFigures> {
     let figures = |stage: Stage| {
-        let milliseconds = Spread::of(times.stages.get(&stage)?);
+        let own_times = times.stages.get(&stage)?;
+        let time_ratio = first.stages.get(&stage).map(|first| pareto::ratio(own_times, first));
         let error = match stage {
             Stage::Bin => errors.worst(|_, name| name == "rgb"),
             _ => errors.worst(|of, _| of == stage),
         };
-        Some(StageFigures { stage, milliseconds, error, kernel_error: own.get(&stage).cloned(), dominated_by: None })
+        Some(StageFigures {
+            stage,
+            milliseconds: Spread::of(own_times),
+            time_ratio,
+            error,
+            kernel_error: own.get(&stage).cloned(),
+            dominated_by: None,
+        })
     };
     Stage::ALL.into_iter().filter_map(figures).collect()
 }
 
-fn mark_dominated(figures: &mut [VariantFigures]) {
+fn mark_dominated(figures: &mut [VariantFigures], times: &[Times]) {
     let names: Vec<String> = figures.iter().map(|f| f.name.clone()).collect();
-    let whole: Vec<Choice> = figures
-        .iter()
-        .map(|f| Choice {
-            time: f.step_milliseconds,
-            errors: vec![f.picture_error.relative, f.gradient_error.relative],
-        })
-        .collect();
-    for (figure, by) in figures.iter_mut().zip(pareto::dominated(&whole)) {
+    let whole = |(f, times): (&VariantFigures, &Times)| Choice {
+        times: times.step.clone(),
+        errors: vec![f.picture_error.relative, f.gradient_error.relative],
+    };
+    let by = pareto::dominated(&figures.iter().zip(times).map(whole).collect::<Vec<_>>());
+    for (figure, by) in figures.iter_mut().zip(by) {
         figure.dominated_by = by.map(|by| names[by].clone());
     }
     for stage in Stage::ALL {
-        let judged = |s: &StageFigures| s.stage == stage && s.error.is_some();
-        let mut having: Vec<(&String, &mut StageFigures)> = figures
+        let mut judged: Vec<(usize, &mut StageFigures)> = figures
             .iter_mut()
-            .zip(&names)
-            .filter_map(|(f, name)| Some((name, f.stages.iter_mut().find(|s| judged(s))?)))
+            .enumerate()
+            .filter_map(|(i, f)| Some((i, f.stages.iter_mut().find(|s| s.stage == stage && s.error.is_some())?)))
             .collect();
-        let choice = |s: &StageFigures| Choice {
-            time: s.milliseconds,
+        let choice = |(i, s): &(usize, &mut StageFigures)| Choice {
+            times: times[*i].stages[&stage].clone(),
             errors: s.error.iter().map(|error| error.relative).collect(),
         };
-        let choices: Vec<Choice> = having.iter().map(|(_, s)| choice(s)).collect();
-        let names: Vec<String> = having.iter().map(|(name, _)| (*name).clone()).collect();
-        for ((_, figure), by) in having.iter_mut().zip(pareto::dominated(&choices)) {
-            figure.dominated_by = by.map(|by| names[by].clone());
+        let by = pareto::dominated(&judged.iter().map(choice).collect::<Vec<_>>());
+        let of: Vec<usize> = judged.iter().map(|(i, _)| *i).collect();
+        for ((_, figure), by) in judged.iter_mut().zip(by) {
+            figure.dominated_by = by.map(|by| names[of[by]].clone());
         }
     }
 }

@@ -22,7 +22,7 @@ pub struct Drawings {
 const STYLE: &str = "
 :root { color-scheme: light; }
 * { box-sizing: border-box; }
-body { margin: 0 auto; padding: 2rem 1.5rem 4rem; max-width: 64rem; color: #222; background: #fff;
+body { margin: 0 auto; padding: 2rem 1.5rem 4rem; max-width: 76rem; color: #222; background: #fff;
   font: 16px/1.5 system-ui, sans-serif; }
 h1 { font-size: 1.9rem; line-height: 1.2; margin: 0 0 .3rem; }
 h2 { font-size: 1.35rem; margin: 2.6rem 0 .6rem; padding-top: .6rem; border-top: 1px solid #ccc; }
@@ -37,6 +37,8 @@ table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabu
 th, td { padding: .22rem .7rem .22rem 0; text-align: left; vertical-align: top; border-bottom: 1px solid #e6e6e6; }
 thead th { border-bottom: 1px solid #888; font-weight: 600; }
 th { font-weight: 500; }
+tbody th { white-space: nowrap; }
+figure { max-width: 66rem; }
 .n { text-align: right; white-space: nowrap; }
 .r { color: #777; white-space: nowrap; }
 code, pre { font-family: ui-monospace, monospace; font-size: .82rem; }
@@ -74,6 +76,9 @@ fn short(value: f64) -> String {
 fn scientific(value: f64) -> Markup {
     if value == 0.0 {
         return html! { "0" };
+    }
+    if (0.01..1000.0).contains(&value) {
+        return html! { (format!("{value:.2}")) };
     }
     let text = format!("{value:.1e}");
     let (mantissa, exponent) = text.split_once('e').unwrap_or((&text, "0"));
@@ -182,14 +187,15 @@ fn of_kernels(kernels: &Kernels, drawings: &Drawings) -> Markup {
             "Left: error of the picture (rgb) against the time from the step's first pass to the finished picture. Right: \
              the largest error of any of the model's gradients against the time of the whole step. A choice is hollow \
              where another is in nothing worse and in something better: picture, gradients and time of the step \
-             together, errors within 10 % and times whose quartiles overlap counting as equal."
+             together. Errors within 10 % count as equal, and so do times within 2 % or about which less than three quarters \
+             of the rounds agree; times are compared round by round."
         }))
         div.wide { table {
             thead { tr {
-                th { "choice" } th { "sets" } th.n { "picture, ms" } th.n { "step, ms" } th.n { "of the first" }
+                th { "choice" } th { "sets" } th.n { "picture, ms" } th.n { "step, ms" } th.n { "of the first's" }
                 th.n { "picture error" } th.n { "gradient error" } th { "worst in" } th {}
             } }
-            tbody { @for v in variants { (row(v, base)) } }
+            tbody { @for v in variants { (row(v)) } }
         } }
         (left_out(omitted))
         h3 { "By stage" }
@@ -246,8 +252,8 @@ fn of_kernels(kernels: &Kernels, drawings: &Drawings) -> Markup {
     }
 }
 
-fn row(v: &VariantFigures, base: &VariantFigures) -> Markup {
-    let ratio = v.step_milliseconds.median / base.step_milliseconds.median;
+fn row(v: &VariantFigures) -> Markup {
+    let ratio = v.time_ratio.median;
     html! {
         tr.out[v.dominated_by.is_some()] {
             th { (v.name) }
@@ -316,6 +322,11 @@ fn range(range: Option<[f64; 2]>, digits: usize) -> Markup {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::gpu::DeviceInfo;
+    use crate::report::SceneFacts;
+    use crate::report::kernels::{OwnError, StageFigures};
+    use crate::report::stages::Stage;
+    use crate::report::training::{Point, Sample, SeedRun, VariantRuns};
 
     #[test]
     fn numbers_as_shown() {
@@ -326,5 +337,143 @@ mod tests {
         assert_eq!(scientific(1.26e-7).into_string(), "1.3·10<sup>−7</sup>");
         assert_eq!(scientific(0.0).into_string(), "0");
         assert_eq!(value(f64::NAN, "?".into()).into_string(), "not finite");
+    }
+
+    fn spread(median: f64) -> Spread {
+        Spread::of(&[0.9 * median, median, 1.2 * median])
+    }
+
+    fn choice(name: &str, change: &str, factor: f64, dominated_by: Option<&str>) -> VariantFigures {
+        let distance = |relative: f64, tensor| Distance { relative, largest: 2.0 * relative, tensor };
+        let dominated_by = dominated_by.map(str::to_owned);
+        let stage = |stage, milliseconds: f64, relative: f64| StageFigures {
+            stage,
+            milliseconds: spread(milliseconds),
+            time_ratio: Some(spread(factor)),
+            error: Some(distance(relative, "opacity")),
+            kernel_error: Some(OwnError {
+                relative: relative / 3.0,
+                pass: "render/decode".into(),
+                tensor: "scale".into(),
+                integers: 0,
+            }),
+            dominated_by: dominated_by.clone(),
+        };
+        VariantFigures {
+            name: name.into(),
+            changes: if change.is_empty() { vec![] } else { vec![change.into()] },
+            picture_milliseconds: spread(20.0 * factor),
+            picture_error: distance(2.5e-6 * factor, "rgb"),
+            step_milliseconds: spread(80.0 * factor),
+            time_ratio: spread(factor),
+            gradient_error: distance(4e-5 * factor, "grad_offset"),
+            dominated_by: dominated_by.clone(),
+            stages: vec![stage(Stage::Cull, 0.5, 0.0), stage(Stage::Decode, 7.0 * factor, 1e-7 * factor)],
+            tensors: vec![],
+        }
+    }
+
+    /// A report of made-up numbers.
+    fn report() -> Report {
+        let device = DeviceInfo {
+            index: 0,
+            name: "Device <1>".into(),
+            kind: "discrete",
+            driver: "driver 1.2".into(),
+            api: "1.3.200".into(),
+            subgroup_size: 32,
+            max_binding_bytes: 1 << 30,
+            heap_bytes: 1 << 33,
+            shared_bytes: 1 << 16,
+            max_groups: 65535,
+            timestamp_period: 1.0,
+            lacks: vec![],
+        };
+        let sample = |step: u32, psnr| Sample {
+            step,
+            seconds: f64::from(step) / 8.0,
+            loss: 1.0 / psnr,
+            psnr,
+            masked_psnr: Some(psnr - 5.0),
+            ssim: 0.9,
+            anchors: 1000,
+        };
+        let run = |name: &str, gain: f64, dominated_by: Option<&str>| {
+            let samples = vec![sample(10, 15.0 + gain), sample(100, 21.0 + gain)];
+            let point = |mean: &Sample| Point {
+                mean: *mean,
+                psnr_range: [mean.psnr - 0.1, mean.psnr + 0.1],
+                masked_psnr_range: None,
+                loss_range: [mean.loss; 2],
+                psnr_front: gain == 0.0,
+                masked_psnr_front: false,
+                loss_front: true,
+            };
+            VariantRuns {
+                name: name.into(),
+                changes: vec![],
+                points: samples.iter().map(point).collect(),
+                runs: vec![SeedRun { seed: 0, samples }],
+                dominated_by: dominated_by.map(str::to_owned),
+            }
+        };
+        let omitted = vec![Omitted { variant: "no masks".into(), why: "there are none".into() }];
+        Report {
+            version: "1.2.3".into(),
+            command: "gscream-vk report garden".into(),
+            scene: SceneFacts {
+                name: "garden".into(),
+                train_views: 60,
+                test_views: 10,
+                size: [252, 142],
+                points: 5000,
+                masks: 60,
+                priors: 0,
+                reference: false,
+            },
+            device,
+            settings: crate::config::Settings::default(),
+            kernels: Some(Kernels {
+                warm_up: 50,
+                step: 51,
+                views: vec!["a".into(), "b".into()],
+                repetitions: 3,
+                anchors: 1234,
+                variants: vec![
+                    choice("as set", "", 1.0, None),
+                    choice("worse", "render.cull=false", 1.5, Some("as set")),
+                ],
+                omitted: omitted.clone(),
+            }),
+            training: Some(Training {
+                iterations: 100,
+                steps: vec![10, 100],
+                test_views: 10,
+                variants: vec![run("as set", 0.0, None), run("worse", -1.0, Some("as set"))],
+                omitted,
+            }),
+        }
+    }
+
+    #[test]
+    fn the_page_of_fixed_numbers() {
+        let text = |text: &str| format!("<svg>{text}</svg>");
+        let drawings = Drawings { whole: text("whole"), stages: text("stages"), training: text("training") };
+        let page = page(&report(), &drawings);
+        // A line per element, so that a change is one of a line.
+        insta::assert_snapshot!(page.replace("><", ">\n<").replace("</tr>", "</tr>\n"));
+    }
+
+    #[test]
+    fn the_plots_of_fixed_numbers() {
+        let report = report();
+        let (kernels, training) = (report.kernels.expect("made up"), report.training.expect("made up"));
+        for (name, figure) in [
+            ("step", figures::whole(&kernels)),
+            ("stages", figures::by_stage(&kernels)),
+            ("training", figures::training(&training)),
+        ] {
+            insta::assert_snapshot!(name, crate::report::plots::draw(&figure).expect("drawn"));
+        }
     }
 }

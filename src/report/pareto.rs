@@ -8,20 +8,43 @@ pub const SAME_ERROR: f64 = 1.1;
 /// A choice with its cost and its errors, the smaller the better.
 #[derive(Clone, Debug)]
 pub struct Choice {
-    /// Time.
-    pub time: Spread,
+    /// Times of the rounds, of all choices in the same order: what disturbs a round disturbs all of them alike.
+    pub times: Vec<f64>,
     /// Errors, each by itself; 0 is exact.
     pub errors: Vec<f64>,
 }
 
-/// True where `a` makes `b` superfluous: it is in nothing worse, and in something better by more than the spread.
-/// Times whose quartiles overlap, and errors within [`SAME_ERROR`], count as equal.
+/// Median times within this factor of each other count as equal even where the rounds agree on the faster one.
+pub const SAME_TIME: f64 = 1.02;
+
+/// How long `a` takes in terms of `b`, round by round.
+///
+/// # Panics
+/// Unless both have the same number of rounds.
+pub fn ratio(a: &[f64], b: &[f64]) -> Spread {
+    assert_eq!(a.len(), b.len(), "all choices have a turn in every round");
+    Spread::of(&a.iter().zip(b).map(|(a, b)| if a == b { 1.0 } else { a / b }).collect::<Vec<f64>>())
+}
+
+/// True where the ratio is of a longer time: in its median, and in three quarters of the rounds.
+pub fn is_longer(ratio: &Spread) -> bool {
+    ratio.median > SAME_TIME && ratio.lower > 1.0
+}
+
+/// Likewise of a shorter one.
+pub fn is_shorter(ratio: &Spread) -> bool {
+    ratio.median * SAME_TIME < 1.0 && ratio.upper < 1.0
+}
+
+/// True where `a` makes `b` superfluous: it is in nothing worse, and in something better. Errors within [`SAME_ERROR`]
+/// count as equal, and so do times that most rounds do not agree about.
 pub fn dominates(a: &Choice, b: &Choice) -> bool {
-    let (faster, slower) = (a.time.upper < b.time.lower, b.time.upper < a.time.lower);
+    let ratio = ratio(&a.times, &b.times);
     let better = |x: &f64, y: &f64| x * SAME_ERROR < *y;
     let pairs = || a.errors.iter().zip(&b.errors);
     let worse = pairs().any(|(x, y)| better(y, x));
-    !slower && !worse && (faster || pairs().any(|(x, y)| better(x, y)))
+    let slower = ratio.median > SAME_TIME;
+    !slower && !worse && (is_shorter(&ratio) || pairs().any(|(x, y)| better(x, y)))
 }
 
 /// For each choice the first one that makes it superfluous. Among equals none is.
@@ -42,7 +65,7 @@ mod tests {
     use super::*;
 
     fn choice(times: &[f64], errors: &[f64]) -> Choice {
-        Choice { time: Spread::of(times), errors: errors.to_vec() }
+        Choice { times: times.to_vec(), errors: errors.to_vec() }
     }
 
     #[test]
@@ -52,8 +75,8 @@ mod tests {
         let slow = choice(&[2.0, 2.1, 2.2], &[1e-7, 0.0]);
         let rough = choice(&[1.0, 1.1, 1.2], &[1e-5, 0.0]);
         assert_eq!(dominated(&[exact.clone(), fast.clone(), slow, rough]), [None, None, Some(0), Some(0)]);
-        // Within the spread of time and error nothing is better.
-        let alike = choice(&[1.05, 1.15, 1.25], &[1.05e-7, 0.0]);
+        // Neither the rounds nor the errors tell them apart.
+        let alike = choice(&[1.05, 1.05, 1.25], &[1.05e-7, 0.0]);
         assert_eq!(dominated(&[exact.clone(), alike]), [None, None]);
         // Exact in the one and worse in the other: both stay.
         let other = choice(&[1.0, 1.1, 1.2], &[0.0, 1e-6]);
@@ -62,6 +85,9 @@ mod tests {
         let zero = choice(&[1.0, 1.1, 1.2], &[0.0, 0.0]);
         assert!(dominates(&zero, &exact) && !dominates(&exact, &zero) && !dominates(&zero, &zero));
         assert!(!dominates(&fast, &exact));
+        // What disturbs both alike hides nothing: every round is a tenth faster.
+        let (even, faster) = (choice(&[1.0, 3.0, 9.0], &[0.0]), choice(&[0.9, 2.7, 8.1], &[0.0]));
+        assert_eq!(dominated(&[even, faster]), [Some(1), None]);
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Plots as SVG: panels side by side with one legend, a marker and a colour for each choice.
 //!
-//! Colours are those of Okabe and Ito, told apart by every kind of colour vision; shapes differ as well, so that the plots
+//! Colours are those of Okabe and Ito and of Tol, told apart by every kind of colour vision; shapes differ as well, so that the plots
 //! survive a black-and-white printer. A superfluous choice is hollow. Logarithmic axes never hold a zero: an error of
 //! exactly zero has a strip of its own below the axis.
 
@@ -22,8 +22,8 @@ const GRID: RGBColor = RGBColor(0xe4, 0xe4, 0xe4);
 const STRIP: RGBColor = RGBColor(0xf4, 0xf4, 0xf4);
 const FRONT: RGBColor = RGBColor(0xc8, 0xc8, 0xc8);
 
-/// Okabe and Ito (2008) without the yellow, which a white page swallows.
-const COLORS: [RGBColor; 7] = [
+/// Okabe and Ito (2008) without the yellow, which a white page swallows, then Tol's muted scheme.
+const COLORS: [RGBColor; 11] = [
     RGBColor(0x00, 0x00, 0x00),
     RGBColor(0xd5, 0x5e, 0x00),
     RGBColor(0x00, 0x72, 0xb2),
@@ -31,6 +31,10 @@ const COLORS: [RGBColor; 7] = [
     RGBColor(0xe6, 0x9f, 0x00),
     RGBColor(0xcc, 0x79, 0xa7),
     RGBColor(0x56, 0xb4, 0xe9),
+    RGBColor(0x88, 0x22, 0x55),
+    RGBColor(0x99, 0x99, 0x33),
+    RGBColor(0x33, 0x22, 0x88),
+    RGBColor(0x77, 0x77, 0x77),
 ];
 
 /// How an axis runs.
