@@ -4,7 +4,6 @@ use std::path::PathBuf;
 
 use anyhow::{Context as _, bail};
 
-use super::folders::Record;
 use super::shared::{DeviceArgs, SceneArgs, load_scene, with_gpu};
 use super::train::default_folder;
 use crate::config::Settings;
@@ -137,10 +136,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         })?)
     };
     let device = device.expect("one of the two was measured");
-    let record = Record::new(&device.name, &name);
     let report = Report {
-        version: record.version,
-        command: record.command,
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        command: command_line(),
         scene: SceneFacts::new(last_part(&name), &scene),
         device,
         settings,
@@ -174,6 +172,12 @@ fn read(args: &Args, settings: &Settings) -> anyhow::Result<Scene> {
 /// The folder's own name: where it lies is nobody's business who reads the page.
 fn last_part(name: &str) -> &str {
     name.rsplit(['/', '\\']).find(|part| !part.is_empty()).unwrap_or(name)
+}
+
+/// The command line without the place of the program.
+fn command_line() -> String {
+    let arguments = std::env::args_os().skip(1).map(|word| word.to_string_lossy().into_owned());
+    std::iter::once("gscream-vk".to_owned()).chain(arguments).collect::<Vec<_>>().join(" ")
 }
 
 fn write(report: &Report, out: &std::path::Path) -> anyhow::Result<Vec<&'static str>> {

@@ -158,11 +158,11 @@ pub fn training(training: &Training) -> Figure {
         }
     }
     let several = training.variants.iter().any(|v| v.runs.len() > 1);
-    let bars = if several { " Bars: extremes over the seeds." } else { "" };
+    let bars = if several { " Hollow: superfluous at its end. Bars: extremes over the seeds." } else { "" };
     Figure {
         description: "Figures on held-out views during training, against seconds and against steps".to_owned(),
         legend: training.variants.iter().map(|v| v.name.clone()).collect(),
-        footnote: format!("Grey band: Pareto front over all choices. Hollow: superfluous at its end.{bars}"),
+        footnote: format!("Grey band: Pareto front over all choices.{bars}"),
         panels,
         columns: 2,
         panel: [480.0, 270.0],

@@ -279,7 +279,7 @@ fn of_training(training: &Training, drawings: &Drawings) -> Markup {
             " each. Figures are means over " (test_views) " held-out views, the same photographs for all choices, taken at "
             (steps.len()) " steps while the clock stands still: seconds are those of training alone. The colour loss is \
              (1 − w) L1 + w (1 − SSIM) of the whole picture with " code { "losses.ssim_weight" } " as w."
-            @if seeds == 1 { " With one seed nothing is known of the spread: small differences mean nothing." }
+            @if seeds == 1 { " With one seed nothing is known of the spread: small differences mean nothing, and no choice is called superfluous." }
         }
         (figure(&drawings.training, &html! {
             "Figures on held-out views during training. The grey band joins the points on the Pareto front: nothing measured \
@@ -295,7 +295,7 @@ fn of_training(training: &Training, drawings: &Drawings) -> Markup {
                 tr.out[v.dominated_by.is_some()] {
                     th { (v.name) }
                     td { (changes(&v.changes)) }
-                    td.n { (value(m.seconds, format!("{:.1}", m.seconds))) }
+                    td.n { (value(m.seconds, format!("{:.1}", m.seconds))) (range(Some(end.seconds_range), 1)) }
                     td.n { (format!("{:.2}", f64::from(m.step) / m.seconds)) }
                     td.n { (value(m.psnr, format!("{:.2}", m.psnr))) (range(Some(end.psnr_range), 2)) }
                     td.n { @if let Some(psnr) = m.masked_psnr { (value(psnr, format!("{psnr:.2}"))) } @else { "–" } (range(end.masked_psnr_range, 2)) }
@@ -402,6 +402,7 @@ mod tests {
             let samples = vec![sample(10, 15.0 + gain), sample(100, 21.0 + gain)];
             let point = |mean: &Sample| Point {
                 mean: *mean,
+                seconds_range: [mean.seconds; 2],
                 psnr_range: [mean.psnr - 0.1, mean.psnr + 0.1],
                 masked_psnr_range: None,
                 loss_range: [mean.loss; 2],

@@ -135,7 +135,7 @@ fn failed(error: impl std::fmt::Display) -> Error {
 
 /// About the width of a text, pixels: the fonts of whoever looks are not known.
 fn width_of(text: &str, size: f64) -> f64 {
-    0.54 * size * text.chars().count() as f64
+    0.5 * size * text.chars().count() as f64
 }
 
 /// Draws in pixels.
@@ -414,7 +414,10 @@ fn draw_panel(pen: &Pen<'_>, panel: &Panel, (x0, y0): (f64, f64), [width, height
     let mut front: Vec<(f64, f64)> = marks().filter(shown).filter(|m| m.front).map(place).collect();
     front.sort_by(|a, b| a.0.total_cmp(&b.0));
     if front.len() > 1 {
-        pen.line(&front, FRONT, 5.0)?;
+        // What was best so far stays best until the next point is reached.
+        let steps = front.windows(2).flat_map(|pair| [pair[0], (pair[1].0, pair[0].1)]);
+        let path: Vec<(f64, f64)> = steps.chain(front.last().copied()).collect();
+        pen.line(&path, FRONT, 5.0)?;
     }
     for series in &panel.series {
         let color = COLORS[series.style % COLORS.len()];

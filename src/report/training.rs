@@ -70,6 +70,8 @@ pub struct SeedRun {
 pub struct Point {
     /// Means.
     pub mean: Sample,
+    /// Fewest and most seconds.
+    pub seconds_range: [f64; 2],
     /// Smallest and largest PSNR.
     pub psnr_range: [f64; 2],
     /// Smallest and largest PSNR inside the mask.
@@ -95,7 +97,8 @@ pub struct VariantRuns {
     pub runs: Vec<SeedRun>,
     /// Over the seeds, by sample.
     pub points: Vec<Point>,
-    /// A choice whose end is at least as good in every figure and was reached no later.
+    /// A choice whose end is in nothing worse, the time that it took included, and in something better, by more than the
+    /// seeds differ. With one seed nothing is known of that, and none is named.
     pub dominated_by: Option<String>,
 }
 
@@ -274,6 +277,7 @@ fn points(runs: &[SeedRun]) -> Vec<Point> {
                 ssim: mean(&|s| s.ssim),
                 anchors: mean(&|s| f64::from(s.anchors)).round() as u32,
             },
+            seconds_range: range(&|s| s.seconds),
             psnr_range: range(&|s| s.psnr),
             masked_psnr_range: has_mask.then(|| range(&masked)),
             loss_range: range(&|s| s.loss),
@@ -299,28 +303,31 @@ fn judge(variants: &mut [VariantRuns]) {
     for (point, ((psnr, masked), loss)) in variants.iter_mut().flat_map(|v| &mut v.points).zip(marks) {
         (point.psnr_front, point.masked_psnr_front, point.loss_front) = (psnr, masked, loss);
     }
-    // With several seeds, what overlaps counts as equal; with one, nothing is known of the spread.
-    let ends: Vec<Option<(f64, Point)>> =
-        variants.iter().map(|v| v.points.last().map(|p| (p.mean.seconds, *p))).collect();
+    let ends: Vec<Option<Point>> =
+        variants.iter().map(|v| v.points.last().filter(|_| v.runs.len() > 1).copied()).collect();
     let names: Vec<String> = variants.iter().map(|v| v.name.clone()).collect();
-    let superfluous = |b: &(f64, Point)| {
-        ends.iter().position(|a| {
-            let Some(a) = a else { return false };
-            let (x, y) = (&a.1, &b.1);
-            let masked = |p: &Point| p.masked_psnr_range.unwrap_or([0.0, 0.0]);
-            let negated = |[low, high]: [f64; 2]| [-high, -low];
-            // Of every figure, as larger is better: the range of a and of b.
-            let figures =
-                [(x.psnr_range, y.psnr_range), (masked(x), masked(y)), (negated(x.loss_range), negated(y.loss_range))];
-            let worse = figures.iter().any(|([_, high], [low, _])| high < low) || a.0 > b.0;
-            let better = figures.iter().any(|([low, _], [_, high])| low > high) || a.0 < b.0;
-            !worse && better
-        })
-    };
+    let superfluous = |b: &Point| ends.iter().flatten().position(|a| beats(a, b));
+    let judged: Vec<usize> = (0..ends.len()).filter(|i| ends[*i].is_some()).collect();
     let by: Vec<Option<usize>> = ends.iter().map(|end| end.as_ref().and_then(superfluous)).collect();
     for (variant, by) in variants.iter_mut().zip(by) {
-        variant.dominated_by = by.map(|by| names[by].clone());
+        variant.dominated_by = by.map(|by| names[judged[by]].clone());
     }
+}
+
+/// Ranges that overlap count as equal.
+fn beats(a: &Point, b: &Point) -> bool {
+    let negated = |[low, high]: [f64; 2]| [-high, -low];
+    let masked = |p: &Point| p.masked_psnr_range.unwrap_or([0.0, 0.0]);
+    // As more is better: the ranges of a and of b.
+    let figures = [
+        (a.psnr_range, b.psnr_range),
+        (masked(a), masked(b)),
+        (negated(a.loss_range), negated(b.loss_range)),
+        (negated(a.seconds_range), negated(b.seconds_range)),
+    ];
+    let worse = figures.iter().any(|([_, high], [low, _])| high < low);
+    let better = figures.iter().any(|([low, _], [_, high])| low > high);
+    !worse && better
 }
 
 #[cfg(test)]
@@ -344,24 +351,41 @@ mod tests {
         }
     }
 
-    fn variant(name: &str, seconds: f64, psnr: &[f64]) -> VariantRuns {
-        let sample =
-            |psnr| Sample { step: 10, seconds, loss: 1.0 / psnr, psnr, masked_psnr: None, ssim: 0.5, anchors: 7 };
-        let runs: Vec<SeedRun> =
-            psnr.iter().zip(0..).map(|(psnr, seed)| SeedRun { seed, samples: vec![sample(*psnr)] }).collect();
+    fn variant(name: &str, seconds: [f64; 2], psnr: &[f64]) -> VariantRuns {
+        let sample = |(psnr, seconds): (&f64, f64)| Sample {
+            step: 10,
+            seconds,
+            loss: 1.0 / psnr,
+            psnr: *psnr,
+            masked_psnr: None,
+            ssim: 0.5,
+            anchors: 7,
+        };
+        let runs: Vec<SeedRun> = (psnr.iter().zip(seconds))
+            .zip(0..)
+            .map(|(figures, seed)| SeedRun { seed, samples: vec![sample(figures)] })
+            .collect();
         VariantRuns { name: name.into(), changes: vec![], points: points(&runs), runs, dominated_by: None }
     }
 
     #[test]
     fn ends_are_judged_by_figures_and_time() {
-        let mut variants =
-            [variant("a", 10.0, &[20.0, 21.0]), variant("b", 11.0, &[20.5, 21.5]), variant("c", 12.0, &[18.0, 19.0])];
+        let mut variants = [
+            variant("a", [10.0, 10.5], &[20.0, 21.0]),
+            variant("slower", [11.0, 11.5], &[20.5, 21.5]),
+            variant("worse", [10.2, 10.8], &[18.0, 19.0]),
+            variant("alike", [10.2, 10.8], &[20.5, 21.5]),
+            variant("better", [12.0, 12.5], &[22.0, 22.5]),
+        ];
         judge(&mut variants);
-        let by = |i: usize| variants[i].dominated_by.as_deref();
-        assert_eq!((by(0), by(1), by(2)), (None, Some("a"), Some("a")), "b overlaps a and is slower");
-        assert!(variants[0].points[0].psnr_front && variants[1].points[0].psnr_front);
-        assert!(!variants[2].points[0].psnr_front && !variants[2].points[0].masked_psnr_front);
-        assert_eq!(variants[0].points[0].mean.psnr, 20.5);
-        assert_eq!(variants[0].points[0].psnr_range, [20.0, 21.0]);
+        let by: Vec<Option<&str>> = variants.iter().map(|v| v.dominated_by.as_deref()).collect();
+        assert_eq!(by, [None, Some("a"), Some("a"), None, None]);
+        let front: Vec<bool> = variants.iter().map(|v| v.points[0].psnr_front).collect();
+        assert_eq!(front, [true, false, false, true, true]);
+        assert!(variants.iter().all(|v| !v.points[0].masked_psnr_front));
+        assert_eq!((variants[0].points[0].mean.psnr, variants[0].points[0].psnr_range), (20.5, [20.0, 21.0]));
+        let mut alone = [variant("a", [10.0, 0.0], &[20.0]), variant("b", [11.0, 0.0], &[19.0])];
+        judge(&mut alone);
+        assert!(alone.iter().all(|v| v.dominated_by.is_none()), "one seed says nothing");
     }
 }
