@@ -176,7 +176,11 @@ fn last_part(name: &str) -> &str {
 
 /// The command line without the place of the program.
 fn command_line() -> String {
-    let arguments = std::env::args_os().skip(1).map(|word| word.to_string_lossy().into_owned());
+    let quoted = |word: std::borrow::Cow<'_, str>| {
+        let plain = |c: char| c.is_alphanumeric() || "-_=.,/:+".contains(c);
+        if word.chars().all(plain) { word.into_owned() } else { format!("'{}'", word.replace('\'', "'\\''")) }
+    };
+    let arguments = std::env::args_os().skip(1).map(|word| quoted(word.to_string_lossy()));
     std::iter::once("gscream-vk".to_owned()).chain(arguments).collect::<Vec<_>>().join(" ")
 }
 

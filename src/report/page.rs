@@ -45,7 +45,7 @@ code, pre { font-family: ui-monospace, monospace; font-size: .82rem; }
 pre { background: #f7f7f7; padding: .8rem 1rem; overflow-x: auto; white-space: pre-wrap; overflow-wrap: anywhere; }
 .settings { columns: 2; column-gap: 2rem; }
 tr.out td, tr.out th { color: #777; }
-.mark { color: #a33c00; }
+.mark, tr.out td.mark { color: #a33c00; }
 @page { size: A4; margin: 14mm; }
 @media print {
   body { padding: 0; max-width: none; font-size: 10pt; }
@@ -105,7 +105,7 @@ fn figure(svg: &str, caption: &Markup) -> Markup {
 }
 
 fn by(dominated: Option<&String>) -> Markup {
-    html! { @if let Some(by) = dominated { span.mark { "superfluous" } ": " (by) } }
+    html! { @if let Some(by) = dominated { br; small { span.mark { "superfluous" } ": " (by) } } }
 }
 
 fn changes(changes: &[String]) -> Markup {
@@ -192,8 +192,8 @@ fn of_kernels(kernels: &Kernels, drawings: &Drawings) -> Markup {
         }))
         div.wide { table {
             thead { tr {
-                th { "choice" } th { "sets" } th.n { "picture, ms" } th.n { "step, ms" } th.n { "of the first's" }
-                th.n { "picture error" } th.n { "gradient error" } th { "worst in" } th {}
+                th { "choice" } th { "sets" } th.n { "picture, ms" } th.n { "step, ms" } th.n { "step, relative" }
+                th.n { "picture error" } th.n { "gradient error" } th { "worst in" }
             } }
             tbody { @for v in variants { (row(v)) } }
         } }
@@ -232,7 +232,7 @@ fn of_kernels(kernels: &Kernels, drawings: &Drawings) -> Markup {
         @if variants.len() > 1 {
             h3 { "Where the choices differ" }
             div.wide { table {
-                thead { tr { th { "stage" } th { "choice" } th.n { "ms" } th.n { "error so far" } th { "worst in" } th {} } }
+                thead { tr { th { "stage" } th { "choice" } th.n { "ms" } th.n { "error so far" } th { "worst in" } th { "superfluous for" } } }
                 tbody {
                     @for s in &base.stages {
                         @let differing = variants.iter().skip(1).filter_map(|v| {
@@ -243,7 +243,7 @@ fn of_kernels(kernels: &Kernels, drawings: &Drawings) -> Markup {
                             th { (s.stage.name()) } td { (v.name) } td.n { (time(&own.milliseconds)) }
                             td.n { (error(own.error.as_ref())) }
                             td { @if let Some(e) = &own.error { (e.tensor) } }
-                            td { (by(own.dominated_by.as_ref())) }
+                            td.mark { @if let Some(by) = &own.dominated_by { (by) } }
                         } }
                     }
                 }
@@ -256,7 +256,7 @@ fn row(v: &VariantFigures) -> Markup {
     let ratio = v.time_ratio.median;
     html! {
         tr.out[v.dominated_by.is_some()] {
-            th { (v.name) }
+            th { (v.name) (by(v.dominated_by.as_ref())) }
             td { (changes(&v.changes)) }
             td.n { (time(&v.picture_milliseconds)) }
             td.n { (time(&v.step_milliseconds)) }
@@ -264,7 +264,6 @@ fn row(v: &VariantFigures) -> Markup {
             td.n { (error(Some(&v.picture_error))) }
             td.n { (error(Some(&v.gradient_error))) }
             td { (v.gradient_error.tensor) }
-            td { (by(v.dominated_by.as_ref())) }
         }
     }
 }
@@ -288,12 +287,12 @@ fn of_training(training: &Training, drawings: &Drawings) -> Markup {
         div.wide { table {
             thead { tr {
                 th { "choice" } th { "sets" } th.n { "seconds" } th.n { "steps/s" } th.n { "PSNR, dB" }
-                th.n { "masked PSNR, dB" } th.n { "SSIM" } th.n { "loss" } th.n { "anchors" } th {}
+                th.n { "masked PSNR, dB" } th.n { "SSIM" } th.n { "loss" } th.n { "anchors" }
             } }
             tbody { @for v in variants { @if let Some(end) = v.points.last() {
                 @let m = &end.mean;
                 tr.out[v.dominated_by.is_some()] {
-                    th { (v.name) }
+                    th { (v.name) (by(v.dominated_by.as_ref())) }
                     td { (changes(&v.changes)) }
                     td.n { (value(m.seconds, format!("{:.1}", m.seconds))) (range(Some(end.seconds_range), 1)) }
                     td.n { (format!("{:.2}", f64::from(m.step) / m.seconds)) }
@@ -302,7 +301,6 @@ fn of_training(training: &Training, drawings: &Drawings) -> Markup {
                     td.n { (value(m.ssim, format!("{:.4}", m.ssim))) }
                     td.n { (value(m.loss, format!("{:.4}", m.loss))) (range(Some(end.loss_range), 4)) }
                     td.n { (m.anchors) }
-                    td { (by(v.dominated_by.as_ref())) }
                 }
             } } }
         } }

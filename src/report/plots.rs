@@ -320,8 +320,9 @@ impl Range {
             let power = 10f64.powf(rough.log10().floor());
             let step = power * [1.0, 2.0, 5.0, 10.0].into_iter().find(|m| m * power >= rough).unwrap_or(10.0);
             let digits = (-step.log10().floor()).max(0.0) as usize;
-            let first = (low / step).ceil() as i64;
-            let last = (high / step).floor() as i64;
+            // A bound that is itself round may have been rounded past.
+            let first = (low / step - 1e-9).ceil() as i64;
+            let last = (high / step + 1e-9).floor() as i64;
             (first..=last).map(|i| i as f64 * step).map(|v| (v, format!("{v:.digits$}"))).collect::<Vec<_>>()
         };
         if self.scale == Scale::Linear {

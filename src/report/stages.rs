@@ -134,11 +134,12 @@ pub const OUTPUTS: [(Stage, &str, Rows); 29] = [
     (Stage::Rasterize, "depth_map", Rows::Plain),
     (Stage::Losses, "losses", Rows::Plain),
     (Stage::Losses, "grad_rgb", Rows::Plain),
-    (Stage::Losses, "grad_depth", Rows::Plain),
     (Stage::RasterizeBackward, "grad_mean", Rows::Slots(2)),
     (Stage::RasterizeBackward, "grad_covariance", Rows::Slots(3)),
     (Stage::RasterizeBackward, "grad_opacity", Rows::Slots(1)),
     (Stage::RasterizeBackward, "grad_color", Rows::Slots(3)),
+    // By the depth map's pixels first, a buffer of the same name; then by the Gaussians' depths, which is kept.
+    (Stage::RasterizeBackward, "grad_depth", Rows::Slots(1)),
     (Stage::ProjectBackward, "grad_position", Rows::Slots(3)),
     (Stage::ProjectBackward, "grad_scale", Rows::Slots(3)),
     (Stage::ProjectBackward, "grad_rotation", Rows::Slots(4)),
