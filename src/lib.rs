@@ -18,6 +18,7 @@ pub mod model;
 pub mod optimizer;
 pub mod primitives;
 pub mod render;
+pub mod report;
 pub mod scene;
 pub mod stage;
 pub mod train;

@@ -12,6 +12,7 @@ pub mod folders;
 pub mod pictures;
 mod plan;
 mod render;
+mod report;
 pub mod shared;
 mod synth;
 mod train;
@@ -55,6 +56,7 @@ enum Command {
     Plan(plan::Args),
     Verify(verify::Args),
     Ablate(ablate::Args),
+    Report(report::Args),
 }
 
 /// Runs the command.
@@ -71,6 +73,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
         Command::Plan(args) => plan::run(&args),
         Command::Verify(args) => verify::run(&args),
         Command::Ablate(args) => ablate::run(&args),
+        Command::Report(args) => report::run(&args),
     }
 }
 

@@ -44,6 +44,10 @@ pub struct Difference {
     pub cosine: f64,
     /// |got| / |want|; 1 for two zero tensors.
     pub norm_ratio: f64,
+    /// |got - want| / |want| in the Euclidean norm; 0 for two zero tensors.
+    pub relative: f64,
+    /// Integers, which must be equal.
+    pub discrete: bool,
     /// Components beyond the allowed distance.
     pub exceeded: usize,
     /// Components that may be: the boundary band.
@@ -63,7 +67,7 @@ impl Difference {
         assert_eq!(got.len(), want.len(), "{pass}: {tensor} has another length than its reference");
         let scale = want.iter().filter(|w| w.is_finite()).fold(0.0, |m: f64, w| m.max(w.abs()));
         let (mut error, mut exceeded, mut worst, mut worst_excess): (f64, _, _, f64) = (0.0, 0, None, 0.0);
-        let (mut dot, mut gg, mut ww) = (0.0, 0.0, 0.0);
+        let (mut dot, mut gg, mut ww, mut dd) = (0.0, 0.0, 0.0, 0.0);
         for (i, (&g, &w)) in got.iter().zip(want).enumerate() {
             if g == w || (g.is_nan() && w.is_nan()) {
                 if g.is_finite() {
@@ -78,6 +82,7 @@ impl Difference {
             dot += g * w;
             gg += g * g;
             ww += w * w;
+            dd += distance * distance;
             error = if distance.is_nan() { f64::INFINITY } else { error.max(distance) };
             if distance.is_nan() || distance > limit {
                 exceeded += 1;
@@ -97,6 +102,8 @@ impl Difference {
             scale,
             cosine: if both_zero { 1.0 } else { dot / (gg * ww).sqrt() },
             norm_ratio: if both_zero { 1.0 } else { (gg / ww).sqrt() },
+            relative: if both_zero { 0.0 } else { (dd / ww).sqrt() },
+            discrete: false,
             exceeded,
             allowed: (check.band * got.len() as f64).ceil() as usize,
             worst,
@@ -113,11 +120,9 @@ impl Difference {
                 Scalar::I32 => words.iter().map(|&w| f64::from(w as i32)).collect(),
             }
         };
-        let check = match binding.scalar {
-            Scalar::F32 => check,
-            _ => Check { relative: 0.0, absolute: 0.0, ..check },
-        };
-        Self::of(pass, binding.name, &values(got), &values(want), check)
+        let discrete = binding.scalar != Scalar::F32;
+        let check = if discrete { Check { relative: 0.0, absolute: 0.0, ..check } } else { check };
+        Self { discrete, ..Self::of(pass, binding.name, &values(got), &values(want), check) }
     }
 }
 
@@ -140,7 +145,7 @@ pub(super) fn run_words<K: Reference>(
 
 impl std::fmt::Display for Difference {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { pass, tensor, components, error, scale, cosine, norm_ratio, exceeded, allowed, worst } = self;
+        let Self { pass, tensor, components, error, scale, cosine, norm_ratio, exceeded, allowed, worst, .. } = self;
         write!(
             f,
             "{pass:<36} {tensor:<24} {components:>10}  error {error:9.2e} of {scale:9.2e}  1-cos {:8.1e}  norm {norm_ratio:.6}",

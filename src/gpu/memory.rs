@@ -160,9 +160,6 @@ impl Gpu {
     /// Whatever the copy meets.
     pub fn write<T: bytemuck::Pod>(&self, buffer: &Buffer<T>, data: &[T]) -> Result<(), Error> {
         assert!(data.len() <= buffer.len(), "{}: {} elements into {}", buffer.name(), data.len(), buffer.len());
-        if data.is_empty() {
-            return Ok(());
-        }
         self.overwrite(buffer.slot(), bytemuck::cast_slice(data))
     }
 
@@ -172,6 +169,9 @@ impl Gpu {
     }
 
     fn overwrite(&self, slot: Slot, bytes: &[u8]) -> Result<(), Error> {
+        if bytes.is_empty() {
+            return Ok(());
+        }
         let mut staging: Buffer<u32> = self.allocate("staging", bytes.len() / 4, MemoryLocation::CpuToGpu)?;
         if self.rehearsing().is_none() {
             let mapped = staging.mapped_mut().expect("staging memory is host visible");

@@ -1,5 +1,6 @@
 //! Recording passes: barriers, labels, timestamps and crash markers come from one function.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use ash::vk;
@@ -116,6 +117,7 @@ pub struct Recorder<'g> {
     error: Option<Error>,
     differences: Option<Vec<Difference>>,
     inspection: Option<Option<NotFinite>>,
+    trace: Option<Trace>,
 }
 
 /// The first value that is not finite, of an inspected recording.
@@ -131,6 +133,13 @@ pub struct NotFinite {
     pub value: f32,
 }
 
+/// What a traced recording keeps.
+struct Trace {
+    wanted: &'static [&'static str],
+    found: BTreeMap<&'static str, Vec<u32>>,
+    twins: bool,
+}
+
 /// Work given to the device.
 #[must_use = "wait() frees what the submission holds"]
 pub struct Submission<'g> {
@@ -142,6 +151,8 @@ pub struct Submission<'g> {
     pub schedule: Schedule,
     /// GPU against twin, of a checked recording.
     pub differences: Vec<Difference>,
+    /// The wanted buffers of a traced recording by name, as the last pass that wrote them left them.
+    pub trace: BTreeMap<&'static str, Vec<u32>>,
 }
 
 impl Gpu {
@@ -175,6 +186,7 @@ impl Gpu {
             error: None,
             differences: None,
             inspection: None,
+            trace: None,
         };
         recorder.begin()?;
         Ok(recorder)
@@ -202,6 +214,28 @@ impl Gpu {
     pub fn inspected(&self) -> Result<Recorder<'_>, Error> {
         let mut recorder = self.recorder()?;
         recorder.inspection = Some(None);
+        Ok(recorder)
+    }
+
+    /// A recording in which every pass runs at once, and which keeps the words of the buffers of these names. Elements
+    /// that no pass writes are zero: a kernel that only writes such a buffer finds it zeroed the first time.
+    ///
+    /// # Errors
+    /// As [`Gpu::recorder`].
+    pub fn traced(&self, wanted: &'static [&'static str]) -> Result<Recorder<'_>, Error> {
+        let mut recorder = self.recorder()?;
+        recorder.trace = Some(Trace { wanted, found: BTreeMap::new(), twins: false });
+        Ok(recorder)
+    }
+
+    /// As [`Gpu::traced`], but the CPU twins run in the kernels' place: the reference path, float64 within a pass and
+    /// float32 in the buffers between passes. Fills and copies remain the device's.
+    ///
+    /// # Errors
+    /// As [`Gpu::recorder`].
+    pub fn reference(&self, wanted: &'static [&'static str]) -> Result<Recorder<'_>, Error> {
+        let mut recorder = self.recorder()?;
+        recorder.trace = Some(Trace { wanted, found: BTreeMap::new(), twins: true });
         Ok(recorder)
     }
 }
@@ -274,22 +308,46 @@ impl<'g> Recorder<'g> {
             // Nothing behind it is worth running.
             Some(Some(_)) => return Ok(()),
         }
-        let inputs = if self.differences.is_some() {
+        if self.differences.is_none() && self.trace.is_none() {
+            return self.dispatch::<K>(&constants, &slots, &push, threads);
+        }
+        self.flush()?;
+        let wanted = |trace: &Trace, i: usize| K::BINDINGS[i].access.writes() && trace.wanted.contains(&slots[i].name);
+        if let Some(trace) = &self.trace {
+            let fresh = |i: &usize| {
+                let only_written = K::BINDINGS[*i].access == Access::Write;
+                only_written && wanted(trace, *i) && !trace.found.contains_key(slots[*i].name)
+            };
+            let fresh: Vec<usize> = (0..slots.len()).filter(fresh).collect();
+            fresh.into_iter().for_each(|i| self.fill_slot(slots[i], 0));
             self.flush()?;
-            Some(self.download(&slots)?)
-        } else {
-            None
-        };
-        self.dispatch::<K>(&constants, &slots, &push, threads)?;
-        if let Some(mut words) = inputs {
-            self.flush()?;
-            let got = self.download(&slots)?;
+        }
+        let twins = self.trace.as_ref().is_some_and(|trace| trace.twins);
+        let mut words = if twins || self.differences.is_some() { self.download(&slots)? } else { vec![] };
+        if twins {
             K::reference(K::host(&mut words), push, constants);
-            for ((binding, got), want) in K::BINDINGS.iter().zip(&got).zip(&words) {
+            for ((slot, words), binding) in slots.iter().zip(&words).zip(K::BINDINGS) {
                 if binding.access.writes() {
-                    let difference = Difference::of_words(K::NAME, binding, got, want, K::check(binding.name));
-                    self.differences.as_mut().expect("checked mode").push(difference);
+                    self.gpu.write_words(*slot, words)?;
                 }
+            }
+        } else {
+            self.dispatch::<K>(&constants, &slots, &push, threads)?;
+            self.flush()?;
+        }
+        if let Some(differences) = &mut self.differences {
+            K::reference(K::host(&mut words), push, constants);
+            for ((binding, slot), want) in K::BINDINGS.iter().zip(&slots).zip(&words) {
+                if binding.access.writes() {
+                    let got = self.gpu.read_words(*slot, slot.bytes)?;
+                    differences.push(Difference::of_words(K::NAME, binding, &got, want, K::check(binding.name)));
+                }
+            }
+        }
+        if let Some(trace) = &mut self.trace {
+            let written: Vec<&Slot> = (0..slots.len()).filter(|i| wanted(trace, *i)).map(|i| &slots[i]).collect();
+            for slot in written {
+                trace.found.insert(slot.name, self.gpu.read_words(*slot, slot.bytes)?);
             }
         }
         Ok(())
@@ -415,7 +473,10 @@ impl<'g> Recorder<'g> {
 
     /// Sets every word of a buffer.
     pub fn fill<T: bytemuck::Pod>(&mut self, buffer: &Buffer<T>, word: u32) {
-        let slot = buffer.slot();
+        self.fill_slot(buffer.slot(), word);
+    }
+
+    fn fill_slot(&mut self, slot: Slot, word: u32) {
         let inner = self.gpu.inner().clone();
         self.pass("fill", &[(slot.id(), slot.name, Access::Write)], |commands| {
             // SAFETY: a live buffer with transfer usage.
@@ -572,6 +633,7 @@ impl<'g> Recorder<'g> {
             passes: std::mem::take(&mut self.passes),
             schedule: std::mem::take(&mut self.schedule),
             differences: self.differences.take().unwrap_or_default(),
+            trace: self.trace.take().map(|trace| trace.found).unwrap_or_default(),
         };
         submission.start()?;
         Ok(submission)
@@ -592,6 +654,7 @@ impl<'g> Recorder<'g> {
             passes,
             schedule: Schedule::default(),
             differences: vec![],
+            trace: BTreeMap::new(),
         };
         submission.start()?;
         submission.wait()?;

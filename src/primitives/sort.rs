@@ -93,7 +93,9 @@ impl Reference for sort_scatter::Kernel {
         let sort_scatter::Push { stride, shift, mask, .. } = push;
         let n = host.count[0].min(push.capacity) as usize;
         let block = GROUP * constants.items;
-        let scatter = Scatter { block, stride, shift, mask, before: host.before, totals: host.totals };
+        // Behind the digits in use lies what other sorts, or nobody, wrote.
+        let totals = &host.totals[..1 << constants.digit_bits];
+        let scatter = Scatter { block, stride, shift, mask, before: host.before, totals };
         let keys = &host.keys.as_flattened()[..n];
         scatter.run(keys, |from, to| {
             host.sorted_keys[to] = keys[from];
@@ -111,7 +113,9 @@ impl Reference for sort_scatter_index::Kernel {
         let sort_scatter_index::Push { stride, shift, mask, .. } = push;
         let n = host.count[0].min(push.capacity) as usize;
         let block = GROUP * constants.items;
-        let scatter = Scatter { block, stride, shift, mask, before: host.before, totals: host.totals };
+        // Behind the digits in use lies what other sorts, or nobody, wrote.
+        let totals = &host.totals[..1 << constants.digit_bits];
+        let scatter = Scatter { block, stride, shift, mask, before: host.before, totals };
         let keys = &host.keys.as_flattened()[..n];
         scatter.run(keys, |from, to| {
             host.sorted_keys[to] = keys[from];

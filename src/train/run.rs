@@ -230,6 +230,14 @@ pub trait Observer {
     fn interrupted(&mut self) -> Option<Signal> {
         None
     }
+    /// Steps to evaluate at besides those of the settings.
+    fn samples(&self) -> Vec<u32> {
+        vec![]
+    }
+    /// A test view (by its index) as rendered in any evaluation; the clock stands still.
+    fn compared(&mut self, _view: usize, _picture: &Rendered) {}
+    /// An evaluation behind `progress` has ended; its seconds are those of training alone.
+    fn evaluated(&mut self, _progress: &Progress, _report: &Report) {}
 }
 
 /// Watches nothing.
@@ -362,6 +370,8 @@ pub struct Run<'a> {
     /// What [`Run::train`] goes on from.
     history: History,
     owner: OnceCell<Owner>,
+    /// [`Observer::samples`].
+    samples: Vec<u32>,
 }
 
 impl<'a> Run<'a> {
@@ -402,7 +412,18 @@ impl<'a> Run<'a> {
             })
             .collect::<Result<_, gpu::Error>>()?;
         let order = Order::new(scene.train.len(), settings.train.seed, settings.train.view_order);
-        Ok(Self { gpu, scene, settings, photographs, step, order, mailboxes, history, owner: OnceCell::new() })
+        Ok(Self {
+            gpu,
+            scene,
+            settings,
+            photographs,
+            step,
+            order,
+            mailboxes,
+            history,
+            owner: OnceCell::new(),
+            samples: vec![],
+        })
     }
 
     /// The step: its plan, model and stages.
@@ -482,6 +503,7 @@ impl<'a> Run<'a> {
     /// See [`Error`]. Once under way it is [`Error::Stopped`], with a checkpoint of the last step that ended well where the
     /// folder has room for it; what was written before stays.
     pub fn train(&mut self, folder: &Path, watch: &mut dyn Observer) -> Result<Summary, Error> {
+        self.samples = watch.samples();
         let mut session = Session::new(folder, &self.history)?;
         let mut history = std::mem::take(&mut self.history);
         let result = self.advance(&mut session, &mut history, watch);
@@ -675,11 +697,17 @@ impl<'a> Run<'a> {
         }
         let mut report = None;
         if self.evaluates(step) {
+            let mut index = 0;
             report = self.evaluate(|view, picture| {
+                watch.compared(index, picture);
+                index += 1;
                 if last {
                     watch.rendered(view, picture)
                 }
             })?;
+            if let Some(report) = &report {
+                watch.evaluated(&history.last, report);
+            }
             if let Some(mean) = report.as_ref().and_then(|r| r.mean.as_ref()) {
                 let mean = &mean.metrics;
                 let masked = mean.mask.as_ref().map_or(String::new(), |m| format!(", masked {:.2} dB", m.psnr));
@@ -795,7 +823,7 @@ impl<'a> Run<'a> {
     }
 
     fn evaluates(&self, step: u32) -> bool {
-        self.every(self.settings.train.eval_interval, step)
+        self.every(self.settings.train.eval_interval, step) || self.samples.contains(&step)
     }
 
     fn saves(&self, step: u32) -> bool {

@@ -602,6 +602,12 @@ impl Step {
         Ok(())
     }
 
+    /// Everything that is learnt, with its moments; the attention's projections from its first step on.
+    pub fn parameters(&self) -> Vec<&Parameter> {
+        let attention = self.attend.as_ref().map(|attend| &attend.weights);
+        self.anchors.parameters().into_iter().chain([&self.weights]).chain(attention).collect()
+    }
+
     /// The gradients of the last recorded step by PyTorch's names, of what is trained: for tests.
     ///
     /// # Errors
