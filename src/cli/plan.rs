@@ -81,13 +81,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
 }
 
 /// The passes of a step of the whole run, rehearsed.
-fn schedule(
-    gpu: &Gpu,
-    scene: &Scene,
-    settings: &Settings,
-    verdict: &Verdict,
-    step: u32,
-) -> anyhow::Result<Schedule> {
+fn schedule(gpu: &Gpu, scene: &Scene, settings: &Settings, verdict: &Verdict, step: u32) -> anyhow::Result<Schedule> {
     let gpu = gpu.rehearsal();
     let mut run = Run::new(&gpu, scene, settings)?;
     // Long lists are scanned in more passes than short ones.
