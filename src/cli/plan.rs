@@ -66,7 +66,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             step: args.step,
             view: &scene.train[view].name,
             stages: stages(&plan, &settings, &verdict),
-            schedule: schedule(gpu, &scene, &settings, args.step)?,
+            schedule: schedule(gpu, &scene, &settings, &verdict, args.step)?,
             plan: &plan,
             verdict: &verdict,
             measured: args.measure.map(|n| measure(gpu, &scene, &settings, &verdict, args.step, n)).transpose()?,
@@ -81,9 +81,13 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
 }
 
 /// The passes of a step of the whole run, rehearsed.
-fn schedule(gpu: &Gpu, scene: &Scene, settings: &Settings, step: u32) -> anyhow::Result<Schedule> {
+fn schedule(gpu: &Gpu, scene: &Scene, settings: &Settings, verdict: &Verdict, step: u32) -> anyhow::Result<Schedule> {
     let gpu = gpu.rehearsal();
     let mut run = Run::new(&gpu, scene, settings)?;
+    // Long lists are scanned in more passes than short ones.
+    if let Ok(forecast) = &verdict.forecast {
+        run.resize(forecast.capacity)?;
+    }
     let mut rec = gpu.recorder()?;
     run.record(&mut rec, step)?;
     Ok(rec.schedule().clone())
@@ -135,7 +139,7 @@ fn stages(plan: &Plan, settings: &Settings, verdict: &Verdict) -> Vec<Stage> {
 #[derive(Serialize)]
 struct Measured {
     steps: u32,
-    /// Of the last one.
+    /// Of the first one.
     passes: usize,
     barriers: usize,
     /// Buffers alive.
@@ -166,15 +170,16 @@ fn measure(
     run.run_one(from)?;
     let mut timings = Timings::default();
     let mut sums = vec![];
-    let mut counts = (0, 0);
+    let mut counts = None;
     for step in from..from.saturating_add(steps) {
         let times = loop {
             let mut rec = gpu.recorder()?;
             run.record(&mut rec, step)?;
             let submission = rec.submit()?;
-            counts = (submission.schedule.passes(), submission.schedule.barriers());
+            let count = (submission.schedule.passes(), submission.schedule.barriers());
             let times = submission.wait()?;
             if gpu.read(run.step().limits.overflow())?[0] == 0 {
+                counts.get_or_insert(count);
                 break times;
             }
             // Too little room: the step is taken with more, and measured then.
@@ -184,12 +189,13 @@ fn measure(
         timings.add(&times);
     }
     let n = sums.len() as f64;
+    let (passes, barriers) = counts.unwrap_or_default();
     let ms = sums.iter().sum::<f64>() / n;
     let variance = sums.iter().map(|s| (s - ms).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
     Ok(Measured {
         steps,
-        passes: counts.0,
-        barriers: counts.1,
+        passes,
+        barriers,
         bytes: gpu.memory().0,
         ms,
         ms_deviation: variance.sqrt(),
