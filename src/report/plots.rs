@@ -298,8 +298,13 @@ impl Range {
         let low = values.iter().copied().fold(f64::INFINITY, f64::min);
         let high = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
         let (low, high) = if low > high { (0.0, 1.0) } else { (low, high) };
-        // At least a third of a decade, or a little of the value, so that noise does not fill the panel.
-        let least = if scale == Scale::Log { 0.35 } else { (0.02 * high.abs()).max(1e-9) };
+        // At least a third of a decade, or a little of the value, so that noise does not fill the panel; and of small
+        // numbers enough for two powers of ten or their triples, which alone are written briefly.
+        let least = match scale {
+            Scale::Log if high < -2.0 => 1.3,
+            Scale::Log => 0.35,
+            Scale::Linear => (0.02 * high.abs()).max(1e-9),
+        };
         let margin = (0.07 * (high - low)).max(0.5 * (least - (high - low)));
         Self { scale, low: low - margin, high: high + margin, from, to }
     }
@@ -477,6 +482,8 @@ mod tests {
         let around = Range::around(Scale::Log, [0.0, f64::NAN, 1.0, 100.0].into_iter(), (0.0, 1.0));
         assert!(around.low < 0.0 && around.low > -0.5 && around.high > 2.0, "zero does not count");
         let none = Range::around(Scale::Linear, std::iter::empty(), (0.0, 1.0));
+        let small = Range::around(Scale::Log, [1.1e-8].into_iter(), (0.0, 1.0));
+        assert_eq!(texts(&small), ["3·10⁻⁹", "10⁻⁸", "3·10⁻⁸"]);
         assert!(none.low < none.high);
     }
 
