@@ -1,12 +1,12 @@
-// Which tiles a Gaussian touches: those holding a pixel centre where its alpha can reach 1/255.
+// Which tiles a Gaussian touches: those holding a pixel centre where its alpha can reach the threshold alpha_min.
 //
-// alpha >= 1/255 is q(d) = xx dx^2 + 2 xy dx dy + yy dy^2 <= 2 ln(255 opacity) for conic (xx, xy, yy): an ellipse around
-// the mean. Per row of tiles its extent in x is found over the row's sample band; the right boundary x(dy) is concave, so
+// alpha >= alpha_min is q(d) = xx dx^2 + 2 xy dx dy + yy dy^2 <= 2 ln(opacity / alpha_min) for conic (xx, xy, yy): an
+// ellipse around the mean. Per row of tiles its extent in x is found over the row's sample band; the right boundary x(dy) is concave, so
 // its maximum over a band lies at the ellipse's own extreme clamped into the band.
 
 // The bound on q, widened by what float32 rounding of q in the rasteriser may take away, so that culling never decides
 // a pixel: 1e-3 absolute, 1e-4 relative.
-float support_bound(float opacity) { return 2.0 * log(255.0 * opacity) * 1.0001 + 1e-3; }
+float support_bound(float opacity, float alpha_min) { return 2.0 * log(opacity / alpha_min) * 1.0001 + 1e-3; }
 
 struct Support {
   float bound;
@@ -17,9 +17,9 @@ struct Support {
 };
 
 // Half the bounding box of {q <= bound} is sqrt(bound * covariance diagonal).
-Support support_of(vec2 mean, vec3 covariance, vec3 conic, float opacity, int tile, ivec2 tiles) {
+Support support_of(vec2 mean, vec3 covariance, vec3 conic, float opacity, float alpha_min, int tile, ivec2 tiles) {
   Support s;
-  s.bound = support_bound(opacity);
+  s.bound = support_bound(opacity, alpha_min);
   s.covariance = covariance;
   s.narrow = 1.0 / conic.x;
   s.half_size = sqrt(max(s.bound, 0.0) * vec2(covariance.x, covariance.z));

@@ -5,6 +5,7 @@
 // Conic of every Gaussian and the number of tiles it touches.
 layout(local_size_x = 64) in;
 #include "thread.glsl"
+layout(constant_id = 0) const float ALPHA_MIN = 0.00392156862745098; // a Gaussian touches the pixels where its alpha reaches this
 layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };       // [4] x, y, z of the dispatch; visible anchors
 layout(binding = 1, scalar) readonly buffer Mean { vec2 mean[]; };            // [slot] px
 layout(binding = 2, scalar) readonly buffer Covariance { vec3 covariance[]; }; // [slot] xx, xy, yy in px^2, 0.3 on the diagonal included
@@ -36,7 +37,7 @@ void main() {
   vec3 q = vec3(0.0);
   if (depth[s] > 0.0) {
     q = vec3(c.z, -c.y, c.x) / determinant(c);
-    Support support = support_of(mean[s], c, q, o, int(push.tile), ivec2(push.grid));
+    Support support = support_of(mean[s], c, q, o, ALPHA_MIN, int(push.tile), ivec2(push.grid));
     for (int row = support.row0; row <= support.row1; row++) {
       ivec2 columns = support_columns(support, mean[s], row, int(push.tile), ivec2(push.grid));
       n += uint(max(columns.y - columns.x + 1, 0));

@@ -1,7 +1,8 @@
 //! One picture from a finished model, for files and figures.
 
-use super::bin::{Bin, Tiling};
+use super::bin::Bin;
 use super::decode::{self, Decode};
+use super::method::Method;
 use super::project::{Gaussians, Project};
 use super::rasterize::{self, Outputs, Picture, Projected};
 use super::visible::Visible;
@@ -49,7 +50,7 @@ pub struct Forward {
     pub project: Project,
     /// Tiles' lists.
     pub bin: Bin,
-    tiling: Tiling,
+    method: Method,
     offsets: u32,
 }
 
@@ -62,7 +63,7 @@ impl Forward {
         gpu: &Gpu,
         capacity: Capacity,
         offsets: u32,
-        tiling: Tiling,
+        method: Method,
         size: [u32; 2],
         cull: bool,
     ) -> Result<Self, Error> {
@@ -70,15 +71,15 @@ impl Forward {
             visible: Visible::new(gpu, capacity.anchors, offsets, capacity.visible, cull)?,
             decode: Decode::new(gpu, capacity.visible, offsets)?,
             project: Project::new(gpu, capacity.visible, offsets)?,
-            bin: Bin::new(gpu, tiling, capacity.visible * offsets, capacity.pairs, size)?,
-            tiling,
+            bin: Bin::new(gpu, method, capacity.visible * offsets, capacity.pairs, size)?,
+            method,
             offsets,
         })
     }
 
-    /// Shape of the tiles.
-    pub fn tiling(&self) -> Tiling {
-        self.tiling
+    /// What the pictures are computed with.
+    pub fn method(&self) -> Method {
+        self.method
     }
 
     /// The decoded Gaussians as the projection reads them.
@@ -137,6 +138,7 @@ pub struct Renderer {
     gpu: Gpu,
     anchors: Anchors,
     weights: Buffer<f32>,
+    method: Method,
     near: f32,
     cull: bool,
     background: [f32; 3],
@@ -161,6 +163,7 @@ impl Renderer {
         let anchors = Anchors::upload(gpu, anchors, 0)?;
         Ok(Self {
             gpu: gpu.clone(),
+            method: Method::new(gpu, config)?,
             near: config.near as f32,
             cull: config.cull,
             background,
@@ -181,10 +184,16 @@ impl Renderer {
             let (forward, picture) = match self.stages.take() {
                 Some((forward, picture)) if picture.size == camera.size => (forward, picture),
                 _ => {
-                    let tiling = Tiling::of(self.gpu.info().subgroup_size);
                     let pixels = camera.size[0] as usize * camera.size[1] as usize;
                     (
-                        Forward::new(&self.gpu, self.capacity, self.anchors.offsets, tiling, camera.size, self.cull)?,
+                        Forward::new(
+                            &self.gpu,
+                            self.capacity,
+                            self.anchors.offsets,
+                            self.method,
+                            camera.size,
+                            self.cull,
+                        )?,
                         Picture::new(&self.gpu, camera.size, pixels, Outputs::ColorDepth)?,
                     )
                 }
@@ -226,6 +235,6 @@ impl Renderer {
         forward.decode.record(rec, model, &forward.visible.count, camera.center());
         forward.project.record(rec, &forward.visible.slots, forward.gaussians(), camera, *near);
         let binned = forward.bin.record(rec, forward.projected(), camera.size, limits);
-        rasterize::forward(rec, forward.tiling, forward.projected(), binned, self.background, picture);
+        rasterize::forward(rec, forward.method, forward.projected(), binned, self.background, picture);
     }
 }

@@ -2,7 +2,6 @@
 
 use crate::config::Settings;
 use crate::losses;
-use crate::render::bin::Tiling;
 use crate::render::rasterize::Outputs;
 use crate::scene::Scene;
 
@@ -115,10 +114,5 @@ impl Plan {
     /// The larger of each side over all training pictures.
     pub fn largest(&self) -> [u32; 2] {
         self.sizes.iter().fold([1, 1], |a, b| [a[0].max(b[0]), a[1].max(b[1])])
-    }
-
-    /// Tile shape on a device.
-    pub fn tiling(&self, subgroup_size: u32) -> Tiling {
-        Tiling::of(subgroup_size)
     }
 }

@@ -18,6 +18,7 @@ use crate::render::decode::{self, AnchorGradients, DecodeBackward, GaussianGradi
 use crate::render::project::{ProjectBackward, SplatGradients};
 use crate::render::rasterize::{self, Backward, Picture, PictureGradient};
 use crate::render::view::{Capacity, Forward};
+use crate::render::{Config, Method};
 use crate::scene::{Camera, PriorKind};
 
 use super::attend::{Attend, Attended};
@@ -53,9 +54,9 @@ struct Stages {
 }
 
 impl Stages {
-    fn new(gpu: &Gpu, plan: &Plan, capacity: Capacity, offsets: u32, cull: bool) -> Result<Self, Error> {
-        let forward =
-            Forward::new(gpu, capacity, offsets, plan.tiling(gpu.info().subgroup_size), plan.largest(), cull)?;
+    fn new(gpu: &Gpu, plan: &Plan, capacity: Capacity, offsets: u32, config: &Config) -> Result<Self, Error> {
+        let method = Method::new(gpu, config)?;
+        let forward = Forward::new(gpu, capacity, offsets, method, plan.largest(), config.cull)?;
         let slots = (capacity.visible * offsets) as usize;
         Ok(Self {
             rasterize: Backward::new(gpu, slots, capacity.pairs as usize, plan.outputs())?,
@@ -171,7 +172,7 @@ impl Step {
         rec.zero(&weights.root);
         rec.submit()?.wait()?;
         let capacity = Capacity::guess(anchors.capacity);
-        let stages = Stages::new(gpu, &plan, capacity, anchors.offsets, settings.render.cull)?;
+        let stages = Stages::new(gpu, &plan, capacity, anchors.offsets, &settings.render)?;
         let canvases = plan
             .sizes
             .iter()
@@ -214,10 +215,10 @@ impl Step {
     /// When the device has no room.
     pub fn resize(&mut self, capacity: Capacity) -> Result<(), Error> {
         // The old stages' memory goes before the new ones' is taken.
-        let cull = self.config.render.cull;
+        let config = &self.config.render;
         let smallest = Capacity { anchors: 1, visible: 1, pairs: 1 };
-        self.stages = Stages::new(&self.gpu, &self.plan, smallest, self.anchors.offsets, cull)?;
-        self.stages = Stages::new(&self.gpu, &self.plan, capacity, self.anchors.offsets, cull)?;
+        self.stages = Stages::new(&self.gpu, &self.plan, smallest, self.anchors.offsets, config)?;
+        self.stages = Stages::new(&self.gpu, &self.plan, capacity, self.anchors.offsets, config)?;
         self.gradients = Gradients::new(&self.gpu, &self.anchors, &self.weights)?;
         if let Some(attend) = &mut self.attend {
             attend.resize(&self.gpu, self.anchors.capacity)?;
@@ -372,12 +373,12 @@ impl Step {
         forward.decode.record(rec, model, &forward.visible.count, camera.center());
         forward.project.record(rec, &forward.visible.slots, forward.gaussians(), camera, *near);
         let binned = forward.bin.record(rec, forward.projected(), camera.size, limits);
-        rasterize::forward(rec, forward.tiling(), forward.projected(), binned, self.background, picture);
+        rasterize::forward(rec, forward.method(), forward.projected(), binned, self.background, picture);
 
         let gradient = compare(rec, canvas);
 
         let gradient = PictureGradient { rgb: gradient.rgb, depth: gradient.depth, transmittance: None };
-        backward.record(rec, forward.tiling(), forward.projected(), binned, picture, gradient);
+        backward.record(rec, forward.method(), forward.projected(), binned, picture, gradient);
         let splats = SplatGradients {
             mean: &backward.grad_mean,
             covariance: &backward.grad_covariance,
