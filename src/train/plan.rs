@@ -1,5 +1,6 @@
 //! What a scene needs: every stage that is present, and for each that is left out the reason.
 
+use super::photographs::reduced_size;
 use crate::config::Settings;
 use crate::losses;
 use crate::render::rasterize::Outputs;
@@ -29,7 +30,7 @@ pub struct Plan {
     pub growth: bool,
     /// The reference view, an index into the training views.
     pub reference: Option<usize>,
-    /// Distinct sizes of training pictures.
+    /// Distinct sizes of training pictures, at first those of the first step.
     pub sizes: Vec<[u32; 2]>,
     /// What is absent and why.
     pub left_out: Vec<LeftOut>,
@@ -92,11 +93,17 @@ impl Plan {
         if scene.test.is_empty() {
             leave("evaluation", "there are no test views");
         }
-        let mut sizes: Vec<[u32; 2]> = scene.train.iter().map(|v| v.camera.size).collect();
-        sizes.sort_unstable();
-        sizes.dedup();
+        let sizes = Self::reduced_sizes(scene, settings.train.coarse.reduction(1));
         let reference = scene.reference.as_ref().map(|r| r.view);
         Self { masks, depth, depth_gradient, attention, growth, reference, sizes, left_out }
+    }
+
+    /// The distinct sizes of the training pictures reduced by this factor.
+    pub fn reduced_sizes(scene: &Scene, reduction: u32) -> Vec<[u32; 2]> {
+        let mut sizes: Vec<_> = scene.train.iter().map(|v| reduced_size(v.camera.size, reduction)).collect();
+        sizes.sort_unstable();
+        sizes.dedup();
+        sizes
     }
 
     /// The losses of pictures of this size.

@@ -180,7 +180,7 @@ impl<'a> Run<'a> {
         let voxel = if settings.model.voxel > 0.0 { settings.model.voxel } else { derived() };
         let initial = init::anchors(&points, voxel, offsets)?;
         let weights = init::weights(settings.train.seed, offsets, plan.attention);
-        let photographs = photographs::upload(gpu, scene, plan.depth)?;
+        let photographs = photographs::upload(gpu, scene, plan.depth, settings.train.coarse.reduction(1))?;
         let step = Step::new(gpu, plan, settings, &initial.anchors, &weights, initial.voxel)?;
         let mailboxes = (0..DEPTH)
             .map(|_| {
@@ -215,7 +215,7 @@ impl<'a> Run<'a> {
     /// When the device has no room for the stages that begin with this step.
     pub fn record(&mut self, rec: &mut gpu::Recorder<'_>, step: u32) -> Result<String, Error> {
         let view = self.order.view(step);
-        self.step.prepare(step)?;
+        self.prepare(step)?;
         self.record_view(rec, step, view);
         Ok(self.photographs[view].name.clone())
     }
@@ -237,6 +237,18 @@ impl<'a> Run<'a> {
         }
     }
 
+    /// Makes what begins with this step and lets go of what is over: stages, and pictures of another size. Nothing may be
+    /// in flight where the pictures change.
+    fn prepare(&mut self, step: u32) -> Result<(), Error> {
+        let reduction = self.settings.train.coarse.reduction(step);
+        if self.photographs.first().is_some_and(|p| p.reduction != reduction) {
+            self.photographs.clear();
+            self.step.resize_pictures(Plan::reduced_sizes(self.scene, reduction))?;
+            self.photographs = photographs::upload(self.gpu, self.scene, self.step.plan.depth, reduction)?;
+        }
+        Ok(self.step.prepare(step)?)
+    }
+
     fn record_view(&self, rec: &mut gpu::Recorder<'_>, step: u32, view: usize) {
         let rates = Rates::at(self.settings, f64::from(self.scene.radius), step);
         self.step.record(rec, &self.photographs[view], step, rates);
@@ -244,7 +256,7 @@ impl<'a> Run<'a> {
 
     fn submit(&mut self, step: u32, mailbox: usize) -> Result<InFlight<'a>, Error> {
         let view = self.order.view(step);
-        self.step.prepare(step)?;
+        self.prepare(step)?;
         let mut rec = self.gpu.recorder()?;
         self.record_view(&mut rec, step, view);
         let mail = &self.mailboxes[mailbox];
@@ -261,6 +273,7 @@ impl<'a> Run<'a> {
     /// See [`Error`]. What was written before stays.
     pub fn train(&mut self, folder: &Path, watch: &mut dyn Observer) -> Result<Summary, Error> {
         let iterations = self.settings.train.iterations;
+        let coarse = self.settings.train.coarse;
         let log_path = folder.join("log.jsonl");
         let io = |path: &Path| {
             let path = path.to_owned();
@@ -282,8 +295,10 @@ impl<'a> Run<'a> {
             |interval: u32| move |step: u32| step == iterations || (interval > 0 && step.is_multiple_of(interval));
         let (evaluates, saves) = (every(self.settings.train.eval_interval), every(self.settings.train.save_interval));
         while done < iterations {
-            // What follows a change of the anchors, an evaluation or a save waits until it is made.
-            let pause_behind = |step: u32| self.step.changes_anchors(step) || evaluates(step) || saves(step);
+            // What follows a change of the anchors or of the pictures' size, an evaluation or a save waits until it is made.
+            let resizes = |step: u32| coarse.reduction(step) != coarse.reduction(step + 1);
+            let pause_behind =
+                |step: u32| self.step.changes_anchors(step) || resizes(step) || evaluates(step) || saves(step);
             let blocked = next > done + 1 && pause_behind(next - 1);
             if next <= iterations && in_flight.len() < DEPTH && !blocked {
                 let mailbox = (next as usize) % DEPTH;

@@ -73,6 +73,20 @@ struct Canvas {
     losses: Losses,
 }
 
+impl Canvas {
+    /// One for each size of the plan.
+    fn all(gpu: &Gpu, plan: &Plan, settings: &Settings) -> Result<Vec<Self>, Error> {
+        let canvas = |&size: &[u32; 2]| {
+            let pixels = size[0] as usize * size[1] as usize;
+            Ok(Self {
+                picture: Picture::new(gpu, size, pixels, plan.outputs())?,
+                losses: Losses::new(gpu, &plan.losses(size, settings))?,
+            })
+        };
+        plan.sizes.iter().map(canvas).collect()
+    }
+}
+
 /// Learning rates of one step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rates {
@@ -173,17 +187,7 @@ impl Step {
         rec.submit()?.wait()?;
         let capacity = Capacity::guess(anchors.capacity);
         let stages = Stages::new(gpu, &plan, capacity, anchors.offsets, &settings.render)?;
-        let canvases = plan
-            .sizes
-            .iter()
-            .map(|&size| {
-                let pixels = size[0] as usize * size[1] as usize;
-                Ok(Canvas {
-                    picture: Picture::new(gpu, size, pixels, plan.outputs())?,
-                    losses: Losses::new(gpu, &plan.losses(size, settings))?,
-                })
-            })
-            .collect::<Result<_, Error>>()?;
+        let canvases = Canvas::all(gpu, &plan, settings)?;
         Ok(Self {
             gradients: Gradients::new(gpu, &anchors, &weights)?,
             limits: Limits::new(gpu)?,
@@ -224,6 +228,18 @@ impl Step {
             attend.resize(&self.gpu, self.anchors.capacity)?;
         }
         self.capacity = capacity;
+        Ok(())
+    }
+
+    /// Goes on with training pictures of other sizes. Nothing of the step may be in flight.
+    ///
+    /// # Errors
+    /// When the device has no room.
+    pub fn resize_pictures(&mut self, sizes: Vec<[u32; 2]>) -> Result<(), Error> {
+        self.canvases.clear();
+        self.plan.sizes = sizes;
+        self.resize(self.capacity)?;
+        self.canvases = Canvas::all(&self.gpu, &self.plan, &self.config)?;
         Ok(())
     }
 
