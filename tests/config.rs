@@ -147,7 +147,8 @@ fn a_key_of_another_section_and_a_foreign_key_get_their_hints() {
     );
     assert_eq!(
         refusal(&["--set", "render.antialiasing=true"]),
-        "--set render.antialiasing=true: unknown setting `render.antialiasing`; `render` has near, cull"
+        "--set render.antialiasing=true: unknown setting `render.antialiasing`; `render` has near, cull, alpha_threshold, \
+         transmittance_threshold, depth_bits, tiles"
     );
     let message = refusal(&["--set", "quux=1"]);
     assert!(message.contains("unknown setting `quux`; the sections are train, scene, model"), "{message}");

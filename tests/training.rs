@@ -11,6 +11,7 @@ use gscream_vk::gpu::{Gpu, testing};
 use gscream_vk::model::files;
 use gscream_vk::render::view::{Capacity, Renderer};
 use gscream_vk::scene::{self, Scene};
+use gscream_vk::train::config::Coarse;
 use gscream_vk::train::run::{Run, Summary};
 
 /// What a run ends with.
@@ -106,6 +107,51 @@ fn steps_that_overflow_are_taken_again() {
             tight.assert_same(&ample, &format!("{what}, write_back {write_back}"));
         }
     }
+}
+
+/// Steps on reduced pictures are, to the byte, those of a scene read at that size; behind them nothing of it is left.
+#[test]
+fn smaller_pictures_come_first() {
+    let gpu = testing::gpu();
+    let folder = common::folder();
+    let scene = |downscale| {
+        let mut scene = common::load(&folder, &scene::Config { downscale, ..Default::default() });
+        scene.test.clear();
+        scene
+    };
+    let (full, half) = (scene(1), scene(2));
+    let mut settings = common::settings(13);
+    settings.model.attention.patch = 12;
+    let small = train(&gpu, &half, &settings, None);
+    settings.model.attention.patch = 24;
+    settings.train.coarse = Coarse { until: 13, factor: 2 };
+    train(&gpu, &full, &settings, None).assert_same(&small, "a scene at half its size");
+
+    // The change comes between two steps that would otherwise be in flight together.
+    settings.train.coarse.until = 7;
+    let mixed = train(&gpu, &full, &settings, None);
+    let (mixed_figures, small_figures) = (mixed.figures(), small.figures());
+    assert_eq!(mixed_figures[..7], small_figures[..7], "before the change");
+    for (mixed, small) in std::iter::zip(&mixed_figures, &small_figures).skip(7) {
+        assert_ne!(mixed.2, small.2, "step {} sees other pictures", mixed.0);
+    }
+    train(&gpu, &full, &settings, None).assert_same(&mixed, "once more");
+
+    let after_two_steps = |until| {
+        let settings = Settings {
+            train: gscream_vk::train::Config { coarse: Coarse { until, factor: 2 }, ..settings.train.clone() },
+            ..settings.clone()
+        };
+        let mut run = Run::new(&gpu, &full, &settings).expect("the device has room");
+        let at_first = (gpu.memory().0, run.step().plan.sizes.clone());
+        run.run_one(1).expect("a step");
+        run.run_one(2).expect("a step");
+        (at_first, (gpu.memory().0, run.step().plan.sizes.clone()))
+    };
+    let (at_once, coarse) = (after_two_steps(0), after_two_steps(1));
+    assert_eq!(coarse.0.1, [[24, 18]]);
+    assert!(coarse.0.0 < at_once.0.0, "smaller pictures take less memory");
+    assert_eq!(coarse.1, at_once.1, "bytes and sizes behind the change");
 }
 
 #[test]

@@ -1,12 +1,12 @@
-// Which tiles a Gaussian touches: those holding a pixel centre where its alpha can reach 1/255.
+// Which tiles a Gaussian touches: those holding a pixel centre where its alpha can reach the threshold alpha_min.
 //
-// alpha >= 1/255 is q(d) = (dx - k dy)^2 / N + dy^2 / V <= 2 ln(255 opacity) for the factored covariance (N, k, V): an
+// alpha >= alpha_min is q(d) = (dx - k dy)^2 / N + dy^2 / V <= 2 ln(opacity / alpha_min) for the factored covariance (N, k, V): an
 // ellipse around the mean. Per row of tiles its extent in x is found over the row's sample band; the right boundary x(dy) is concave, so
 // its maximum over a band lies at the ellipse's own extreme clamped into the band.
 
 // The bound on q, widened by what float32 rounding of q in the rasteriser may take away, so that culling never decides
 // a pixel: 1e-3 absolute, 1e-4 relative.
-float support_bound(float opacity) { return 2.0 * log(255.0 * opacity) * 1.0001 + 1e-3; }
+float support_bound(float opacity, float alpha_min) { return 2.0 * log(opacity / alpha_min) * 1.0001 + 1e-3; }
 
 struct Support {
   float bound;
@@ -17,9 +17,9 @@ struct Support {
 };
 
 // Half the bounding box of {q <= bound} is sqrt(bound * covariance diagonal), with xx = N + k^2 V.
-Support support_of(vec2 mean, vec3 covariance, float opacity, int tile, ivec2 tiles) {
+Support support_of(vec2 mean, vec3 covariance, float opacity, float alpha_min, int tile, ivec2 tiles) {
   Support s;
-  s.bound = support_bound(opacity);
+  s.bound = support_bound(opacity, alpha_min);
   s.covariance = covariance;
   float xy = covariance.y * covariance.z, xx = covariance.x + covariance.y * xy;
   s.half_size = sqrt(max(s.bound, 0.0) * vec2(xx, covariance.z));

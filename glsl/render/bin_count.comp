@@ -5,6 +5,7 @@
 // Conic of every Gaussian and the number of tiles it touches.
 layout(local_size_x = 64) in;
 #include "thread.glsl"
+layout(constant_id = 0) const float ALPHA_MIN = 0.00392156862745098; // a Gaussian touches the pixels where its alpha reaches this
 layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };       // [4] x, y, z of the dispatch; visible anchors
 layout(binding = 1, scalar) readonly buffer Mean { vec2 mean[]; };            // [slot] px
 layout(binding = 2, scalar) readonly buffer Covariance { vec3 covariance[]; }; // [slot] factored: variance of x given y, px^2; slope; variance of y, px^2
@@ -28,7 +29,7 @@ void main() {
   if (depth[s] > 0.0) {
     // Both variances are at least 0.3 and at most 2^120: so are their reciprocals normal numbers.
     q = vec3(1.0 / c.x, c.y, 1.0 / c.z);
-    Support support = support_of(mean[s], c, o, int(push.tile), ivec2(push.grid));
+    Support support = support_of(mean[s], c, o, ALPHA_MIN, int(push.tile), ivec2(push.grid));
     for (int row = support.row0; row <= support.row1; row++) {
       ivec2 columns = support_columns(support, mean[s], row, int(push.tile), ivec2(push.grid));
       n += uint(max(columns.y - columns.x + 1, 0));

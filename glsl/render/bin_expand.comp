@@ -6,6 +6,7 @@
 // leaves every tile's list in depth order.
 layout(local_size_x = 64) in;
 #include "thread.glsl"
+layout(constant_id = 0) const float ALPHA_MIN = 0.00392156862745098; // a Gaussian touches the pixels where its alpha reaches this
 layout(binding = 0, scalar) readonly buffer DrawnCount { uint drawn_count[]; }; // [1]
 layout(binding = 1, scalar) readonly buffer PairCount { uint pair_count[]; };   // [1] pairs; 0 when they do not fit
 layout(binding = 2, scalar) readonly buffer Order { uint order[]; };            // [rank] slot, nearest first
@@ -29,7 +30,7 @@ void main() {
   uint p = rank_first[r];
   uint end = p + tiles[s];
   first_pair[s] = p;
-  Support support = support_of(mean[s], covariance[s], opacity[s], int(push.tile), ivec2(push.grid));
+  Support support = support_of(mean[s], covariance[s], opacity[s], ALPHA_MIN, int(push.tile), ivec2(push.grid));
   for (int row = support.row0; row <= support.row1; row++) {
     ivec2 columns = support_columns(support, mean[s], row, int(push.tile), ivec2(push.grid));
     for (int column = columns.x; column <= columns.y && p < end; column++, p++) {

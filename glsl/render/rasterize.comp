@@ -19,6 +19,8 @@ layout(local_size_x = 8) in;
 const uint TILE = 16u, THREADS = 64u, ROWS = 4u;
 layout(local_size_x = 64) in;
 #endif
+layout(constant_id = 0) const float ALPHA_MIN = 0.00392156862745098; // samples below are skipped
+layout(constant_id = 1) const float TRANSMITTANCE_MIN = 1e-4; // a pixel is finished before it falls below
 layout(binding = 0, scalar) readonly buffer Ranges { uvec2 ranges[]; };         // [tile + 1] first, one past last in the sorted list
 layout(binding = 1, scalar) readonly buffer Sorted { uint sorted[]; };          // [pair] pair numbers by tile, nearest first
 layout(binding = 2, scalar) readonly buffer PairSlot { uint pair_slot[]; };     // [pair] slot of the Gaussian
@@ -58,8 +60,8 @@ void blend(vec2 m, vec3 q, float o, vec3 c, float z) {
     precise float power = -0.5 * (q.x * across * across + q.z * dy * dy);
     float alpha = min(0.99, o * exp(power));
     float after = T[r] * (1.0 - alpha);
-    bool hit = live[r] && alpha >= 1.0 / 255.0;
-    live[r] = live[r] && !(hit && after < 1e-4);
+    bool hit = live[r] && alpha >= ALPHA_MIN;
+    live[r] = live[r] && !(hit && after < TRANSMITTANCE_MIN);
     hit = hit && live[r];
     float w = hit ? alpha * T[r] : 0.0;
     sum_rgb[r] += w * c;

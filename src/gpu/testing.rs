@@ -60,7 +60,21 @@ pub fn run_once<'t, K: Reference>(
     push: K::Push,
     threads: impl Into<Threads<'t>>,
 ) -> K::Arrays {
-    K::arrays(&run_words::<K>(gpu, K::words(case.clone()), push, K::Constants::default(), threads.into()))
+    run_once_with::<K>(gpu, case, push, K::Constants::default(), threads)
+}
+
+/// As [`run_once`], with specialisation constants.
+///
+/// # Panics
+/// As [`run_once`].
+pub fn run_once_with<'t, K: Reference>(
+    gpu: &Gpu,
+    case: &K::Arrays,
+    push: K::Push,
+    constants: K::Constants,
+    threads: impl Into<Threads<'t>>,
+) -> K::Arrays {
+    K::arrays(&run_words::<K>(gpu, K::words(case.clone()), push, constants, threads.into()))
 }
 
 fn run_words<K: Reference>(

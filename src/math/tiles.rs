@@ -1,7 +1,7 @@
 //! Which tiles a Gaussian touches: the same float32 operations as `glsl/include/tiles.glsl`, because the result is a
 //! discrete decision.
 
-/// The ellipse in which a Gaussian's alpha can reach 1/255, and the tile rows it spans.
+/// The ellipse in which a Gaussian's alpha can reach the threshold, and the tile rows it spans.
 #[derive(Clone, Copy, Debug)]
 pub struct Support {
     bound: f32,
@@ -14,15 +14,21 @@ pub struct Support {
     pub row1: i32,
 }
 
-/// 2 ln(255 opacity), widened by what rounding of the quadratic form may take away.
-pub fn support_bound(opacity: f32) -> f32 {
-    2.0 * (255.0 * opacity).ln() * 1.0001 + 1e-3
+/// 2 ln(opacity / alpha_min), widened by what rounding of the quadratic form may take away.
+pub fn support_bound(opacity: f32, alpha_min: f32) -> f32 {
+    2.0 * (opacity / alpha_min).ln() * 1.0001 + 1e-3
 }
 
 impl Support {
-    /// Of a Gaussian (mean px, factored covariance px^2) on a grid of square tiles.
-    pub fn new(mean: [f32; 2], covariance: [f32; 3], opacity: f32, tile: u32, grid: [u32; 2]) -> Self {
-        let bound = support_bound(opacity);
+    /// Of a Gaussian (mean px, factored covariance px^2, opacity and the alpha it must reach) on a grid of square tiles.
+    pub fn new(
+        mean: [f32; 2],
+        covariance: [f32; 3],
+        (opacity, alpha_min): (f32, f32),
+        tile: u32,
+        grid: [u32; 2],
+    ) -> Self {
+        let bound = support_bound(opacity, alpha_min);
         let [narrow, slope, variance] = covariance;
         let xy = slope * variance;
         let xx = narrow + slope * xy;
@@ -74,11 +80,12 @@ mod tests {
     use proptest::prelude::*;
 
     proptest! {
-        /// No pixel that can reach alpha 1/255 lies outside the tiles found, and no tile found is far from one.
+        /// No pixel that can reach the threshold lies outside the tiles found, and no tile found is far from one.
         #[test]
         fn tiles_hold_the_support(
             mx in -40f32..140.0, my in -40f32..120.0, a in 0.0f32..60.0, b in 0.0f32..4.0, angle in 0f32..3.2,
             opacity in 0.003f32..1.0, tile in prop::sample::select(vec![8u32, 16]),
+            alpha_min in prop::sample::select(vec![1f32 / 255.0, 1e-3, 0.02]),
         ) {
             let (s, c) = angle.sin_cos();
             let (a2, b2) = (a * a, b * b);
@@ -87,13 +94,13 @@ mod tests {
             let [narrow, slope, variance] = covariance;
             let size = [97u32, 83];
             let grid = size.map(|n| n.div_ceil(tile));
-            let found = Support::new([mx, my], covariance, opacity, tile, grid).tiles([mx, my], tile, grid);
+            let found = Support::new([mx, my], covariance, (opacity, alpha_min), tile, grid).tiles([mx, my], tile, grid);
             for y in 0..grid[1] * tile {
                 for x in 0..grid[0] * tile {
                     let (dx, dy) = (x as f32 + 0.5 - mx, y as f32 + 0.5 - my);
                     let across = dx - slope * dy;
                     let power = -0.5 * (across * across / narrow + dy * dy / variance);
-                    if opacity * power.exp() >= 1.0 / 255.0 {
+                    if opacity * power.exp() >= alpha_min {
                         let t = y / tile * grid[0] + x / tile;
                         prop_assert!(found.contains(&t), "pixel {x},{y} of tile {t} is missed by {found:?}");
                     }

@@ -1,9 +1,10 @@
 use serde::{Deserialize, Serialize};
 
+use super::rasterize::{ALPHA_MIN, TRANSMITTANCE_MIN};
 use crate::config::{Invalid, ensure};
 
-/// How anchors become a picture. The low-pass (0.3 px^2), the alpha cut-offs and the stopping transmittance define the
-/// picture and are not settings.
+/// How anchors become a picture. The low-pass (0.3 px^2) and the largest alpha (0.99) define the picture and are not
+/// settings.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default, expecting = "a table")]
 pub struct Config {
@@ -12,17 +13,59 @@ pub struct Config {
     /// Decode only the anchors whose own ellipsoid touches the view (Scaffold-GS). A Gaussian whose anchor is out of view
     /// is then not drawn; without culling every anchor is decoded in every step.
     pub cull: bool,
+    /// A Gaussian does not touch a pixel where its alpha is below this (3DGS: 1/255).
+    pub alpha_threshold: f64,
+    /// A pixel is finished before the Gaussian that would bring its transmittance below this (3DGS: 1e-4); 0 never
+    /// finishes early.
+    pub transmittance_threshold: f64,
+    /// Bits of the depth in the sort key. From 31 every float has its own key, with 28 every float up to 2^32 times
+    /// `near`; with b < 28 depths within `2^(5 - b)` of each other may be drawn in the order of their anchors.
+    pub depth_bits: u32,
+    /// Shape of the rasteriser's tiles. Changes the time only.
+    pub tiles: Tiles,
+}
+
+/// Shape of the rasteriser's tiles.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Tiles {
+    /// The better one for the device.
+    Auto,
+    /// 16 x 16 pixels, 64 threads.
+    Wide,
+    /// 8 x 8 pixels, 8 threads: only where subgroups have 8 threads (CPU drivers).
+    Narrow,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        Self { near: 0.2, cull: true }
+        Self {
+            near: 0.2,
+            cull: true,
+            alpha_threshold: ALPHA_MIN,
+            transmittance_threshold: TRANSMITTANCE_MIN,
+            depth_bits: 28,
+            tiles: Tiles::Auto,
+        }
     }
 }
 
 impl Config {
     /// Refuses values that no run could use.
     pub fn validate(&self) -> Result<(), Invalid> {
-        ensure(self.near.is_finite() && self.near > 0.0, "near", self.near, "must be positive")
+        ensure(self.near.is_finite() && self.near > 0.0, "near", self.near, "must be positive")?;
+        ensure(
+            (1e-6..=0.5).contains(&self.alpha_threshold),
+            "alpha_threshold",
+            self.alpha_threshold,
+            "must be between 0.000001 and 0.5",
+        )?;
+        ensure(
+            (0.0..=0.5).contains(&self.transmittance_threshold),
+            "transmittance_threshold",
+            self.transmittance_threshold,
+            "must be between 0 and 0.5",
+        )?;
+        ensure((8..=32).contains(&self.depth_bits), "depth_bits", self.depth_bits, "must be between 8 and 32")
     }
 }

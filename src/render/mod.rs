@@ -4,9 +4,11 @@ pub mod bin;
 pub mod config;
 pub mod cull;
 pub mod decode;
+pub mod method;
 pub mod project;
 pub mod rasterize;
 pub mod view;
 pub mod visible;
 
 pub use config::Config;
+pub use method::Method;

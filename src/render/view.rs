@@ -1,7 +1,8 @@
 //! One picture from a finished model, for files and figures.
 
-use super::bin::{Bin, Tiling};
+use super::bin::Bin;
 use super::decode::{self, Decode};
+use super::method::Method;
 use super::project::{Gaussians, Project};
 use super::rasterize::{self, Outputs, Picture, Projected};
 use super::visible::Visible;
@@ -50,7 +51,7 @@ pub struct Forward {
     pub project: Project,
     /// Tiles' lists.
     pub bin: Bin,
-    tiling: Tiling,
+    method: Method,
     offsets: u32,
 }
 
@@ -63,7 +64,7 @@ impl Forward {
         gpu: &Gpu,
         capacity: Capacity,
         offsets: u32,
-        tiling: Tiling,
+        method: Method,
         size: [u32; 2],
         cull: bool,
     ) -> Result<Self, Error> {
@@ -71,15 +72,15 @@ impl Forward {
             visible: gpu.stage(stage::CULL, || Visible::new(gpu, capacity.anchors, offsets, capacity.visible, cull))?,
             decode: gpu.stage(stage::DECODE, || Decode::new(gpu, capacity.visible, offsets))?,
             project: gpu.stage(stage::PROJECT, || Project::new(gpu, capacity.visible, offsets))?,
-            bin: gpu.stage(stage::BIN, || Bin::new(gpu, tiling, capacity.visible * offsets, capacity.pairs, size))?,
-            tiling,
+            bin: gpu.stage(stage::BIN, || Bin::new(gpu, method, capacity.visible * offsets, capacity.pairs, size))?,
+            method,
             offsets,
         })
     }
 
-    /// Shape of the tiles.
-    pub fn tiling(&self) -> Tiling {
-        self.tiling
+    /// What the pictures are computed with.
+    pub fn method(&self) -> Method {
+        self.method
     }
 
     /// The decoded Gaussians as the projection reads them.
@@ -145,6 +146,7 @@ pub struct Model<'a> {
 /// The stages that draw views of a model.
 pub struct Painter {
     gpu: Gpu,
+    method: Method,
     near: f32,
     cull: bool,
     background: [f32; 3],
@@ -161,6 +163,7 @@ impl Painter {
     pub fn new(gpu: &Gpu, config: &super::Config, background: [f32; 3], capacity: Capacity) -> Result<Self, Error> {
         Ok(Self {
             gpu: gpu.clone(),
+            method: Method::new(gpu, config)?,
             near: config.near as f32,
             cull: config.cull,
             background,
@@ -184,11 +187,10 @@ impl Painter {
                 // Those of another size go before these are made.
                 old => {
                     drop(old);
-                    let tiling = Tiling::of(self.gpu.info().subgroup_size);
                     let pixels = camera.size[0] as usize * camera.size[1] as usize;
                     let offsets = model.anchors.offsets;
                     (
-                        Forward::new(&self.gpu, self.capacity, offsets, tiling, camera.size, self.cull)?,
+                        Forward::new(&self.gpu, self.capacity, offsets, self.method, camera.size, self.cull)?,
                         Picture::new(&self.gpu, camera.size, pixels, Outputs::ColorDepth)?,
                     )
                 }
@@ -231,7 +233,7 @@ impl Painter {
         forward.decode.record(rec, model, &forward.visible.count, camera.center());
         forward.project.record(rec, &forward.visible.slots, forward.gaussians(), camera, *near);
         let binned = forward.bin.record(rec, forward.projected(), camera.size, limits);
-        rasterize::forward(rec, forward.tiling, forward.projected(), binned, self.background, picture);
+        rasterize::forward(rec, forward.method, forward.projected(), binned, self.background, picture);
     }
 }
 

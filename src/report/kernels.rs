@@ -169,7 +169,7 @@ pub fn measure(
         let plan = Plan::new(scene, &variant.settings);
         let photographs = match photographs.entry(plan.depth) {
             Entry::Occupied(there) => there.get().clone(),
-            Entry::Vacant(free) => free.insert(Rc::new(photographs::upload(gpu, &subset, &plan)?)).clone(),
+            Entry::Vacant(free) => free.insert(Rc::new(photographs::upload(gpu, &subset, &plan, 1)?)).clone(),
         };
         benches.push(Bench::new(gpu, scene, variant, plan, photographs, &warm, step)?);
     }

@@ -22,7 +22,7 @@ pub mod colmap;
 mod layout;
 pub mod path;
 mod priors;
-mod resample;
+pub(crate) mod resample;
 pub mod synthetic;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -585,7 +585,7 @@ impl Reader<'_> {
 }
 
 /// A side divided by `by`, rounded to the nearest pixel and never 0.
-fn reduced(side: u32, by: u32) -> u32 {
+pub(crate) fn reduced(side: u32, by: u32) -> u32 {
     ((u64::from(side) + u64::from(by) / 2) / u64::from(by)).max(1) as u32
 }
 

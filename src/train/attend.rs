@@ -120,7 +120,8 @@ impl Attend {
             size: camera.size,
         };
         let mut rng = random(self.seed, Stream::Patch, step);
-        let patch = patch_position(&mut rng, ([x0, y0], [x1, y1]), self.config.patch, camera.size);
+        let side = (self.config.patch / photograph.reduction).max(1);
+        let patch = patch_position(&mut rng, ([x0, y0], [x1, y1]), side, camera.size);
         let draw = Draw { patch, seed: self.seed as u32, step };
         let Room { select, sort, blended } = self.room();
         let listed = (&visible.list, &visible.count, anchors.count);

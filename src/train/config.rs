@@ -26,6 +26,32 @@ pub struct Config {
     /// Steps between two searches of all gradients, parameters and moments for values that are not finite. The losses and
     /// the networks' gradients are searched in every step. 0 searches nothing: a broken model trains on.
     pub sentinel_interval: u32,
+    /// Smaller pictures first.
+    pub coarse: Coarse,
+}
+
+/// Smaller pictures first: the first steps train on the training pictures reduced once more, as `scene.downscale`
+/// reduces them. Which steps those are depends on the step alone, so that a resumed run goes on as it would have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default, expecting = "a table")]
+pub struct Coarse {
+    /// Last step on reduced pictures; 0 trains on pictures of the full training size from the beginning.
+    pub until: u32,
+    /// Both sides are divided by this.
+    pub factor: u32,
+}
+
+impl Default for Coarse {
+    fn default() -> Self {
+        Self { until: 0, factor: 2 }
+    }
+}
+
+impl Coarse {
+    /// By how much the pictures of `step` (counted from 1) are reduced: 1 is the full training size.
+    pub fn reduction(&self, step: u32) -> u32 {
+        if step <= self.until { self.factor } else { 1 }
+    }
 }
 
 /// How the next training view is drawn.
@@ -50,6 +76,7 @@ impl Default for Config {
             save_interval: 5_000,
             checkpoint_interval: 1_000,
             sentinel_interval: 50,
+            coarse: Coarse::default(),
         }
     }
 }
@@ -70,6 +97,8 @@ impl Config {
             format_args!("{:?}", self.background),
             "must be three numbers between 0 and 1",
         )?;
-        ensure(self.log_interval > 0, "log_interval", self.log_interval, "must be at least 1")
+        ensure(self.log_interval > 0, "log_interval", self.log_interval, "must be at least 1")?;
+        let factor = self.coarse.factor;
+        ensure((2..=16).contains(&factor), "coarse.factor", factor, "must be between 2 and 16")
     }
 }

@@ -19,8 +19,8 @@ use crate::gpu::{self, Gpu, Schedule, Used};
 use crate::model::anchors::Anchors;
 use crate::model::init::{self, Initial};
 use crate::primitives::limit::{Counter, Limits};
-use crate::render::decode;
 use crate::render::view::{Capacity, Forward};
+use crate::render::{Method, decode};
 use crate::scene::{Camera, Prior, Reference, Scene, View};
 use crate::stage;
 
@@ -82,12 +82,12 @@ pub fn survey<'c>(
     let weights = gpu.upload("weights", &flat)?;
     let anchors = Anchors::upload(gpu, &initial.anchors, 0)?;
     let size = cameras.iter().fold([1, 1], |a, c| [a[0].max(c.size[0]), a[1].max(c.size[1])]);
-    let tiling = crate::render::bin::Tiling::of(gpu.info().subgroup_size);
+    let method = Method::new(gpu, &settings.render)?;
     let limits = Limits::new(gpu)?;
     let near = settings.render.near as f32;
     // Pairs are counted whether they fit or not.
     let mut capacity = Capacity { pairs: 1, ..Capacity::guess(anchors.capacity) };
-    let mut forward = Forward::new(gpu, capacity, offsets, tiling, size, settings.render.cull)?;
+    let mut forward = Forward::new(gpu, capacity, offsets, method, size, settings.render.cull)?;
     let mut most = Survey { anchors: anchors.count, visible: 0, pairs: 0 };
     for camera in cameras {
         loop {
@@ -115,7 +115,7 @@ pub fn survey<'c>(
             }
             drop(forward);
             capacity.visible = visible.saturating_add(visible / 2).min(anchors.capacity);
-            forward = Forward::new(gpu, capacity, offsets, tiling, size, settings.render.cull)?;
+            forward = Forward::new(gpu, capacity, offsets, method, size, settings.render.cull)?;
         }
     }
     Ok(most)
@@ -224,7 +224,8 @@ pub fn rehearse(
     let plan = Plan::new(scene, settings);
     let offsets = settings.model.offsets as usize;
     let weights = init::weights(settings.train.seed, offsets, plan.attention);
-    let photographs = photographs::upload(&gpu, scene, &plan)?;
+    let coarse = settings.train.coarse;
+    let mut photographs = photographs::upload(&gpu, scene, &plan, coarse.reduction(1))?;
     let mut step = Step::new(&gpu, plan.clone(), settings, &initial.anchors, &weights, initial.voxel)?;
     let capacity = survey.capacity();
     step.resize(capacity)?;
@@ -246,12 +247,20 @@ pub fn rehearse(
     let every = settings.densify.every as usize;
     let rounds: Vec<u32> = plan.rounds.map_or(vec![], |r| (r.first..=r.last).step_by(every).collect());
     at.extend(&rounds);
+    at.extend((coarse.until > 0).then_some(coarse.until + 1));
     at.retain(|&s| s <= iterations || Some(s) == also);
     let kinds = kinds(scene);
     let mut schedules = BTreeMap::new();
     let grown = f64::from(anchors.saturating_sub(survey.anchors));
     let share = |r: usize| r as f64 / (r as f64 + 8.0);
     for number in at {
+        let reduction = coarse.reduction(number);
+        if photographs.first().is_some_and(|p| p.reduction != reduction) {
+            photographs.clear();
+            step.resize_pictures(Plan::reduced_sizes(scene, reduction))?;
+            photographs = photographs::upload(&gpu, scene, &plan, reduction)?;
+            note("pictures of the full size", number, step.anchors.count);
+        }
         step.prepare(number)?;
         let kept = !rounds.contains(&number) || Some(number) == also;
         if kept {

@@ -1,19 +1,26 @@
 //! The training pictures on the device: 8 bits per channel, the mask in the fourth byte.
+//!
+//! Reduced pictures are made as `scene.downscale` makes them: area averages of picture and prior, "any object pixel"
+//! for the mask, the camera scaled by the exact ratio of each side.
+
+use std::borrow::Cow;
 
 use image::{GrayImage, RgbImage};
 
 use super::plan::Plan;
 use crate::gpu::{Buffer, Error, Gpu};
 use crate::losses;
-use crate::scene::{Camera, Prior, PriorKind, Scene};
+use crate::scene::{Camera, Prior, PriorKind, Scene, reduced, resample};
 use crate::stage;
 
 /// One training view on the device.
 pub struct Photograph {
     /// The view's name.
     pub name: String,
-    /// Its camera.
+    /// Its camera, at the size of the picture.
     pub camera: Camera,
+    /// How many times smaller the picture is than the training size.
+    pub reduction: u32,
     /// True for the reference view: its picture is the inpainted one.
     pub reference: bool,
     /// `[pixel]` red | green << 8 | blue << 16 | mask << 24.
@@ -38,11 +45,16 @@ pub fn mask_box(mask: &GrayImage) -> Option<[u32; 4]> {
     })
 }
 
-/// Uploads all training views. Priors stay behind that no loss looks at.
+/// The size of a picture reduced by this factor.
+pub fn reduced_size(size: [u32; 2], reduction: u32) -> [u32; 2] {
+    size.map(|n| reduced(n, reduction))
+}
+
+/// Uploads all training views, reduced by this factor (1: as they are). Priors stay behind that no loss looks at.
 ///
 /// # Errors
 /// When the device has no room.
-pub fn upload(gpu: &Gpu, scene: &Scene, plan: &Plan) -> Result<Vec<Photograph>, Error> {
+pub fn upload(gpu: &Gpu, scene: &Scene, plan: &Plan, reduction: u32) -> Result<Vec<Photograph>, Error> {
     let mut all = vec![];
     for (i, view) in scene.train.iter().enumerate() {
         let reference = scene.reference.as_ref().filter(|r| r.view == i);
@@ -51,18 +63,32 @@ pub fn upload(gpu: &Gpu, scene: &Scene, plan: &Plan) -> Result<Vec<Photograph>, 
             Some(r) => r.prior.as_ref(),
             None => view.prior.as_ref(),
         };
+        let full = view.camera.size;
+        let size = reduced_size(full, reduction);
+        let smaller = size != full;
+        let picture = if smaller { Cow::Owned(resample::photograph(picture, size)) } else { Cow::Borrowed(picture) };
+        let mask = match &view.mask {
+            Some(mask) if smaller => Some(Cow::Owned(resample::mask(mask, size))),
+            mask => mask.as_ref().map(Cow::Borrowed),
+        };
+        let mask = mask.as_deref();
         let prior = match prior.filter(|_| plan.depth_losses(reference.is_some()).any()) {
-            Some(Prior { kind, values }) => Some((*kind, gpu.stage(stage::PICTURES, || gpu.upload("prior", values))?)),
+            Some(Prior { kind, values }) => {
+                let values =
+                    if smaller { Cow::Owned(resample::map(values, full, size)) } else { Cow::Borrowed(values) };
+                Some((*kind, gpu.stage(stage::PICTURES, || gpu.upload("prior", &values))?))
+            }
             None => None,
         };
-        let words = pack(picture, view.mask.as_ref());
+        let words = pack(&picture, mask);
         all.push(Photograph {
             name: view.name.clone(),
-            camera: view.camera,
+            camera: view.camera.scaled(size),
+            reduction,
             reference: reference.is_some(),
             picture: gpu.stage(stage::PICTURES, || gpu.upload("picture", &words))?,
             prior,
-            mask_box: view.mask.as_ref().and_then(mask_box),
+            mask_box: mask.and_then(mask_box),
         });
     }
     Ok(all)

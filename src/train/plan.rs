@@ -1,8 +1,8 @@
 //! What a scene needs: every stage that is present, from which step to which, and for each that is left out the reason.
 
+use super::photographs::reduced_size;
 use crate::config::Settings;
 use crate::losses;
-use crate::render::bin::Tiling;
 use crate::render::rasterize::Outputs;
 use crate::scene::Scene;
 use crate::stage;
@@ -99,7 +99,7 @@ pub struct Plan {
     pub evaluation: bool,
     /// The reference view, an index into the training views.
     pub reference: Option<usize>,
-    /// Distinct sizes of training pictures.
+    /// Distinct sizes of training pictures, at first those of the first step.
     pub sizes: Vec<[u32; 2]>,
     /// Steps.
     pub iterations: u32,
@@ -229,9 +229,7 @@ impl Plan {
         if !evaluation {
             leave("evaluation", "there are no test views");
         }
-        let mut sizes: Vec<[u32; 2]> = scene.train.iter().map(|v| v.camera.size).collect();
-        sizes.sort_unstable();
-        sizes.dedup();
+        let sizes = Self::reduced_sizes(scene, settings.train.coarse.reduction(1));
         Self {
             masks,
             depth,
@@ -251,6 +249,14 @@ impl Plan {
             iterations,
             left_out,
         }
+    }
+
+    /// The distinct sizes of the training pictures reduced by this factor.
+    pub fn reduced_sizes(scene: &Scene, reduction: u32) -> Vec<[u32; 2]> {
+        let mut sizes: Vec<_> = scene.train.iter().map(|v| reduced_size(v.camera.size, reduction)).collect();
+        sizes.sort_unstable();
+        sizes.dedup();
+        sizes
     }
 
     /// The losses of pictures of this size.
@@ -273,11 +279,6 @@ impl Plan {
     /// The larger of each side over all training pictures.
     pub fn largest(&self) -> [u32; 2] {
         self.sizes.iter().fold([1, 1], |a, b| [a[0].max(b[0]), a[1].max(b[1])])
-    }
-
-    /// Tile shape on a device.
-    pub fn tiling(&self, subgroup_size: u32) -> Tiling {
-        Tiling::of(subgroup_size)
     }
 
     /// The steps that a stage of [`stage::ALL`] takes part in; `None` for one that is left out. What comes behind a step

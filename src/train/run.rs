@@ -399,7 +399,7 @@ impl<'a> Run<'a> {
         step: Step,
         history: History,
     ) -> Result<Self, Error> {
-        let photographs = photographs::upload(gpu, scene, &step.plan)?;
+        let photographs = photographs::upload(gpu, scene, &step.plan, settings.train.coarse.reduction(1))?;
         // As many recordings as will ever be open at once, so that the log's bytes do not say when a run was resumed.
         drop((0..=DEPTH).map(|_| gpu.recorder()).collect::<Result<Vec<_>, _>>()?);
         let mailboxes = (0..DEPTH)
@@ -451,7 +451,7 @@ impl<'a> Run<'a> {
     /// When the device has no room for the stages that begin with this step.
     pub fn record(&mut self, rec: &mut gpu::Recorder<'_>, step: u32) -> Result<String, Error> {
         let view = self.order.view(step);
-        self.step.prepare(step)?;
+        self.prepare(step)?;
         self.record_view(rec, step, view);
         Ok(self.photographs[view].name.clone())
     }
@@ -479,6 +479,18 @@ impl<'a> Run<'a> {
         }
     }
 
+    /// Makes what begins with this step and lets go of what is over: stages, and pictures of another size. Nothing may be
+    /// in flight where the pictures change.
+    fn prepare(&mut self, step: u32) -> Result<(), Error> {
+        let reduction = self.settings.train.coarse.reduction(step);
+        if self.photographs.first().is_some_and(|p| p.reduction != reduction) {
+            self.photographs.clear();
+            self.step.resize_pictures(Plan::reduced_sizes(self.scene, reduction))?;
+            self.photographs = photographs::upload(self.gpu, self.scene, &self.step.plan, reduction)?;
+        }
+        Ok(self.step.prepare(step)?)
+    }
+
     fn record_view(&self, rec: &mut gpu::Recorder<'_>, step: u32, view: usize) {
         let rates = Rates::at(self.settings, f64::from(self.scene.radius), step);
         self.step.record(rec, &self.photographs[view], step, rates);
@@ -486,7 +498,7 @@ impl<'a> Run<'a> {
 
     fn submit(&mut self, step: u32, mailbox: usize) -> Result<InFlight<'a>, Error> {
         let view = self.order.view(step);
-        self.step.prepare(step)?;
+        self.prepare(step)?;
         let mut rec = self.gpu.recorder()?;
         self.record_view(&mut rec, step, view);
         let mail = &self.mailboxes[mailbox];
@@ -579,7 +591,7 @@ impl<'a> Run<'a> {
             if halt.is_none() {
                 halt = watch.interrupted().map(|signal| Error::Interrupted { signal });
             }
-            // What follows a change of the anchors, an evaluation, a save or a checkpoint waits until it is made.
+            // What follows a change of the anchors or of the pictures' size, an evaluation, a save or a checkpoint waits until it is made.
             let behind = next > history.last.step + 1;
             let blocked = halt.is_some() || behind && (session.careful || self.pauses_behind(next - 1));
             if next <= iterations && in_flight.len() < DEPTH && !blocked {
@@ -836,7 +848,9 @@ impl<'a> Run<'a> {
     }
 
     fn pauses_behind(&self, step: u32) -> bool {
-        self.step.changes_anchors(step) || self.evaluates(step) || self.saves(step) || self.checkpoints(step)
+        let coarse = self.settings.train.coarse;
+        let resizes = coarse.reduction(step) != coarse.reduction(step + 1);
+        self.step.changes_anchors(step) || resizes || self.evaluates(step) || self.saves(step) || self.checkpoints(step)
     }
 
     /// Whose the checkpoints of this run are.

@@ -19,6 +19,7 @@ use crate::render::decode::{self, DecodeBackward, GaussianGradients, WantedGradi
 use crate::render::project::{ProjectBackward, SplatGradients};
 use crate::render::rasterize::{self, Backward, Picture, PictureGradient};
 use crate::render::view::{Capacity, Forward, Model, Painter, Rendered};
+use crate::render::{Config, Method};
 use crate::scene::{Camera, PriorKind};
 use crate::stage;
 
@@ -63,11 +64,11 @@ impl Stages {
         capacity: Capacity,
         anchors: &Anchors,
         weights: &Parameter,
-        cull: bool,
+        config: &Config,
     ) -> Result<Self, Error> {
         let (offsets, trained) = (anchors.offsets, plan.trained);
-        let forward =
-            Forward::new(gpu, capacity, offsets, plan.tiling(gpu.info().subgroup_size), plan.largest(), cull)?;
+        let method = Method::new(gpu, config)?;
+        let forward = Forward::new(gpu, capacity, offsets, method, plan.largest(), config.cull)?;
         let slots = (capacity.visible * offsets) as usize;
         let pairs = capacity.pairs as usize;
         Ok(Self {
@@ -86,6 +87,21 @@ impl Stages {
 struct Canvas {
     picture: Picture,
     losses: Losses,
+}
+
+impl Canvas {
+    /// One for each size of the plan.
+    fn all(gpu: &Gpu, plan: &Plan, settings: &Settings) -> Result<Vec<Self>, Error> {
+        let canvas = |&size: &[u32; 2]| {
+            let pixels = size[0] as usize * size[1] as usize;
+            let picture = || Picture::new(gpu, size, pixels, plan.outputs());
+            Ok(Self {
+                picture: gpu.stage(stage::RASTERIZE, picture)?,
+                losses: Losses::new(gpu, &plan.losses(size, settings))?,
+            })
+        };
+        plan.sizes.iter().map(canvas).collect()
+    }
 }
 
 /// Learning rates of one step.
@@ -188,19 +204,8 @@ impl Step {
         rec.zero(&weights.root);
         rec.submit()?.wait()?;
         let capacity = Capacity::guess(anchors.capacity);
-        let stages = Stages::new(gpu, &plan, capacity, &anchors, &weights, settings.render.cull)?;
-        let canvases = plan
-            .sizes
-            .iter()
-            .map(|&size| {
-                let pixels = size[0] as usize * size[1] as usize;
-                let picture = || Picture::new(gpu, size, pixels, plan.outputs());
-                Ok(Canvas {
-                    picture: gpu.stage(stage::RASTERIZE, picture)?,
-                    losses: Losses::new(gpu, &plan.losses(size, settings))?,
-                })
-            })
-            .collect::<Result<_, Error>>()?;
+        let stages = Stages::new(gpu, &plan, capacity, &anchors, &weights, &settings.render)?;
+        let canvases = Canvas::all(gpu, &plan, settings)?;
         Ok(Self {
             limits: Limits::new(gpu)?,
             gpu: gpu.clone(),
@@ -248,7 +253,7 @@ impl Step {
     fn furnish(&mut self) -> Result<(), Error> {
         let Self { gpu, plan, anchors, weights, config, .. } = self;
         self.capacity.anchors = anchors.capacity;
-        self.stages = Some(Stages::new(gpu, plan, self.capacity, anchors, weights, config.render.cull)?);
+        self.stages = Some(Stages::new(gpu, plan, self.capacity, anchors, weights, &config.render)?);
         if let Some(attend) = &mut self.attend {
             gpu.stage(stage::ATTENTION, || attend.furnish(gpu, anchors.capacity))?;
         }
@@ -277,6 +282,18 @@ impl Step {
             cameras.into_iter().enumerate().try_for_each(|(i, camera)| look(i, painter.render(model, camera)?))
         })?;
         Ok(self.furnish()?)
+    }
+
+    /// Goes on with training pictures of other sizes. Nothing of the step may be in flight.
+    ///
+    /// # Errors
+    /// When the device has no room.
+    pub fn resize_pictures(&mut self, sizes: Vec<[u32; 2]>) -> Result<(), Error> {
+        self.canvases.clear();
+        self.plan.sizes = sizes;
+        self.resize(self.capacity)?;
+        self.canvases = Canvas::all(&self.gpu, &self.plan, &self.config)?;
+        Ok(())
     }
 
     /// What the stages have room for.
@@ -454,13 +471,13 @@ impl Step {
         rec.stage(stage::BIN);
         let binned = forward.bin.record(rec, forward.projected(), camera.size, limits);
         rec.stage(stage::RASTERIZE);
-        rasterize::forward(rec, forward.tiling(), forward.projected(), binned, self.background, picture);
+        rasterize::forward(rec, forward.method(), forward.projected(), binned, self.background, picture);
 
         let gradient = compare(rec, canvas);
 
         let gradient = PictureGradient { rgb: gradient.rgb, depth: gradient.depth, transmittance: None };
         rec.stage(stage::RASTERIZE_BACKWARD);
-        backward.record(rec, forward.tiling(), forward.projected(), binned, picture, gradient);
+        backward.record(rec, forward.method(), forward.projected(), binned, picture, gradient);
         let splats = SplatGradients {
             mean: &backward.grad_mean,
             covariance: &backward.grad_covariance,

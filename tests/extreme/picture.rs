@@ -135,7 +135,7 @@ fn run(gpu: &Gpu, tiling: Tiling, model: &Model, camera: &Camera, near: f32) -> 
     let anchors = Anchors::upload(gpu, &model.anchors, 0).expect(fine);
     let weights = gpu.upload("weights", &model.weights).expect(fine);
     let limits = Limits::new(gpu).expect(fine);
-    let forward = Forward::new(gpu, capacity, K as u32, tiling, size, true).expect(fine);
+    let forward = Forward::new(gpu, capacity, K as u32, tiling.into(), size, true).expect(fine);
     let mut picture = Picture::new(gpu, size, pixels, Outputs::ColorDepth).expect(fine);
     picture.rgb = gpu.upload("rgb", &vec![[testing::UNWRITTEN; 3]; pixels]).expect(fine);
     let slots = capacity.visible as usize * K;
