@@ -8,7 +8,7 @@ layout(binding = 0, scalar) readonly buffer Sums { float sums[]; }; // [7] of `a
 layout(binding = 1, scalar) writeonly buffer Fit { float fit[]; };  // [11] |w|, q, mean x, aligned less prior at the means, w, 1 / sum dx^2 with dx in units, mean prior, 1 / n, units per x, what the means lack of x, of prior
 void main() {
   float n = sums[0];
-  float unit = alignable_unit(n, sums[1]);
+  float unit = n > 0.0 ? alignable_unit(n, sums[1]) : 0.0;
   float scale = 0.0, scaled_mean = 0.0, inverse_n = 0.0, inverse_spread = 0.0; // scale: per unit
   vec2 rest = vec2(0.0);
   precise vec2 mean = vec2(0.0);
@@ -25,7 +25,7 @@ void main() {
     float product = sums[6] - sums[3] * correction.y;
     // A standard deviation of 8 roundings of the mean (2^-21) is no shape: w = q = 0, without a gradient. In units, so
     // that it does not depend on the scene's scale; the mean is then about 1. Not a number fails here too.
-    float rounding = 4.76837158203125e-7 * scaled_mean;
+    float rounding = 4.76837158203125e-7 * max(scaled_mean, 0.5); // at least 1/2, but for a mean of 0
     if (spread > n * rounding * rounding) {
       inverse_spread = 1.0 / spread;
       scale = product * inverse_spread;

@@ -155,7 +155,7 @@ mod tests {
                 let case = depth_l1::Arrays {
                     rendered: noise(),
                     prior: noise(),
-                    fit: vec![0.3, 0.2, 0.5, 0.4, -0.3, 0.1, 0.2, 0.1],
+                    fit: vec![0.3, 0.2, 0.5, 0.4, -0.3, 0.1, 0.2, 0.1, 0.5, 1e-3, -2e-3],
                     difference: unwritten.clone(),
                     grad_aligned: unwritten.clone(),
                     partial: vec![UNWRITTEN; groups(pixels) as usize + 1],
@@ -184,7 +184,7 @@ mod tests {
         let case = depth_l1::Arrays {
             rendered: vec![2.0, 3.0],
             prior: vec![1.0, 1.5],
-            fit: vec![0.5, 0.0, 2.0, 1.0, 0.5, 1.0, 1.0, 1.0],
+            fit: vec![0.5, 0.0, 2.0, 0.0, 0.5, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0],
             difference: vec![UNWRITTEN; 2],
             grad_aligned: vec![UNWRITTEN; 2],
             partial: vec![UNWRITTEN],

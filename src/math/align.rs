@@ -98,7 +98,7 @@ impl Fit {
         let (mean, mean_prior) = (sums[1] / n, sums[2] / n);
         let (mean_rest, prior_rest) = (correction / unit, correction_prior);
         let spread = sums[5] - sums[3] * correction;
-        let rounding = mean * unit * 2.0_f64.powi(-21);
+        let rounding = (mean * unit).max(0.5) * 2.0_f64.powi(-21);
         let means = Self { mean, inverse_count: 1.0 / n, unit, mean_rest, prior_rest, ..Self::default() };
         if spread > n * rounding * rounding {
             let slope = (sums[6] - sums[3] * correction_prior) / spread * unit;
