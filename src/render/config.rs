@@ -53,7 +53,7 @@ impl Default for Config {
 impl Config {
     /// Refuses values that no run could use.
     pub fn validate(&self) -> Result<(), Invalid> {
-        ensure(self.near.is_finite() && self.near > 0.0, "near", self.near, "must be positive")?;
+        ensure((1e-30..=1e30).contains(&self.near), "near", self.near, "must be between 1e-30 and 1e30")?;
         ensure(
             (1e-6..=0.5).contains(&self.alpha_threshold),
             "alpha_threshold",

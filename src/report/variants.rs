@@ -3,13 +3,19 @@
 use crate::config::{Error, Settings, Source};
 
 /// A choice: its name and the settings that make it. `key=value` is what `--set` takes; `key*=factor` multiplies what the
-/// settings say, rounded and at least 1.
+/// settings say, rounded and at least 1; `key=value%` is that share of all steps.
 pub type Choice = (&'static str, &'static [&'static str]);
 
 /// Choices within a step. The first, without a change, is the settings as they are.
 pub const KERNELS: &[Choice] = &[
     ("as set", &[]),
     ("no culling", &["render.cull=false"]),
+    ("wide tiles", &["render.tiles=\"wide\""]),
+    ("depth keys of 21 bits", &["render.depth_bits=21"]),
+    ("depth keys of 14 bits", &["render.depth_bits=14"]),
+    ("alpha from 1/1000", &["render.alpha_threshold=0.001"]),
+    ("alpha from 1/64", &["render.alpha_threshold=0.015625"]),
+    ("no early stop", &["render.transmittance_threshold=0.0"]),
     ("half the tokens", &["model.attention.tokens*=0.5"]),
     ("a quarter of the tokens", &["model.attention.tokens*=0.25"]),
     ("attention written back", &["model.attention.write_back=true"]),
@@ -26,6 +32,7 @@ pub const TRAINING: &[Choice] = &[
     ("no attention", &["model.attention.enabled=false"]),
     ("no depth", &["losses.depth.enabled=false"]),
     ("half the resolution", &["scene.downscale*=2"]),
+    ("half the resolution in the first half", &["train.coarse.until=50%"]),
 ];
 
 /// A choice with its settings resolved.
@@ -66,8 +73,12 @@ pub fn parse(text: &str) -> (String, Vec<String>) {
     }
 }
 
-/// `key*=factor` as `key=value`; anything else as it is, for [`Settings::resolve`] to judge.
+/// `key*=factor` and `key=value%` as `key=value`; anything else as it is, for [`Settings::resolve`] to judge.
 fn absolute(base: &Settings, change: &str) -> String {
+    let share = change.split_once('=').and_then(|(key, value)| {
+        let share: f64 = value.trim().strip_suffix('%')?.parse().ok()?;
+        Some(format!("{key}={}", (f64::from(base.train.iterations) * share / 100.0).round()))
+    });
     let found = change.split_once("*=").and_then(|(key, factor)| {
         let table: toml::Value = toml::from_str(&base.to_toml()).ok()?;
         let value = key.trim().split('.').try_fold(&table, |table, key| table.get(key))?;
@@ -78,7 +89,7 @@ fn absolute(base: &Settings, change: &str) -> String {
             _ => None,
         }
     });
-    found.unwrap_or_else(|| change.to_owned())
+    share.or(found).unwrap_or_else(|| change.to_owned())
 }
 
 #[cfg(test)]
@@ -103,7 +114,13 @@ mod tests {
         assert_eq!(absolute(&base, "model.attention.tokens*=0.25"), "model.attention.tokens=500");
         assert_eq!(absolute(&base, "model.attention.tokens*=0.0001"), "model.attention.tokens=1");
         assert_eq!(absolute(&base, "losses.ssim_weight*=0.5"), "losses.ssim_weight=0.1");
-        for wrong in ["model.tokens*=2", "model.attention.enabled*=2", "model.attention.tokens*=many"] {
+        assert_eq!(absolute(&base, "train.coarse.until=50%"), "train.coarse.until=15000");
+        for wrong in [
+            "model.tokens*=2",
+            "model.attention.enabled*=2",
+            "model.attention.tokens*=many",
+            "train.coarse.until=half%",
+        ] {
             let error = resolve(&[], &base, [("wrong", vec![wrong.to_owned()])]);
             assert!(error.is_err(), "{wrong}");
         }

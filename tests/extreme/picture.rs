@@ -6,6 +6,7 @@ use gscream_vk::model::files;
 use gscream_vk::primitives::limit::{Counter, Limits};
 use gscream_vk::render::bin::Tiling;
 use gscream_vk::render::decode::{self, AnchorGradients, DecodeBackward, GaussianGradients};
+use gscream_vk::render::method::{DepthKey, Method};
 use gscream_vk::render::project::{ProjectBackward, SplatGradients};
 use gscream_vk::render::rasterize::{self, Backward, Outputs, Picture, PictureGradient};
 use gscream_vk::render::view::{Capacity, Forward};
@@ -51,7 +52,7 @@ pub const CASES: &[Case] = &[
     Case {
         stage: "cull to decode_backward",
         case: "log-scales of +-40, 88, 100 and 1e30, of offsets and of Gaussians",
-        guarantee: "Gaussians beyond 2^60 px absent; picture within the bounds of blending; gradients finite, but for an offset's beyond float32's range, which is infinite and never not-a-number",
+        guarantee: "Gaussians beyond 2^60 px absent; picture within the bounds of blending (with `render.depth_bits` 31: the default 28 order depths up to 2^32 times the near plane); gradients finite, but for an offset's beyond float32's range, which is infinite and never not-a-number",
         run: log_scales,
     },
 ];
@@ -127,6 +128,10 @@ impl Whole {
 }
 
 fn run(gpu: &Gpu, tiling: Tiling, model: &Model, camera: &Camera, near: f32) -> Whole {
+    run_with(gpu, Method::from(tiling), model, camera, near)
+}
+
+fn run_with(gpu: &Gpu, method: Method, model: &Model, camera: &Camera, near: f32) -> Whole {
     let fine = "the device runs the case";
     let n = model.anchors.position.len() as u32;
     let size = camera.size;
@@ -135,7 +140,9 @@ fn run(gpu: &Gpu, tiling: Tiling, model: &Model, camera: &Camera, near: f32) -> 
     let anchors = Anchors::upload(gpu, &model.anchors, 0).expect(fine);
     let weights = gpu.upload("weights", &model.weights).expect(fine);
     let limits = Limits::new(gpu).expect(fine);
-    let forward = Forward::new(gpu, capacity, K as u32, tiling.into(), size, true).expect(fine);
+    // Depths are sorted by their distance from the near plane.
+    let method = Method { depth_key: DepthKey::new(near, method.depth_key.bits), ..method };
+    let forward = Forward::new(gpu, capacity, K as u32, method, size, true).expect(fine);
     let mut picture = Picture::new(gpu, size, pixels, Outputs::ColorDepth).expect(fine);
     picture.rgb = gpu.upload("rgb", &vec![[testing::UNWRITTEN; 3]; pixels]).expect(fine);
     let slots = capacity.visible as usize * K;
@@ -168,9 +175,9 @@ fn run(gpu: &Gpu, tiling: Tiling, model: &Model, camera: &Camera, near: f32) -> 
     forward.decode.record(&mut rec, of, &forward.visible.count, camera.center());
     forward.project.record(&mut rec, &forward.visible.slots, forward.gaussians(), camera, near);
     let binned = forward.bin.record(&mut rec, forward.projected(), size, &limits);
-    rasterize::forward(&mut rec, tiling, forward.projected(), binned, BACKGROUND, &picture);
+    rasterize::forward(&mut rec, method, forward.projected(), binned, BACKGROUND, &picture);
     let gradient = PictureGradient { rgb: &grad_rgb, depth: Some(&grad_z), transmittance: None };
-    backward.record(&mut rec, tiling, forward.projected(), binned, &picture, gradient);
+    backward.record(&mut rec, method, forward.projected(), binned, &picture, gradient);
     let splats = SplatGradients {
         mean: &backward.grad_mean,
         covariance: &backward.grad_covariance,
@@ -374,7 +381,9 @@ fn log_scales(gpu: &Gpu) {
                 extreme.anchors.offset[3 * K * i..][..3 * K].fill(0.0);
             }
         }
-        let got = run(gpu, tiling, &extreme, &camera(size), NEAR);
+        // Keys of 28 bits order depths up to 2^32 times the near plane.
+        let method = Method { depth_key: DepthKey::new(NEAR, 31), ..tiling.into() };
+        let got = run_with(gpu, method, &extreme, &camera(size), NEAR);
         let present = got.splats.depth.iter().filter(|d| **d > 0.0).count();
         assert!((200..2000).contains(&present), "{present} of {} present", got.splats.depth.len());
         let what = format!("{tiling:?}");

@@ -167,8 +167,15 @@ fn moments(gpu: &Gpu) {
         let parameters = step.anchors.parameters().into_iter().chain([&step.weights]);
         parameters.map(|p| p.tensors().map(Buffer::view)).collect()
     };
+    // Room for anchors to come holds whatever it holds.
     let read = |run: &Run<'_>| -> Vec<Vec<u32>> {
-        tensors(run).iter().flatten().map(|buffer| bits(&gpu.read(buffer).expect("read"))).collect()
+        let step = run.step();
+        let of_anchors = step.anchors.parameters().into_iter().map(|p| (step.anchors.count * p.width) as usize);
+        let lengths = of_anchors.chain([step.weights.value.len()]);
+        let words = |(tensors, n): ([Buffer<f32>; 3], usize)| {
+            tensors.map(|buffer| bits(&gpu.read_range(&buffer, n).expect("read")))
+        };
+        tensors(run).into_iter().zip(lengths).flat_map(words).collect()
     };
     let mut whole = setup.run(gpu);
     whole.run_one(1).expect("a step");
