@@ -27,7 +27,7 @@ pub fn unit(n: f64, sum: f64) -> f64 {
 }
 
 /// Sums over valid pixels: of the weights, the values x and the priors p, and then of the distances dx, dp from these
-/// sums' means, of dx^2 and of dx dp, with dx in [`unit`]s. The distances' sums are zero but for the means' rounding.
+/// sums' means, of dx^2 and of dx dp, with dx in [`unit()`]s. The distances' sums are zero but for the means' rounding.
 pub type Sums = [f64; 7];
 
 /// Both passes' sums in float64.
@@ -64,13 +64,13 @@ pub struct Fit {
     pub level: f64,
     /// Slope w, signed.
     pub slope: f64,
-    /// One over the sum of squared distances from the mean, in [`unit`]s; 0 when the fit is singular.
+    /// One over the sum of squared distances from the mean, in [`unit()`]s; 0 when the fit is singular.
     pub inverse_spread: f64,
     /// Mean prior over valid pixels, but for `prior_rest`; 0 when the fit is singular.
     pub mean_prior: f64,
     /// One over the number of valid pixels; 0 without any.
     pub inverse_count: f64,
-    /// [`unit`]s per x.
+    /// [`unit()`]s per x.
     pub unit: f64,
     /// What `mean` lacks: its rounding.
     pub mean_rest: f64,
@@ -148,7 +148,7 @@ impl Fit {
     }
 
     /// `dL/dx` of a pixel from `grad_aligned` = dL/d(aligned) there, with the sums of grad_aligned and of
-    /// `grad_aligned * (x - mean)`, in [`unit`]s, over all pixels:
+    /// `grad_aligned * (x - mean)`, in [`unit()`]s, over all pixels:
     /// `dw/dx = valid (dp - 2 w dx) / S`, `dq/dx = -mean dw/dx - valid w / n`; the gradient of |w| at 0 is 0.
     pub fn gradient(&self, grad_aligned: f64, sums: [f64; 2], x: f64, prior: f64, valid: f64) -> f64 {
         let sign = if self.slope == 0.0 { 0.0 } else { self.slope.signum() };
