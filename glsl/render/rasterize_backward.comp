@@ -260,4 +260,9 @@ void main() {
 #endif
   // Behind the last Gaussian that any pixel of the tile can still see.
   for (uint i = base + t; i < range.y; i += THREADS) write(sorted[i], vec3(0.0), NO_SUMS);
+  // Pairs that were counted but touch no tile stand behind the last tile (see bin_expand): the gather reads them too.
+  if (tile == 0u) {
+    uvec2 none = ranges[gl_NumWorkGroups.x * gl_NumWorkGroups.y];
+    for (uint i = none.x + t; i < none.y; i += THREADS) write(sorted[i], vec3(0.0), NO_SUMS);
+  }
 }
