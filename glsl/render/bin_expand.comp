@@ -40,7 +40,7 @@ void main() {
     }
   }
   // Counting and this pass are two kernels; should a driver round them differently, a pair too many is dropped above
-  // and one too few goes to the tile behind the last, which nobody draws.
+  // and one too few goes to the tile behind the last, which nobody draws and whose gradients are 0.
   for (; p < end; p++) {
     pair_tile[p] = push.grid.x * push.grid.y;
     pair_index[p] = p;

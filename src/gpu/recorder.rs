@@ -402,7 +402,7 @@ impl<'g> Recorder<'g> {
     }
 
     fn download(&self, slots: &[Slot]) -> Result<Vec<Vec<u32>>, Error> {
-        slots.iter().map(|slot| self.gpu.read_words(*slot, slot.bytes)).collect()
+        slots.iter().map(|slot| self.words(*slot)).collect()
     }
 
     pub(super) fn dispatch<K: Reference>(

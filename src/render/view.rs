@@ -1,6 +1,6 @@
 //! One picture from a finished model, for files and figures.
 
-use super::bin::Bin;
+use super::bin::{Bin, Binned};
 use super::decode::{self, Decode};
 use super::method::Method;
 use super::project::{Gaussians, Project};
@@ -100,6 +100,31 @@ impl Forward {
             opacity: &self.decode.opacity,
             color: &self.decode.color,
         }
+    }
+
+    /// Records everything before the picture: which anchors are in view, their Gaussians, and the tiles' lists.
+    pub fn record<'s>(
+        &'s self,
+        rec: &mut Recorder<'_>,
+        model: Model<'_>,
+        camera: &Camera,
+        near: f32,
+        limits: &Limits,
+    ) -> Binned<'s> {
+        let Model { anchors, weights } = model;
+        self.visible.record(rec, anchors, camera, near, limits);
+        let offset = anchors.offset.value.view();
+        let model = decode::Anchors {
+            position: &anchors.position,
+            feature: &anchors.feature.value,
+            offset: &offset,
+            log_scaling: &anchors.log_scaling.value,
+            weights,
+            visible: &self.visible.list,
+        };
+        self.decode.record(rec, model, &self.visible.count, camera.center());
+        self.project.record(rec, &self.visible.slots, self.gaussians(), camera, near);
+        self.bin.record(rec, self.projected(), camera.size, limits)
     }
 }
 
@@ -218,21 +243,7 @@ impl Painter {
     }
 
     fn record(&self, rec: &mut Recorder<'_>, model: Model<'_>, forward: &Forward, picture: &Picture, camera: &Camera) {
-        let Self { limits, near, .. } = self;
-        let Model { anchors, weights } = model;
-        forward.visible.record(rec, anchors, camera, *near, limits);
-        let offset = anchors.offset.value.view();
-        let model = decode::Anchors {
-            position: &anchors.position,
-            feature: &anchors.feature.value,
-            offset: &offset,
-            log_scaling: &anchors.log_scaling.value,
-            weights,
-            visible: &forward.visible.list,
-        };
-        forward.decode.record(rec, model, &forward.visible.count, camera.center());
-        forward.project.record(rec, &forward.visible.slots, forward.gaussians(), camera, *near);
-        let binned = forward.bin.record(rec, forward.projected(), camera.size, limits);
+        let binned = forward.record(rec, model, camera, self.near, &self.limits);
         rasterize::forward(rec, forward.method, forward.projected(), binned, self.background, picture);
     }
 }

@@ -665,7 +665,7 @@ pub fn clear(run: &Path) -> Result<(), WriteError> {
     Ok(())
 }
 
-/// Removes what a killed writer left of files whose names `owned` knows: `.NAME.XXXXXX`, never renamed to `NAME`.
+/// Removes what a killed writer left of files whose names `owned` knows: `.NAME.` and six letters, never renamed to `NAME`.
 pub fn sweep(folder: &Path, owned: impl Fn(&str) -> bool) {
     for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
         let name = entry.file_name();

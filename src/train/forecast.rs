@@ -19,8 +19,8 @@ use crate::gpu::{self, Gpu, Schedule, Used};
 use crate::model::anchors::Anchors;
 use crate::model::init::{self, Initial};
 use crate::primitives::limit::{Counter, Limits};
-use crate::render::view::{Capacity, Forward};
-use crate::render::{Method, decode};
+use crate::render::Method;
+use crate::render::view::{Capacity, Forward, Model};
 use crate::scene::{Camera, Prior, Reference, Scene, View};
 use crate::stage;
 
@@ -93,19 +93,7 @@ pub fn survey<'c>(
         loop {
             let mut rec = gpu.recorder()?;
             limits.lower(&mut rec);
-            forward.visible.record(&mut rec, &anchors, camera, near, &limits);
-            let offset = anchors.offset.value.view();
-            let model = decode::Anchors {
-                position: &anchors.position,
-                feature: &anchors.feature.value,
-                offset: &offset,
-                log_scaling: &anchors.log_scaling.value,
-                weights: &weights,
-                visible: &forward.visible.list,
-            };
-            forward.decode.record(&mut rec, model, &forward.visible.count, camera.center());
-            forward.project.record(&mut rec, &forward.visible.slots, forward.gaussians(), camera, near);
-            forward.bin.record(&mut rec, forward.projected(), camera.size, &limits);
+            forward.record(&mut rec, Model { anchors: &anchors, weights: &weights }, camera, near, &limits);
             rec.submit()?.wait()?;
             let counters = gpu.read(limits.counters())?;
             let [visible, pairs] = [Counter::Visible, Counter::Pairs].map(|c| counters[c as usize]);
