@@ -7,11 +7,16 @@
 // variant narrow: NARROW
 // variant color: COLOR_ONLY
 // variant narrow_color: NARROW COLOR_ONLY
+// variant depth: NO_TRANSMITTANCE
+// variant narrow_depth: NARROW NO_TRANSMITTANCE
 //
 // Front-to-back blending of a tile's Gaussians (3D Gaussian Splatting, equation 3): colour, depth and transmittance.
 // The base kernel takes 16 x 16 tiles, 64 threads of 4 pixels, and passes Gaussians through shared memory. `narrow` is
 // for subgroups of 8 (CPU drivers): 8 x 8 tiles, one subgroup of 8 threads x 8 pixels; each lane loads one Gaussian and
-// broadcasts it, so there is no shared memory and no barrier. `color` leaves depth and transmittance out.
+// broadcasts it, so there is no shared memory and no barrier. `depth` leaves transmittance out, `color` also depth.
+#ifdef COLOR_ONLY
+#define NO_TRANSMITTANCE
+#endif
 #ifdef NARROW
 const uint TILE = 8u, THREADS = 8u, ROWS = 8u;
 layout(local_size_x = 8) in;
@@ -32,6 +37,8 @@ layout(binding = 7, scalar) writeonly buffer Rgb { vec3 rgb[]; };               
 #ifndef COLOR_ONLY
 layout(binding = 8, scalar) readonly buffer Depth { float depth[]; };           // [slot] camera z
 layout(binding = 9, scalar) writeonly buffer DepthMap { float depth_map[]; };   // [pixel] sum of z alpha T, not divided by coverage
+#endif
+#ifndef NO_TRANSMITTANCE
 layout(binding = 10, scalar) writeonly buffer Transmittance { float transmittance[]; }; // [pixel] what is left of the background
 #endif
 layout(push_constant, scalar) uniform Push {
@@ -154,6 +161,8 @@ void main() {
       rgb[p] = sum_rgb[r] + T[r] * push.background;
 #ifndef COLOR_ONLY
       depth_map[p] = sum_z[r];
+#endif
+#ifndef NO_TRANSMITTANCE
       transmittance[p] = T[r];
 #endif
     }

@@ -39,7 +39,7 @@ impl Reference for bin_depth_keys::Kernel {
         for i in 0..host.drawn_count[0] as usize {
             let s = host.drawn[i];
             let bits = host.depth[s as usize].to_bits();
-            host.keys[i] = (bits.saturating_sub(push.base) >> push.shift).min(push.last);
+            host.keys[i] = bits.saturating_sub(push.base).min(push.last);
             host.values[i] = s;
         }
     }
@@ -250,7 +250,7 @@ impl Bin {
         limits.note(rec, drawn_count, Counter::Drawn);
         dispatch::record(rec, drawn_count, drawn_groups, drawn.len() as u32, 1);
         let buffers = bin_depth_keys::Buffers { drawn_count, drawn, depth, keys: depth_keys, values: depth_values };
-        let push = bin_depth_keys::Push { base: depth_key.base, shift: depth_key.shift, last: depth_key.last() };
+        let push = bin_depth_keys::Push { base: depth_key.base, last: depth_key.last() };
         rec.run(bin_depth_keys::Kernel, buffers, push, drawn_groups);
         let pairs = Pairs { keys: depth_keys, values: depth_values };
         let order = self.depth_sort.record(rec, pairs, Count::Device(drawn_count), 0..depth_key.bits).values;

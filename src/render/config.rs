@@ -18,8 +18,8 @@ pub struct Config {
     /// A pixel is finished before the Gaussian that would bring its transmittance below this (3DGS: 1e-4); 0 never
     /// finishes early.
     pub transmittance_threshold: f64,
-    /// Bits of the depth in the sort key. From 31 every float has its own key, with 28 every float up to 2^32 times
-    /// `near`; with b < 28 depths within `2^(5 - b)` of each other may be drawn in the order of their anchors.
+    /// Bits of the depth in the sort key, 28 to 32. From 31 every float has its own key, with 28 every float up to 2^32
+    /// times `near`, and a sorting pass less.
     pub depth_bits: u32,
     /// Shape of the rasteriser's tiles. Changes the time only.
     pub tiles: Tiles,
@@ -66,6 +66,6 @@ impl Config {
             self.transmittance_threshold,
             "must be between 0 and 0.5",
         )?;
-        ensure((8..=32).contains(&self.depth_bits), "depth_bits", self.depth_bits, "must be between 8 and 32")
+        ensure((28..=32).contains(&self.depth_bits), "depth_bits", self.depth_bits, "must be between 28 and 32")
     }
 }

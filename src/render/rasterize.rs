@@ -13,8 +13,8 @@ use super::bin::{Binned, Tiling};
 use super::method::Method;
 use crate::gpu::kernels::render::{
     rasterize, rasterize_backward, rasterize_backward_color, rasterize_backward_depth, rasterize_backward_narrow,
-    rasterize_backward_narrow_color, rasterize_backward_narrow_depth, rasterize_color, rasterize_gather,
-    rasterize_gather_color, rasterize_narrow, rasterize_narrow_color,
+    rasterize_backward_narrow_color, rasterize_backward_narrow_depth, rasterize_color, rasterize_depth,
+    rasterize_gather, rasterize_gather_color, rasterize_narrow, rasterize_narrow_color, rasterize_narrow_depth,
 };
 use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
 
@@ -104,7 +104,7 @@ const PICTURE: Check = Check { relative: 1e-5, absolute: 1e-5, band: 1e-3 };
 const PAIR: Check = Check { relative: 2e-4, absolute: 2e-5, band: 5e-3 };
 
 macro_rules! forward_twin {
-    ($module:ident, $tile:expr $(, $depth:ident)?) => {
+    ($module:ident, $tile:expr $(, depth: $depth:ident)? $(, transmittance: $transmittance:ident)?) => {
         impl Reference for $module::Kernel {
             fn reference(host: $module::Host<'_>, push: $module::Push, constants: $module::Constants) {
                 let $module::Constants { alpha_min, transmittance_min } = constants;
@@ -126,8 +126,8 @@ macro_rules! forward_twin {
                         $(
                             let _ = &host.$depth;
                             host.depth_map[p] = _z as f32;
-                            host.transmittance[p] = left as f32;
                         )?
+                        $(host.$transmittance[p] = left as f32;)?
                     }
                 }
             }
@@ -137,8 +137,10 @@ macro_rules! forward_twin {
         }
     };
 }
-forward_twin!(rasterize, 16, depth);
-forward_twin!(rasterize_narrow, 8, depth);
+forward_twin!(rasterize, 16, depth: depth, transmittance: transmittance);
+forward_twin!(rasterize_narrow, 8, depth: depth, transmittance: transmittance);
+forward_twin!(rasterize_depth, 16, depth: depth);
+forward_twin!(rasterize_narrow_depth, 8, depth: depth);
 forward_twin!(rasterize_color, 16);
 forward_twin!(rasterize_narrow_color, 8);
 
@@ -300,8 +302,10 @@ pub struct Projected<'a> {
 pub enum Outputs {
     /// Colour alone.
     Color,
-    /// Colour and depth (transmittance is written with depth).
-    ColorDepth,
+    /// Colour and depth.
+    Depth,
+    /// Colour, depth and transmittance.
+    Transmittance,
 }
 
 /// A picture's buffers.
@@ -310,8 +314,10 @@ pub struct Picture {
     pub size: [u32; 2],
     /// `[pixel]` linear rgb.
     pub rgb: Buffer<[f32; 3]>,
-    /// Depth and transmittance, if asked for.
-    pub depth: Option<(Buffer<f32>, Buffer<f32>)>,
+    /// Sum of z alpha T, if asked for.
+    pub depth: Option<Buffer<f32>>,
+    /// What is left of the background, if asked for.
+    pub transmittance: Option<Buffer<f32>>,
 }
 
 impl Picture {
@@ -320,18 +326,20 @@ impl Picture {
     /// # Errors
     /// As [`Gpu::buffer`].
     pub fn new(gpu: &Gpu, size: [u32; 2], pixels: usize, outputs: Outputs) -> Result<Self, Error> {
-        let depth = match outputs {
-            Outputs::Color => None,
-            Outputs::ColorDepth => Some((gpu.buffer("depth_map", pixels)?, gpu.buffer("transmittance", pixels)?)),
-        };
-        Ok(Self { size, rgb: gpu.buffer("rgb", pixels)?, depth })
+        let (depth, transmittance) = (outputs != Outputs::Color, outputs == Outputs::Transmittance);
+        Ok(Self {
+            size,
+            rgb: gpu.buffer("rgb", pixels)?,
+            depth: depth.then(|| gpu.buffer("depth_map", pixels)).transpose()?,
+            transmittance: transmittance.then(|| gpu.buffer("transmittance", pixels)).transpose()?,
+        })
     }
 }
 
 impl Picture {
     /// The same picture without its depth.
     pub fn color(&self) -> Self {
-        Self { size: self.size, rgb: self.rgb.view(), depth: None }
+        Self { size: self.size, rgb: self.rgb.view(), depth: None, transmittance: None }
     }
 }
 
@@ -358,11 +366,15 @@ pub fn forward(
             rec.run_with($module::Kernel, constants, buffers, $module::Push { size, tiles_x: grid[0], background }, threads);
         }};
     }
-    match (&picture.depth, tiling) {
-        (Some((depth_map, transmittance)), Tiling::Wide) => draw!(rasterize, depth, depth_map, transmittance),
-        (Some((depth_map, transmittance)), Tiling::Narrow) => draw!(rasterize_narrow, depth, depth_map, transmittance),
-        (None, Tiling::Wide) => draw!(rasterize_color),
-        (None, Tiling::Narrow) => draw!(rasterize_narrow_color),
+    match (&picture.depth, &picture.transmittance, tiling) {
+        (Some(depth_map), Some(transmittance), Tiling::Wide) => draw!(rasterize, depth, depth_map, transmittance),
+        (Some(depth_map), Some(transmittance), Tiling::Narrow) => {
+            draw!(rasterize_narrow, depth, depth_map, transmittance);
+        }
+        (Some(depth_map), None, Tiling::Wide) => draw!(rasterize_depth, depth, depth_map),
+        (Some(depth_map), None, Tiling::Narrow) => draw!(rasterize_narrow_depth, depth, depth_map),
+        (None, _, Tiling::Wide) => draw!(rasterize_color),
+        (None, _, Tiling::Narrow) => draw!(rasterize_narrow_color),
     }
 }
 
@@ -373,7 +385,7 @@ pub struct PictureGradient<'a> {
     pub rgb: &'a Buffer<[f32; 3]>,
     /// `[pixel]`, of the depth map.
     pub depth: Option<&'a Buffer<f32>>,
-    /// `[pixel]`, of the transmittance; only together with `depth`.
+    /// `[pixel]`, of the transmittance; only together with `depth`, of a picture that has both.
     pub transmittance: Option<&'a Buffer<f32>>,
 }
 
@@ -402,7 +414,7 @@ impl Backward {
     /// # Errors
     /// As [`Gpu::buffer`].
     pub fn new(gpu: &Gpu, slots: usize, pairs: usize, outputs: Outputs) -> Result<Self, Error> {
-        let depth = outputs == Outputs::ColorDepth;
+        let depth = outputs != Outputs::Color;
         Ok(Self {
             pair_mean: gpu.buffer("pair_mean", pairs)?,
             pair_conic: gpu.buffer("pair_conic", pairs)?,
@@ -457,9 +469,9 @@ impl Backward {
             }};
         }
         match (&picture.depth, &self.pair_depth, &self.grad_depth, gradient.depth) {
-            (Some((depth_map, transmittance)), Some(pair_depth), Some(grad_depth), Some(grad_depth_map)) => {
-                match (gradient.transmittance, tiling) {
-                    (Some(grad_transmittance), Tiling::Wide) => {
+            (Some(depth_map), Some(pair_depth), Some(grad_depth), Some(grad_depth_map)) => {
+                match (picture.transmittance.as_ref().zip(gradient.transmittance), tiling) {
+                    (Some((transmittance, grad_transmittance)), Tiling::Wide) => {
                         back!(
                             rasterize_backward,
                             depth,
@@ -470,7 +482,7 @@ impl Backward {
                             grad_transmittance
                         );
                     }
-                    (Some(grad_transmittance), Tiling::Narrow) => {
+                    (Some((transmittance, grad_transmittance)), Tiling::Narrow) => {
                         back!(
                             rasterize_backward_narrow,
                             depth,
@@ -625,14 +637,15 @@ mod tests {
             let (alpha_min, transmittance_min) = THRESHOLDS[i % THRESHOLDS.len()];
             for n in [0, 1, 65, 700] {
                 macro_rules! check {
-                    ($module:ident, $tiling:expr $(, $depth:ident)?) => {{
+                    ($module:ident, $tiling:expr $(, $depth:ident $(, $transmittance:ident)?)?) => {{
                         let s = scene(i as u64, n, size, $tiling, alpha_min);
                         let pixels = (size[0] * size[1]) as usize;
                         let grid = $tiling.grid(size);
                         let case = $module::Arrays {
                             ranges: s.ranges, sorted: s.sorted, pair_slot: s.pair_slot, mean: s.mean, conic: s.conic,
                             opacity: s.opacity, color: s.color, rgb: vec![[UNWRITTEN; 3]; pixels],
-                            $($depth: s.depth, depth_map: vec![UNWRITTEN; pixels], transmittance: vec![UNWRITTEN; pixels],)?
+                            $($depth: s.depth, depth_map: vec![UNWRITTEN; pixels],
+                            $($transmittance: vec![UNWRITTEN; pixels],)?)?
                         };
                         let push = $module::Push { size, tiles_x: grid[0], background: [0.1, 0.2, 0.3] };
                         let threads = [grid[0] * $tiling.threads(), grid[1], 1];
@@ -640,10 +653,12 @@ mod tests {
                         testing::assert_twin_with($module::Kernel, &gpu, constants, case, push, threads);
                     }};
                 }
-                check!(rasterize, Tiling::Wide, depth);
+                check!(rasterize, Tiling::Wide, depth, transmittance);
+                check!(rasterize_depth, Tiling::Wide, depth);
                 check!(rasterize_color, Tiling::Wide);
                 if gpu.info().subgroup_size == 8 {
-                    check!(rasterize_narrow, Tiling::Narrow, depth);
+                    check!(rasterize_narrow, Tiling::Narrow, depth, transmittance);
+                    check!(rasterize_narrow_depth, Tiling::Narrow, depth);
                     check!(rasterize_narrow_color, Tiling::Narrow);
                 }
             }

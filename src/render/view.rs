@@ -216,7 +216,7 @@ impl Painter {
                     let offsets = model.anchors.offsets;
                     (
                         Forward::new(&self.gpu, self.capacity, offsets, self.method, camera.size, self.cull)?,
-                        Picture::new(&self.gpu, camera.size, pixels, Outputs::ColorDepth)?,
+                        Picture::new(&self.gpu, camera.size, pixels, Outputs::Transmittance)?,
                     )
                 }
             };
@@ -224,7 +224,7 @@ impl Painter {
             self.record(&mut rec, model, &forward, &picture, camera);
             rec.submit()?.wait()?;
             if self.gpu.read(self.limits.overflow())?[0] == 0 {
-                let (depth, transmittance) = picture.depth.as_ref().expect("the picture was made with depth");
+                let (depth, transmittance) = picture.depth.as_ref().zip(picture.transmittance.as_ref()).expect("the picture was made with depth");
                 let rendered = Rendered {
                     size: camera.size,
                     rgb: self.gpu.read(&picture.rgb)?,

@@ -11,8 +11,6 @@ pub const KERNELS: &[Choice] = &[
     ("as set", &[]),
     ("no culling", &["render.cull=false"]),
     ("wide tiles", &["render.tiles=\"wide\""]),
-    ("depth keys of 21 bits", &["render.depth_bits=21"]),
-    ("depth keys of 14 bits", &["render.depth_bits=14"]),
     ("alpha from 1/1000", &["render.alpha_threshold=0.001"]),
     ("alpha from 1/64", &["render.alpha_threshold=0.015625"]),
     ("no early stop", &["render.transmittance_threshold=0.0"]),

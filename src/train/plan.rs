@@ -224,7 +224,7 @@ impl Plan {
         }
         leave("gradient of anchor positions", "anchors do not move");
         leave("gradient of view directions and distances", "cameras do not move");
-        leave("gradient of transmittance", "no loss looks at it");
+        leave("transmittance and its gradient", "no loss looks at it");
         let evaluation = !scene.test.is_empty();
         if !evaluation {
             leave("evaluation", "there are no test views");
@@ -273,7 +273,7 @@ impl Plan {
 
     /// What the rasteriser writes.
     pub fn outputs(&self) -> Outputs {
-        if self.depth { Outputs::ColorDepth } else { Outputs::Color }
+        if self.depth { Outputs::Depth } else { Outputs::Color }
     }
 
     /// The larger of each side over all training pictures.

@@ -372,7 +372,7 @@ impl Step {
         let compared = (&photograph.camera, view.depth.is_some());
         self.line(rec, compared, Some(photograph), step, rates, |rec, canvas| {
             let Canvas { picture, losses } = canvas;
-            losses.forward_backward(rec, &view, &picture.rgb, picture.depth.as_ref().map(|d| &d.0))
+            losses.forward_backward(rec, &view, &picture.rgb, picture.depth.as_ref())
         });
     }
 
@@ -387,7 +387,7 @@ impl Step {
     ) {
         self.line(rec, (camera, depth.is_some()), None, step, rates, |rec, canvas| {
             let Canvas { picture, losses } = canvas;
-            losses.compare(rec, depth, &picture.rgb, picture.depth.as_ref().map(|d| &d.0))
+            losses.compare(rec, depth, &picture.rgb, picture.depth.as_ref())
         });
     }
 

@@ -143,10 +143,10 @@ fn run_with(gpu: &Gpu, method: Method, model: &Model, camera: &Camera, near: f32
     // Depths are sorted by their distance from the near plane.
     let method = Method { depth_key: DepthKey::new(near, method.depth_key.bits), ..method };
     let forward = Forward::new(gpu, capacity, K as u32, method, size, true).expect(fine);
-    let mut picture = Picture::new(gpu, size, pixels, Outputs::ColorDepth).expect(fine);
+    let mut picture = Picture::new(gpu, size, pixels, Outputs::Transmittance).expect(fine);
     picture.rgb = gpu.upload("rgb", &vec![[testing::UNWRITTEN; 3]; pixels]).expect(fine);
     let slots = capacity.visible as usize * K;
-    let backward = Backward::new(gpu, slots, 1 << 18, Outputs::ColorDepth).expect(fine);
+    let backward = Backward::new(gpu, slots, 1 << 18, Outputs::Transmittance).expect(fine);
     let project_backward = ProjectBackward::new(gpu, &forward.project).expect(fine);
     let decode_backward = DecodeBackward::new(gpu, &forward.decode).expect(fine);
     let zeros = |name, len: usize| gpu.upload(name, &vec![0f32; len]).expect(fine);
@@ -205,7 +205,7 @@ fn run_with(gpu: &Gpu, method: Method, model: &Model, camera: &Camera, near: f32
     assert_eq!(gpu.read(limits.overflow()).expect(fine), [0], "{counters:?}");
     let visible = counters[Counter::Visible as usize];
     let slots = visible as usize * K;
-    let (depth, transmittance) = picture.depth.as_ref().expect("asked for");
+    let (depth, transmittance) = picture.depth.as_ref().zip(picture.transmittance.as_ref()).expect("asked for");
     let read = |b| gpu.read(b).expect(fine);
     Whole {
         visible,

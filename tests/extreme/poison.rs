@@ -77,7 +77,7 @@ fn first_step(gpu: &Gpu, run: &mut Run<'_>) -> [Vec<u32>; 3] {
     let step = run.step();
     let size = step.plan.sizes[0];
     let picture = step.picture(size);
-    let depth = picture.depth.as_ref().map(|d| gpu.read(&d.0).expect("read")).expect("the scene has priors");
+    let depth = picture.depth.as_ref().map(|d| gpu.read(d).expect("read")).expect("the scene has priors");
     let rgb = gpu.read(&picture.rgb).expect("read").into_flattened();
     let terms = gpu.read(step.terms(size)).expect("read");
     let finite = rgb.iter().chain(&depth).all(|v| v.is_finite());

@@ -156,9 +156,9 @@ fn draw(gpu: &Gpu, tiling: Tiling, size: [u32; 2], splats: &Splats, pairs: u32) 
     gpu.write(limits.slots(), &[n]).expect(fine);
     let slots = dispatch::groups(gpu, "slots", 64).expect(fine);
     let bin = Bin::new(gpu, tiling, n.max(1), pairs, size).expect(fine);
-    let mut picture = Picture::new(gpu, size, pixels, Outputs::ColorDepth).expect(fine);
+    let mut picture = Picture::new(gpu, size, pixels, Outputs::Transmittance).expect(fine);
     picture.rgb = gpu.upload("rgb", &vec![[testing::UNWRITTEN; 3]; pixels]).expect(fine);
-    let backward = Backward::new(gpu, n.max(1) as usize, pairs as usize, Outputs::ColorDepth).expect(fine);
+    let backward = Backward::new(gpu, n.max(1) as usize, pairs as usize, Outputs::Transmittance).expect(fine);
     let up: Vec<_> = (0..pixels).map(|p| upstream(p, farthest)).collect();
     let grad_rgb = gpu.upload("grad_rgb", &up.iter().map(|u| u.0).collect::<Vec<_>>()).expect(fine);
     let grad_z = gpu.upload("grad_depth_map", &up.iter().map(|u| u.1).collect::<Vec<_>>()).expect(fine);
@@ -181,7 +181,7 @@ fn draw(gpu: &Gpu, tiling: Tiling, size: [u32; 2], splats: &Splats, pairs: u32) 
     rec.submit().expect(fine).wait().expect(fine);
     let counters = gpu.read(limits.counters()).expect(fine);
     assert_eq!(gpu.read(limits.overflow()).expect(fine), [0], "room for {pairs} pairs, counted {counters:?}");
-    let (z, t) = picture.depth.as_ref().expect("asked for");
+    let (z, t) = picture.depth.as_ref().zip(picture.transmittance.as_ref()).expect("asked for");
     let grid = tiling.grid(size);
     let (sorted, pair_slot) = (gpu.read(binned.sorted).expect(fine), gpu.read(binned.pair_slot).expect(fine));
     let lists = gpu.read(binned.ranges).expect(fine)[..(grid[0] * grid[1]) as usize]

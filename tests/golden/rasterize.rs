@@ -97,8 +97,8 @@ fn rasterize() {
             let grid = tiling.grid(size);
             let pairs = n * grid[0] * grid[1];
             let bin = Bin::new(&gpu, tiling, n, pairs, size).unwrap();
-            let picture = Picture::new(&gpu, size, pixels, Outputs::ColorDepth).unwrap();
-            let backward = Backward::new(&gpu, n as usize, pairs as usize, Outputs::ColorDepth).unwrap();
+            let picture = Picture::new(&gpu, size, pixels, Outputs::Transmittance).unwrap();
+            let backward = Backward::new(&gpu, n as usize, pairs as usize, Outputs::Transmittance).unwrap();
             let grad_rgb = gpu.upload("grad_rgb", &case.vectors::<3>("upstream.rgb")).unwrap();
             let grad_z = gpu.upload("grad_depth_map", &case.f32("upstream.z")).unwrap();
             let grad_t = gpu.upload("grad_transmittance", &case.f32("upstream.transmittance")).unwrap();
@@ -129,7 +129,7 @@ fn rasterize() {
             let picture_check = Check { relative: 1e-5, absolute: 1e-5, band: 0.0 };
             let rgb = gpu.read(&picture.rgb).unwrap();
             compare(&case, "rgb", rgb.as_flattened(), &case.f64("rgb"), &band, picture_check);
-            let (z, t) = picture.depth.as_ref().expect("asked for");
+            let (z, t) = picture.depth.as_ref().zip(picture.transmittance.as_ref()).expect("asked for");
             compare(&case, "z", &gpu.read(z).unwrap(), &case.f64("z"), &band, picture_check);
             compare(&case, "transmittance", &gpu.read(t).unwrap(), &case.f64("transmittance"), &band, picture_check);
             // Sums over up to 2,000 pixels with cancellation; 1 / (1 - alpha) <= 100 amplifies 1e-7 to 1e-5 of the sum.

@@ -97,7 +97,7 @@ fn step() {
                 let check = Check { relative: 1e-4, absolute: 2e-5, band: 2e-3 };
                 let rgb = gpu.read(&picture.rgb).unwrap();
                 case.compare(&format!("step{number}.rgb"), rgb.as_flattened(), check);
-                let z = gpu.read(&picture.depth.as_ref().unwrap().0).unwrap();
+                let z = gpu.read(picture.depth.as_ref().unwrap()).unwrap();
                 case.compare(&format!("step{number}.z"), &z, check);
                 case.compare(&format!("step{number}.terms"), &terms, Check { relative: 1e-4, ..check });
                 // The fit to an arbitrary prior, L1's kinks and the thresholds of alpha make single elements jump; the
