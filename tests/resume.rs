@@ -214,10 +214,10 @@ fn killed_at_any_moment_it_comes_to_the_same_end() {
     let mut run = String::new();
     for moment in 0..MOMENTS {
         // One in each twentieth of a whole run, from its first instant to its last; where the program was quicker than
-        // that, at the same moment of a new run.
-        let delay = whole.mul_f64((f64::from(moment) + rng.random::<f64>()) / f64::from(MOMENTS));
+        // that, a little earlier in a new run.
+        let mut delay = whole.mul_f64((f64::from(moment) + rng.random::<f64>()) / f64::from(MOMENTS));
         for attempt in 0.. {
-            assert!(attempt < 10, "no run lasts {delay:?}");
+            assert!(attempt < 20, "no run lasts {delay:?}");
             let mut child = if run.is_empty() {
                 runs += 1;
                 run = format!("run{runs}");
@@ -247,6 +247,7 @@ fn killed_at_any_moment_it_comes_to_the_same_end() {
             assert!(output.status.success(), "{}", text(&output.stderr));
             assert_whole(&place, &run, "ended before it could be killed");
             run.clear();
+            delay = delay.mul_f64(0.8);
         }
     }
     if !run.is_empty() {
@@ -254,6 +255,26 @@ fn killed_at_any_moment_it_comes_to_the_same_end() {
         assert_whole(&place, &run, "at last");
     }
     println!("{MOMENTS} kills of {runs} runs, {resumed} of them resumed before");
+}
+
+/// Killed between the record that says so and the removal of its checkpoints, a run is complete.
+#[test]
+fn a_complete_run_is_rid_of_checkpoints_left_behind() {
+    let place = Place::new(&settings());
+    half(&place, "run");
+    let (checkpoints, aside) = (place.path().join("run/checkpoints"), place.path().join("aside"));
+    std::fs::rename(&checkpoints, &aside).expect("a folder to set aside");
+    std::fs::create_dir(&checkpoints).expect("a folder");
+    for file in std::fs::read_dir(&aside).expect("a folder") {
+        let file = file.expect("a file");
+        std::fs::copy(file.path(), checkpoints.join(file.file_name())).expect("a copy");
+    }
+    succeeds(place.resume("run"));
+    assert_whole(&place, "run", "complete");
+    std::fs::rename(&aside, &checkpoints).expect("put back");
+    assert_eq!(place.checkpoints("run").len(), 2);
+    succeeds(place.resume("run"));
+    assert_whole(&place, "run", "complete, with checkpoints put back");
 }
 
 #[test]

@@ -50,7 +50,7 @@ pub(super) struct Args {
     /// Go on with the run in this folder, from its last good checkpoint, under its own settings
     ///
     /// Its scene is read from where it was; SCENE says where it is now, if it was moved. Without a checkpoint yet, the
-    /// run starts again. A complete run is left as it is.
+    /// run starts again. A complete run stays as it is.
     #[arg(long, value_name = "RUN", conflicts_with_all = ["SettingsArgs", "out", "overwrite"])]
     resume: Option<PathBuf>,
     /// Measure every pass: prints milliseconds per pass and writes trace.json (for chrome://tracing or Perfetto)
@@ -67,6 +67,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         let record = Record::read(folder)
             .with_context(|| format!("{}: holds no run to go on with: start one with --out", folder.display()))?;
         if let Some(steps) = record.complete {
+            // It may have been killed after it was complete and before its last lines.
+            sweep(folder);
+            checkpoint::clear(folder)?;
             println!("{}: the run is complete ({steps} steps): nothing to do", folder.display());
             return Ok(());
         }
