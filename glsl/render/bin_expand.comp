@@ -2,8 +2,8 @@
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_GOOGLE_include_directive : require
 #include "tiles.glsl"
-// One (Gaussian, tile) pair per tile touched, Gaussian after Gaussian in depth order: a stable sort by tile alone then
-// leaves every tile's list in depth order.
+// One (Gaussian, tile) pair per tile touched, Gaussian after Gaussian in depth order: pairs put by tile, in this order
+// within a tile, then leave every tile's list in depth order.
 layout(local_size_x = 64) in;
 #include "thread.glsl"
 layout(constant_id = 0) const float ALPHA_MIN = 0.00392156862745098; // a Gaussian touches the pixels where its alpha reaches this
@@ -17,8 +17,7 @@ layout(binding = 6, scalar) readonly buffer Covariance { vec3 covariance[]; };  
 layout(binding = 7, scalar) readonly buffer Opacity { float opacity[]; };       // [slot]
 layout(binding = 8, scalar) writeonly buffer FirstPair { uint first_pair[]; };  // [slot] first pair of a Gaussian
 layout(binding = 9, scalar) writeonly buffer PairTile { uint pair_tile[]; };   // [pair] tile, row-major
-layout(binding = 10, scalar) writeonly buffer PairIndex { uint pair_index[]; }; // [pair] the pair's own number
-layout(binding = 11, scalar) writeonly buffer PairSlot { uint pair_slot[]; };   // [pair] slot of its Gaussian
+layout(binding = 10, scalar) writeonly buffer PairSlot { uint pair_slot[]; };   // [pair] slot of its Gaussian
 layout(push_constant, scalar) uniform Push {
   uvec2 grid; // tiles in x and y
   uint tile;  // side of a tile, px
@@ -35,7 +34,6 @@ void main() {
     ivec2 columns = support_columns(support, mean[s], row, int(push.tile), ivec2(push.grid));
     for (int column = columns.x; column <= columns.y && p < end; column++, p++) {
       pair_tile[p] = uint(row) * push.grid.x + uint(column);
-      pair_index[p] = p;
       pair_slot[p] = s;
     }
   }
@@ -43,7 +41,6 @@ void main() {
   // and one too few goes to the tile behind the last, which nobody draws and whose gradients are 0.
   for (; p < end; p++) {
     pair_tile[p] = push.grid.x * push.grid.y;
-    pair_index[p] = p;
     pair_slot[p] = s;
   }
 }

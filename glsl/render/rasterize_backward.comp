@@ -5,6 +5,7 @@
 #extension GL_KHR_shader_subgroup_vote : require
 #extension GL_KHR_shader_subgroup_ballot : require
 #extension GL_KHR_shader_subgroup_arithmetic : require
+#extension GL_KHR_shader_subgroup_shuffle : require
 // variant narrow: NARROW
 // variant color: COLOR_ONLY
 // variant narrow_color: NARROW COLOR_ONLY
@@ -140,6 +141,25 @@ Sums over_subgroup(Sums s) {
   return s;
 }
 
+#ifdef NARROW
+// Half of a step of eight sums over eight lanes at once: lanes with the bit keep the second's, the others the first's,
+// and both add what their partner holds of it. After bits 1, 2 and 4 lane k holds the k-th Gaussian's sums.
+Sums meet(Sums a, Sums b, uint bit) {
+  bool upper = (gl_SubgroupInvocationID & bit) != 0u;
+#define MEET(f) s.f = (upper ? b.f : a.f) + subgroupShuffleXor(upper ? a.f : b.f, bit)
+  Sums s;
+  MEET(first);
+  MEET(second);
+  MEET(opacity);
+  MEET(color);
+  s.z = 0.0;
+#ifdef WITH_DEPTH
+  MEET(z);
+#endif
+  return s;
+}
+#endif
+
 #ifndef NARROW
 const uint BATCH = 32u;
 const uint SUBGROUPS = 16u; // most there can be: 64 threads in subgroups of at least 4
@@ -196,17 +216,17 @@ void main() {
 #else
     float z = 0.0;
 #endif
-    Sums mine = NO_SUMS;
-#define SUM(k) { \
-      Sums s = over_subgroup(sums_of(subgroupBroadcast(m, k), subgroupBroadcast(q, k), subgroupBroadcast(o, k), subgroupBroadcast(c, k), subgroupBroadcast(z, k))); \
-      bool own = t == k; \
-      mine.first = own ? s.first : mine.first; \
-      mine.second = own ? s.second : mine.second; \
-      mine.opacity = own ? s.opacity : mine.opacity; \
-      mine.color = own ? s.color : mine.color; \
-      mine.z = own ? s.z : mine.z; \
-    }
-    SUM(0u) SUM(1u) SUM(2u) SUM(3u) SUM(4u) SUM(5u) SUM(6u) SUM(7u)
+#define SUMS(k) sums_of(subgroupBroadcast(m, k), subgroupBroadcast(q, k), subgroupBroadcast(o, k), subgroupBroadcast(c, k), subgroupBroadcast(z, k))
+    Sums a = SUMS(0u);
+    a = meet(a, SUMS(1u), 1u);
+    Sums b = SUMS(2u);
+    b = meet(b, SUMS(3u), 1u);
+    a = meet(a, b, 2u);
+    b = SUMS(4u);
+    b = meet(b, SUMS(5u), 1u);
+    Sums d = SUMS(6u);
+    d = meet(d, SUMS(7u), 1u);
+    Sums mine = meet(a, meet(b, d, 2u), 4u);
     if (some) write(p, q, mine);
   }
 #else

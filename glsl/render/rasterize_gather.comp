@@ -3,39 +3,37 @@
 #extension GL_GOOGLE_include_directive : require
 // variant color: COLOR_ONLY
 //
-// A Gaussian's gradients: the sum over its pairs, which lie one behind the other, and from the factors of the conic
-// (1/N, k, 1/V) to those of the covariance (N, k, V): dL/dN = -dL/d(1/N) / N^2.
+// Gradients of a Gaussian that touches a tile: the sum over its pairs, which lie one behind the other, and from the factors
+// of the conic (1/N, k, 1/V) to those of the covariance (N, k, V): dL/dN = -dL/d(1/N) / N^2. Others' gradients stay as they
+// were (zero).
 layout(local_size_x = 64) in;
 #include "thread.glsl"
-layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };       // [4] x, y, z of the dispatch; visible anchors
-layout(binding = 1, scalar) readonly buffer Tiles { uint tiles[]; };            // [slot] tiles touched
-layout(binding = 2, scalar) readonly buffer PairCount { uint pair_count[]; };   // [1] pairs; 0 when they do not fit
-layout(binding = 3, scalar) readonly buffer FirstPair { uint first_pair[]; };   // [slot] first pair
-layout(binding = 4, scalar) readonly buffer Conic { vec3 conic[]; };            // [slot] factored inverse covariance
-layout(binding = 5, scalar) readonly buffer PairMean { vec2 pair_mean[]; };     // [pair]
-layout(binding = 6, scalar) readonly buffer PairConic { vec3 pair_conic[]; };   // [pair]
-layout(binding = 7, scalar) readonly buffer PairOpacity { float pair_opacity[]; }; // [pair]
-layout(binding = 8, scalar) readonly buffer PairColor { vec3 pair_color[]; };   // [pair]
-layout(binding = 9, scalar) writeonly buffer GradMean { vec2 grad_mean[]; };    // [slot] 1/px
-layout(binding = 10, scalar) writeonly buffer GradCovariance { vec3 grad_covariance[]; }; // [slot] of the factors
-layout(binding = 11, scalar) writeonly buffer GradOpacity { float grad_opacity[]; }; // [slot]
-layout(binding = 12, scalar) writeonly buffer GradColor { vec3 grad_color[]; }; // [slot]
+layout(binding = 0, scalar) readonly buffer DrawnCount { uint drawn_count[]; }; // [1] Gaussians that touch a tile
+layout(binding = 1, scalar) readonly buffer Drawn { uint drawn[]; };            // [drawn] their slots
+layout(binding = 2, scalar) readonly buffer Tiles { uint tiles[]; };            // [slot] tiles touched
+layout(binding = 3, scalar) readonly buffer PairCount { uint pair_count[]; };   // [1] pairs; 0 when they do not fit
+layout(binding = 4, scalar) readonly buffer FirstPair { uint first_pair[]; };   // [slot] first pair
+layout(binding = 5, scalar) readonly buffer Conic { vec3 conic[]; };            // [slot] factored inverse covariance
+layout(binding = 6, scalar) readonly buffer PairMean { vec2 pair_mean[]; };     // [pair]
+layout(binding = 7, scalar) readonly buffer PairConic { vec3 pair_conic[]; };   // [pair]
+layout(binding = 8, scalar) readonly buffer PairOpacity { float pair_opacity[]; }; // [pair]
+layout(binding = 9, scalar) readonly buffer PairColor { vec3 pair_color[]; };   // [pair]
+layout(binding = 10, scalar) writeonly buffer GradMean { vec2 grad_mean[]; };    // [slot] 1/px
+layout(binding = 11, scalar) writeonly buffer GradCovariance { vec3 grad_covariance[]; }; // [slot] of the factors
+layout(binding = 12, scalar) writeonly buffer GradOpacity { float grad_opacity[]; }; // [slot]
+layout(binding = 13, scalar) writeonly buffer GradColor { vec3 grad_color[]; }; // [slot]
 #ifndef COLOR_ONLY
-layout(binding = 13, scalar) readonly buffer PairDepth { float pair_depth[]; }; // [pair]
-layout(binding = 14, scalar) writeonly buffer GradDepth { float grad_depth[]; }; // [slot]
+layout(binding = 14, scalar) readonly buffer PairDepth { float pair_depth[]; }; // [pair]
+layout(binding = 15, scalar) writeonly buffer GradDepth { float grad_depth[]; }; // [slot]
 #endif
-layout(push_constant, scalar) uniform Push {
-  uint offsets; // slots per visible anchor
-} push;
 void main() {
-  uint s = thread_index();
-  if (s >= groups[3] * push.offsets) return;
-  uint n = pair_count[0] == 0u ? 0u : tiles[s];
-  uint p = n == 0u ? 0u : first_pair[s];
+  uint i = thread_index();
+  if (i >= drawn_count[0] || pair_count[0] == 0u) return;
+  uint s = drawn[i], p = first_pair[s], end = p + tiles[s];
   vec2 m = vec2(0.0);
   vec3 g = vec3(0.0), c = vec3(0.0);
   float o = 0.0, z = 0.0;
-  for (uint i = 0u; i < n; i++, p++) {
+  for (; p < end; p++) {
     m += pair_mean[p];
     g += pair_conic[p];
     o += pair_opacity[p];

@@ -253,11 +253,11 @@ backward_twin!(rasterize_backward_narrow_color, 8);
 macro_rules! gather_twin {
     ($module:ident $(, $depth:ident)?) => {
         impl Reference for $module::Kernel {
-            fn reference(host: $module::Host<'_>, push: $module::Push, (): ()) {
-                for s in 0..(host.groups[3] * push.offsets) as usize {
-                    let n = if host.pair_count[0] == 0 { 0 } else { host.tiles[s] as usize };
-                    let first = if n == 0 { 0 } else { host.first_pair[s] as usize };
-                    let pairs = first..first + n;
+            fn reference(host: $module::Host<'_>, (): (), (): ()) {
+                let drawn = if host.pair_count[0] == 0 { 0 } else { host.drawn_count[0] as usize };
+                for s in host.drawn[..drawn].iter().map(|&slot| slot as usize) {
+                    let first = host.first_pair[s] as usize;
+                    let pairs = first..first + host.tiles[s] as usize;
                     let sum = |f: &dyn Fn(usize) -> f32| pairs.clone().map(|p| f64::from(f(p))).sum::<f64>();
                     let g: [f64; 3] = std::array::from_fn(|c| sum(&|p| host.pair_conic[p][c]));
                     let [a, _, b] = host.conic[s].map(f64::from);
@@ -396,7 +396,7 @@ pub struct Backward {
     pair_opacity: Buffer<f32>,
     pair_color: Buffer<[f32; 3]>,
     pair_depth: Option<Buffer<f32>>,
-    /// `[slot]` 1/px.
+    /// `[slot]` 1/px; as the others 0 where nothing is drawn.
     pub grad_mean: Buffer<[f32; 2]>,
     /// `[slot]` of xx, the one off-diagonal parameter, yy.
     pub grad_covariance: Buffer<[f32; 3]>,
@@ -439,9 +439,8 @@ impl Backward {
         picture: &Picture,
         gradient: PictureGradient<'_>,
     ) {
-        let Projected { slots, offsets, mean, depth, opacity, color, .. } = gaussians;
-        let groups = &slots.buffer;
-        let Binned { ranges, sorted, pair_slot, conic, tiles, pair_count, first_pair } = binned;
+        let Projected { mean, depth, opacity, color, .. } = gaussians;
+        let Binned { ranges, sorted, pair_slot, conic, tiles, drawn, drawn_count, pair_count, first_pair, .. } = binned;
         let Self {
             pair_mean,
             pair_conic,
@@ -458,6 +457,11 @@ impl Backward {
         let grid = tiling.grid(size);
         let threads = [grid[0] * tiling.threads(), grid[1], 1];
         let (rgb, grad_rgb) = (&picture.rgb, gradient.rgb);
+        // Most slots draw nothing and are not looked at again.
+        rec.zero(grad_mean);
+        rec.zero(grad_covariance);
+        rec.zero(grad_opacity);
+        rec.zero(grad_color);
         macro_rules! back {
             ($module:ident $(, $field:ident)*) => {{
                 let buffers = $module::Buffers {
@@ -470,6 +474,7 @@ impl Backward {
         }
         match (&picture.depth, &self.pair_depth, &self.grad_depth, gradient.depth) {
             (Some(depth_map), Some(pair_depth), Some(grad_depth), Some(grad_depth_map)) => {
+                rec.zero(grad_depth);
                 match (picture.transmittance.as_ref().zip(gradient.transmittance), tiling) {
                     (Some((transmittance, grad_transmittance)), Tiling::Wide) => {
                         back!(
@@ -501,7 +506,8 @@ impl Backward {
                     }
                 }
                 let buffers = rasterize_gather::Buffers {
-                    groups,
+                    drawn_count,
+                    drawn,
                     tiles,
                     pair_count,
                     first_pair,
@@ -517,7 +523,7 @@ impl Backward {
                     pair_depth,
                     grad_depth,
                 };
-                rec.run(rasterize_gather::Kernel, buffers, rasterize_gather::Push { offsets }, slots);
+                rec.run(rasterize_gather::Kernel, buffers, (), binned.drawn_groups);
             }
             _ => {
                 match tiling {
@@ -525,7 +531,8 @@ impl Backward {
                     Tiling::Narrow => back!(rasterize_backward_narrow_color),
                 }
                 let buffers = rasterize_gather_color::Buffers {
-                    groups,
+                    drawn_count,
+                    drawn,
                     tiles,
                     pair_count,
                     first_pair,
@@ -539,7 +546,7 @@ impl Backward {
                     grad_opacity,
                     grad_color,
                 };
-                rec.run(rasterize_gather_color::Kernel, buffers, rasterize_gather_color::Push { offsets }, slots);
+                rec.run(rasterize_gather_color::Kernel, buffers, (), binned.drawn_groups);
             }
         }
     }
@@ -755,7 +762,8 @@ mod tests {
             let pairs = s.pair_slot.len();
             let mut random = || rng.random_range(-1f32..1.0);
             let case = rasterize_gather::Arrays {
-                groups: vec![1, 1, 1, n as u32],
+                drawn_count: vec![s.tiles.iter().filter(|tiles| **tiles > 0).count() as u32],
+                drawn: (0..n as u32).filter(|&slot| s.tiles[slot as usize] > 0).collect(),
                 tiles: s.tiles,
                 pair_count: vec![pairs as u32],
                 first_pair: s.first_pair,
@@ -775,11 +783,12 @@ mod tests {
                 rasterize_gather::Kernel,
                 &gpu,
                 case.clone(),
-                rasterize_gather::Push { offsets: 1 },
+                (),
                 n,
             );
             let color = rasterize_gather_color::Arrays {
-                groups: case.groups,
+                drawn_count: case.drawn_count,
+                drawn: case.drawn,
                 tiles: case.tiles,
                 pair_count: vec![0],
                 first_pair: case.first_pair,
@@ -797,7 +806,7 @@ mod tests {
                 rasterize_gather_color::Kernel,
                 &gpu,
                 color,
-                rasterize_gather_color::Push { offsets: 1 },
+                (),
                 n,
             );
         }

@@ -224,7 +224,11 @@ impl Painter {
             self.record(&mut rec, model, &forward, &picture, camera);
             rec.submit()?.wait()?;
             if self.gpu.read(self.limits.overflow())?[0] == 0 {
-                let (depth, transmittance) = picture.depth.as_ref().zip(picture.transmittance.as_ref()).expect("the picture was made with depth");
+                let (depth, transmittance) = picture
+                    .depth
+                    .as_ref()
+                    .zip(picture.transmittance.as_ref())
+                    .expect("the picture was made with depth");
                 let rendered = Rendered {
                     size: camera.size,
                     rgb: self.gpu.read(&picture.rgb)?,
