@@ -779,13 +779,7 @@ mod tests {
                 grad_color: vec![[UNWRITTEN; 3]; n],
                 grad_depth: vec![UNWRITTEN; n],
             };
-            testing::assert_twin(
-                rasterize_gather::Kernel,
-                &gpu,
-                case.clone(),
-                (),
-                n,
-            );
+            testing::assert_twin(rasterize_gather::Kernel, &gpu, case.clone(), (), n);
             let color = rasterize_gather_color::Arrays {
                 drawn_count: case.drawn_count,
                 drawn: case.drawn,
@@ -802,13 +796,7 @@ mod tests {
                 grad_opacity: case.grad_opacity,
                 grad_color: case.grad_color,
             };
-            testing::assert_twin(
-                rasterize_gather_color::Kernel,
-                &gpu,
-                color,
-                (),
-                n,
-            );
+            testing::assert_twin(rasterize_gather_color::Kernel, &gpu, color, (), n);
         }
     }
 }

@@ -1,7 +1,7 @@
 //! What a run will take, before it takes it.
 //!
-//! Two things are looked up, the rest is rehearsed. A *survey* decodes, projects and counts every training view of the
-//! untrained model on the device, without drawing it: visible anchors and (Gaussian, tile) pairs. The *rehearsal* then runs
+//! Two things are looked up, the rest is rehearsed. A *survey* decodes, projects and counts training views of the
+//! untrained model on the device, without drawing them: visible anchors and (Gaussian, tile) pairs. The *rehearsal* then runs
 //! the stages' own code from the first step to the last on a device that only keeps the books ([`Gpu::rehearsal`]), so
 //! that what it finds is what that code allocates. How many anchors grow is not known before; [`expected_anchors`] says
 //! what is assumed.
@@ -66,7 +66,11 @@ pub fn initial(scene: &Scene, settings: &Settings) -> Result<Initial, init::Erro
     init::from_points(&points, &settings.model)
 }
 
-/// Counts what the untrained model shows to these cameras.
+/// Most cameras that a survey looks through: it comes before the first step, and what they miss the margin of
+/// [`Survey::capacity`] covers.
+const SURVEYED: usize = 24;
+
+/// Counts what the untrained model shows to these cameras, or where there are many to every n-th.
 ///
 /// # Errors
 /// When the device has no room for a forward pass.
@@ -89,7 +93,8 @@ pub fn survey<'c>(
     let mut capacity = Capacity { pairs: 1, ..Capacity::guess(anchors.capacity) };
     let mut forward = Forward::new(gpu, capacity, offsets, method, size, settings.render.cull)?;
     let mut most = Survey { anchors: anchors.count, visible: 0, pairs: 0 };
-    for camera in cameras {
+    let every = cameras.len().div_ceil(SURVEYED).max(1);
+    for camera in cameras.into_iter().step_by(every) {
         loop {
             let mut rec = gpu.recorder()?;
             limits.lower(&mut rec);
