@@ -10,8 +10,9 @@ use rand::{Rng, RngExt};
 
 use crate::gpu::kernels::model::{
     attention_backward, attention_backward_lanes, attention_forward, attention_forward_lanes, attention_output,
-    attention_output_backward, attention_project, attention_project_backward, attention_skip,
-    attention_weight_backward, attention_weight_sum,
+    attention_output_backward, attention_output_backward_lanes, attention_output_lanes, attention_project,
+    attention_project_backward, attention_project_backward_lanes, attention_project_lanes, attention_skip,
+    attention_weight_backward, attention_weight_backward_lanes, attention_weight_sum,
 };
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::math::attention::{FEATURE, HEAD, HEADS, INNER, Offsets, SIDES, dot, softmax_row};
@@ -35,17 +36,23 @@ fn head_of(x: &[f64], token: usize, head: usize) -> &[f64] {
     crate::math::attention::head(x, token, head)
 }
 
-impl Reference for attention_project::Kernel {
-    fn reference(host: attention_project::Host<'_>, push: attention_project::Push, (): ()) {
-        let (n, _) = sides(host.tokens, push.own, push.capacity);
-        let (feature, weights) = (widen(&host.feature[..n * 8]), widen(host.weights));
-        for (out, at) in [(host.qk, push.to_qk), (host.value, push.to_v)] {
-            let matrix = &weights[4 * at as usize..][..INNER * FEATURE];
-            let y = crate::math::attention::linear(&feature, matrix, FEATURE);
-            out.as_flattened_mut().iter_mut().zip(y).for_each(|(out, y)| *out = y as f32);
+macro_rules! project_twin {
+    ($kernel:ident) => {
+        impl Reference for $kernel::Kernel {
+            fn reference(host: $kernel::Host<'_>, push: $kernel::Push, (): ()) {
+                let (n, _) = sides(host.tokens, push.own, push.capacity);
+                let (feature, weights) = (widen(&host.feature[..n * 8]), widen(host.weights));
+                for (out, at) in [(host.qk, push.to_qk), (host.value, push.to_v)] {
+                    let matrix = &weights[4 * at as usize..][..INNER * FEATURE];
+                    let y = crate::math::attention::linear(&feature, matrix, FEATURE);
+                    out.as_flattened_mut().iter_mut().zip(y).for_each(|(out, y)| *out = y as f32);
+                }
+            }
         }
-    }
+    };
 }
+project_twin!(attention_project);
+project_twin!(attention_project_lanes);
 
 /// The softmax of a row is right to about (3 + 2 |x|) units of the exponential (Vulkan's bound, x at most some tens
 /// where it matters) plus the logit's own error of some 20 units times its terms.
@@ -83,34 +90,47 @@ macro_rules! forward_twin {
 forward_twin!(attention_forward);
 forward_twin!(attention_forward_lanes);
 
-impl Reference for attention_output::Kernel {
-    fn reference(host: attention_output::Host<'_>, push: attention_output::Push, (): ()) {
-        let (n, _) = sides(host.tokens, push.own, push.capacity);
-        let (mixed, weights) = (widen(&host.mixed[..n * INNER / 4]), widen(host.weights));
-        let matrix = &weights[4 * push.to_out as usize..];
-        let y = crate::math::attention::linear(&mixed, &matrix[..INNER * FEATURE], INNER);
-        for (i, (out, y)) in host.updated.as_flattened_mut().iter_mut().zip(y).enumerate() {
-            *out = (y + matrix[INNER * FEATURE + i % FEATURE]) as f32;
+macro_rules! output_twin {
+    ($kernel:ident) => {
+        impl Reference for $kernel::Kernel {
+            fn reference(host: $kernel::Host<'_>, push: $kernel::Push, (): ()) {
+                let (n, _) = sides(host.tokens, push.own, push.capacity);
+                let (mixed, weights) = (widen(&host.mixed[..n * INNER / 4]), widen(host.weights));
+                let matrix = &weights[4 * push.to_out as usize..];
+                let y = crate::math::attention::linear(&mixed, &matrix[..INNER * FEATURE], INNER);
+                for (i, (out, y)) in host.updated.as_flattened_mut().iter_mut().zip(y).enumerate() {
+                    *out = (y + matrix[INNER * FEATURE + i % FEATURE]) as f32;
+                }
+            }
         }
-    }
+    };
 }
+output_twin!(attention_output);
+output_twin!(attention_output_lanes);
 
-impl Reference for attention_output_backward::Kernel {
-    fn reference(host: attention_output_backward::Host<'_>, push: attention_output_backward::Push, (): ()) {
-        let (n, _) = sides(host.tokens, push.own, push.capacity);
-        let (grad, weights) = (widen(&host.grad_updated[..n * 8]), widen(host.weights));
-        let mixed = widen(&host.mixed[..n * INNER / 4]);
-        let matrix = &weights[4 * push.to_out as usize..][..INNER * FEATURE];
-        let grad_mixed = crate::math::attention::times(&grad, matrix, FEATURE, INNER);
-        for (out, g) in host.grad_mixed.as_flattened_mut().iter_mut().zip(&grad_mixed) {
-            *out = *g as f32;
+macro_rules! output_backward_twin {
+    ($kernel:ident) => {
+        impl Reference for $kernel::Kernel {
+            fn reference(host: $kernel::Host<'_>, push: $kernel::Push, (): ()) {
+                let (n, _) = sides(host.tokens, push.own, push.capacity);
+                let (grad, weights) = (widen(&host.grad_updated[..n * 8]), widen(host.weights));
+                let mixed = widen(&host.mixed[..n * INNER / 4]);
+                let matrix = &weights[4 * push.to_out as usize..][..INNER * FEATURE];
+                let grad_mixed = crate::math::attention::times(&grad, matrix, FEATURE, INNER);
+                for (out, g) in host.grad_mixed.as_flattened_mut().iter_mut().zip(&grad_mixed) {
+                    *out = *g as f32;
+                }
+                for (i, h) in (0..n).flat_map(|i| (0..HEADS).map(move |h| (i, h))) {
+                    let [top, inverse] = host.softmax[i * HEADS + h];
+                    host.rows[i * HEADS + h] =
+                        [top, inverse, dot(head_of(&grad_mixed, i, h), head_of(&mixed, i, h)) as f32];
+                }
+            }
         }
-        for (i, h) in (0..n).flat_map(|i| (0..HEADS).map(move |h| (i, h))) {
-            let [top, inverse] = host.softmax[i * HEADS + h];
-            host.rows[i * HEADS + h] = [top, inverse, dot(head_of(&grad_mixed, i, h), head_of(&mixed, i, h)) as f32];
-        }
-    }
+    };
 }
+output_backward_twin!(attention_output_backward);
+output_backward_twin!(attention_output_backward_lanes);
 
 macro_rules! backward_twin {
     ($kernel:ident) => {
@@ -153,24 +173,30 @@ macro_rules! backward_twin {
 backward_twin!(attention_backward);
 backward_twin!(attention_backward_lanes);
 
-impl Reference for attention_project_backward::Kernel {
-    fn reference(host: attention_project_backward::Host<'_>, push: attention_project_backward::Push, (): ()) {
-        let (n, _) = sides(host.tokens, push.own, push.capacity);
-        let weights = widen(host.weights);
-        let [a, b] = [(host.grad_qk, push.to_qk), (host.grad_value, push.to_v)].map(|(grad, at)| {
-            let matrix = &weights[4 * at as usize..][..INNER * FEATURE];
-            crate::math::attention::times(&widen(&grad[..n * INNER / 4]), matrix, INNER, FEATURE)
-        });
-        for ((out, a), b) in host.grad_feature.as_flattened_mut().iter_mut().zip(a).zip(b) {
-            *out = (a + b) as f32;
-        }
-    }
+macro_rules! project_backward_twin {
+    ($kernel:ident) => {
+        impl Reference for $kernel::Kernel {
+            fn reference(host: $kernel::Host<'_>, push: $kernel::Push, (): ()) {
+                let (n, _) = sides(host.tokens, push.own, push.capacity);
+                let weights = widen(host.weights);
+                let [a, b] = [(host.grad_qk, push.to_qk), (host.grad_value, push.to_v)].map(|(grad, at)| {
+                    let matrix = &weights[4 * at as usize..][..INNER * FEATURE];
+                    crate::math::attention::times(&widen(&grad[..n * INNER / 4]), matrix, INNER, FEATURE)
+                });
+                for ((out, a), b) in host.grad_feature.as_flattened_mut().iter_mut().zip(a).zip(b) {
+                    *out = (a + b) as f32;
+                }
+            }
 
-    /// A thousand terms that may cancel.
-    fn check(_: &'static str) -> Check {
-        Check { relative: 1e-5, absolute: 4e-6, band: 0.0 }
-    }
+            /// A thousand terms that may cancel.
+            fn check(_: &'static str) -> Check {
+                Check { relative: 1e-5, absolute: 4e-6, band: 0.0 }
+            }
+        }
+    };
 }
+project_backward_twin!(attention_project_backward);
+project_backward_twin!(attention_project_backward_lanes);
 
 impl Reference for attention_weight_backward::Kernel {
     fn reference(host: attention_weight_backward::Host<'_>, push: attention_weight_backward::Push, (): ()) {
@@ -181,17 +207,32 @@ impl Reference for attention_weight_backward::Kernel {
         let (rows, columns) = (4 * push.rows as usize, 4 * push.columns as usize);
         let (grad, input) = (widen(host.grad_output), widen(host.inputs));
         let length = n.div_ceil(SLICES);
-        for (slice, partial) in host.partial.as_flattened_mut().chunks_mut(WEIGHTS).enumerate() {
+        let all = rows * columns + if push.bias != 0 { rows } else { 0 };
+        for (slice, partial) in host.partial.as_flattened_mut().chunks_mut(all).enumerate() {
             let tokens = (slice * length).min(n)..((slice + 1) * length).min(n);
             let grad = &grad[tokens.start * rows..tokens.end * rows];
             let input = &input[tokens.start * columns..tokens.end * columns];
             let sum = crate::math::attention::outer(grad, rows, input, columns);
-            let at = 4 * push.matrix as usize;
-            partial[at..].iter_mut().zip(sum).for_each(|(out, sum)| *out = sum as f32);
+            partial.iter_mut().zip(sum).for_each(|(out, sum)| *out = sum as f32);
             if push.bias != 0 {
                 let sum = crate::math::attention::outer(grad, rows, &vec![1.0; tokens.len()], 1);
-                partial[at + rows * columns..].iter_mut().zip(sum).for_each(|(out, sum)| *out = sum as f32);
+                partial[rows * columns..].iter_mut().zip(sum).for_each(|(out, sum)| *out = sum as f32);
             }
+        }
+    }
+}
+
+impl Reference for attention_weight_backward_lanes::Kernel {
+    fn reference(host: attention_weight_backward_lanes::Host<'_>, push: attention_weight_backward_lanes::Push, (): ()) {
+        let (n, _) = sides(host.tokens, push.own, push.capacity);
+        let (rows, columns) = (4 * push.rows as usize, 4 * push.columns as usize);
+        let (grad, input) = (widen(&host.grad_output[..n * rows / 4]), widen(&host.inputs[..n * columns / 4]));
+        let out = &mut host.grad_weights.as_flattened_mut()[4 * push.matrix as usize..];
+        let sum = crate::math::attention::outer(&grad, rows, &input, columns);
+        out.iter_mut().zip(sum).for_each(|(out, sum)| *out = sum as f32);
+        if push.bias != 0 {
+            let sum = crate::math::attention::outer(&grad, rows, &vec![1.0; n], 1);
+            out[rows * columns..].iter_mut().zip(sum).for_each(|(out, sum)| *out = sum as f32);
         }
     }
 }
@@ -199,10 +240,22 @@ impl Reference for attention_weight_backward::Kernel {
 impl Reference for attention_weight_sum::Kernel {
     fn reference(host: attention_weight_sum::Host<'_>, (): (), (): ()) {
         let none = host.tokens[0] == 0 || host.tokens[1] == 0;
-        let partial = host.partial.as_flattened();
-        for (i, out) in host.grad_weights.as_flattened_mut().iter_mut().enumerate() {
-            let sum: f64 = (0..SLICES).map(|s| f64::from(partial[s * WEIGHTS + i])).sum();
-            *out = if none { 0.0 } else { sum as f32 };
+        let partials = [
+            (host.inside_qk, SIDES[0].to_qk),
+            (host.around_qk, SIDES[1].to_qk),
+            (host.inside_value, SIDES[0].to_v),
+            (host.around_value, SIDES[1].to_v),
+            (host.inside_out, SIDES[0].to_out),
+            (host.around_out, SIDES[1].to_out),
+        ];
+        let grad_weights = host.grad_weights.as_flattened_mut();
+        for (partial, at) in partials {
+            let partial = partial.as_flattened();
+            let all = partial.len() / SLICES;
+            for (i, out) in grad_weights[at..at + all].iter_mut().enumerate() {
+                let sum: f64 = (0..SLICES).map(|s| f64::from(partial[s * all + i])).sum();
+                *out = if none { 0.0 } else { sum as f32 };
+            }
         }
     }
 }
@@ -271,8 +324,35 @@ pub struct Attention {
     /// A subgroup of 8 shares what its lanes load: right where a load costs as much as some forty additions, on a CPU.
     lanes: bool,
     sides: [Side; 2],
-    partial: Buffer<[f32; 4]>,
+    /// Slices of every matrix's gradient, a buffer for each because passes that write one wait for each other: inside to
+    /// queries-or-keys, values and output, then around. The form of lanes sums at once.
+    partials: Option<[Buffer<[f32; 4]>; 6]>,
     skip: Buffer<u32>,
+}
+
+fn partials(gpu: &Gpu) -> Result<[Buffer<[f32; 4]>; 6], Error> {
+    let partial = |name, bias| gpu.buffer(name, SLICES * (INNER * FEATURE + bias) / 4);
+    Ok([
+        partial("inside_qk_partial", 0)?,
+        partial("inside_value_partial", 0)?,
+        partial("inside_out_partial", FEATURE)?,
+        partial("around_qk_partial", 0)?,
+        partial("around_value_partial", 0)?,
+        partial("around_out_partial", FEATURE)?,
+    ])
+}
+
+/// Records one of the two forms of a kernel, which share bindings and push constants. Of each: so many tokens (rounded up)
+/// take so many threads.
+macro_rules! run {
+    ($self:ident, $rec:ident, $lanes:ident $many:literal tokens $wide:literal,
+     $other:ident $few:literal tokens $narrow:literal, $buffers:tt, $push:tt) => {
+        if $self.lanes {
+            $rec.run($lanes::Kernel, $lanes::Buffers $buffers, $lanes::Push $push, $self.threads($many, $wide));
+        } else {
+            $rec.run($other::Kernel, $other::Buffers $buffers, $other::Push $push, $self.threads($few, $narrow));
+        }
+    };
 }
 
 impl Attention {
@@ -282,9 +362,10 @@ impl Attention {
     /// As [`Gpu::buffer`].
     pub fn new(gpu: &Gpu, capacity: u32) -> Result<Self, Error> {
         let side = |names| Side::new(gpu, names, capacity as usize);
+        let lanes = gpu.info().kind == "cpu" && gpu.info().subgroup_size == 8;
         Ok(Self {
             capacity,
-            lanes: gpu.info().kind == "cpu" && gpu.info().subgroup_size == 8,
+            lanes,
             sides: [
                 side([
                     "inside_qk",
@@ -311,7 +392,7 @@ impl Attention {
                     "grad_around",
                 ])?,
             ],
-            partial: gpu.buffer("attention_partial", SLICES * WEIGHTS / 4)?,
+            partials: if lanes { None } else { Some(partials(gpu)?) },
             skip: gpu.buffer("attention_skip", 3)?,
         })
     }
@@ -349,31 +430,23 @@ impl Attention {
         let (capacity, features, weights) = (self.capacity, features.vectors(), &weights.view());
         for ((own, side), feature) in (0..).zip(&self.sides).zip(&features) {
             let Offsets { to_qk, to_v, .. } = SIDES[own as usize];
-            let push = attention_project::Push { own, capacity, to_qk: (to_qk / 4) as u32, to_v: (to_v / 4) as u32 };
+            let (to_qk, to_v) = ((to_qk / 4) as u32, (to_v / 4) as u32);
             let Side { qk, value, .. } = side;
-            let buffers = attention_project::Buffers { tokens, feature, weights, qk, value };
-            rec.run(attention_project::Kernel, buffers, push, self.threads(4, 32));
+            run!(self, rec, attention_project_lanes 32 tokens 128, attention_project 4 tokens 32,
+                { tokens, feature, weights, qk, value }, { own, capacity, to_qk, to_v });
         }
         for own in 0..2u32 {
             let (side, other) = (&self.sides[own as usize], &self.sides[1 - own as usize]);
             let (query, mixed, softmax) = (&side.qk, &side.mixed, &side.softmax);
             let (key, value) = (&other.qk, &other.value);
-            if self.lanes {
-                let push = attention_forward_lanes::Push { own, capacity };
-                let buffers = attention_forward_lanes::Buffers { tokens, query, key, value, mixed, softmax };
-                rec.run(attention_forward_lanes::Kernel, buffers, push, self.threads(32, 64));
-            } else {
-                let push = attention_forward::Push { own, capacity };
-                let buffers = attention_forward::Buffers { tokens, query, key, value, mixed, softmax };
-                rec.run(attention_forward::Kernel, buffers, push, self.threads(1, 8));
-            }
+            run!(self, rec, attention_forward_lanes 32 tokens 64, attention_forward 1 tokens 8,
+                { tokens, query, key, value, mixed, softmax }, { own, capacity });
         }
         for (own, side) in (0..).zip(&self.sides) {
             let to_out = (SIDES[own as usize].to_out / 4) as u32;
             let updated = &side.updated.view();
-            let buffers = attention_output::Buffers { tokens, mixed: &side.mixed, weights, updated };
-            let push = attention_output::Push { own, capacity, to_out };
-            rec.run(attention_output::Kernel, buffers, push, self.threads(4, 8));
+            run!(self, rec, attention_output_lanes 32 tokens 16, attention_output 4 tokens 8,
+                { tokens, mixed: &side.mixed, weights, updated }, { own, capacity, to_out });
         }
         Pair { inside: &self.sides[0].updated, around: &self.sides[1].updated }
     }
@@ -395,43 +468,27 @@ impl Attention {
         for ((own, side), grad_updated) in (0..).zip(&self.sides).zip(&grad_updated) {
             let to_out = (SIDES[own as usize].to_out / 4) as u32;
             let Side { mixed, softmax, grad_mixed, rows, .. } = side;
-            let buffers =
-                attention_output_backward::Buffers { tokens, grad_updated, weights, mixed, softmax, grad_mixed, rows };
-            let push = attention_output_backward::Push { own, capacity, to_out };
-            rec.run(attention_output_backward::Kernel, buffers, push, self.threads(4, 8));
+            run!(self, rec, attention_output_backward_lanes 32 tokens 64, attention_output_backward 4 tokens 8,
+                { tokens, grad_updated, weights, mixed, softmax, grad_mixed, rows }, { own, capacity, to_out });
         }
         for own in 0..2u32 {
-            self.shares_backward(rec, tokens, own);
+            let Side { qk, value, grad_mixed, rows, grad_qk, grad_value, .. } = &self.sides[own as usize];
+            let Side { qk: other_qk, value: other_value, grad_mixed: other_grad_mixed, rows: other_rows, .. } =
+                &self.sides[1 - own as usize];
+            run!(self, rec, attention_backward_lanes 16 tokens 64, attention_backward 1 tokens 8, {
+                tokens, qk, value, grad_mixed, rows, other_qk, other_value, other_grad_mixed, other_rows,
+                grad_qk, grad_value
+            }, { own, capacity });
         }
         for (own, side) in (0..).zip(&self.sides) {
             let Offsets { to_qk, to_v, .. } = SIDES[own as usize];
             let (to_qk, to_v) = ((to_qk / 4) as u32, (to_v / 4) as u32);
-            let push = attention_project_backward::Push { own, capacity, to_qk, to_v };
             let grad_feature = &side.grad_feature.view();
             let Side { grad_qk, grad_value, .. } = side;
-            let buffers = attention_project_backward::Buffers { tokens, weights, grad_qk, grad_value, grad_feature };
-            rec.run(attention_project_backward::Kernel, buffers, push, self.threads(4, 8));
+            run!(self, rec, attention_project_backward_lanes 32 tokens 16, attention_project_backward 4 tokens 8,
+                { tokens, weights, grad_qk, grad_value, grad_feature }, { own, capacity, to_qk, to_v });
         }
-        let (narrow, inner) = ((FEATURE / 4) as u32, (INNER / 4) as u32);
-        for (own, side) in (0..).zip(&self.sides) {
-            let (Offsets { to_qk, to_v, to_out }, at) = (SIDES[own as usize], own as usize);
-            let products = [
-                (&side.grad_qk, inner, &features[at], narrow, to_qk, 0),
-                (&side.grad_value, inner, &features[at], narrow, to_v, 0),
-                (&grad_updated[at], narrow, &side.mixed, inner, to_out, 1),
-            ];
-            for (grad_output, rows, inputs, columns, matrix, bias) in products {
-                let matrix = (matrix / 4) as u32;
-                let push = attention_weight_backward::Push { own, capacity, rows, columns, matrix, bias };
-                let partial = &self.partial;
-                let buffers = attention_weight_backward::Buffers { tokens, grad_output, inputs, partial };
-                let threads = rows / 2 * (columns / 2) * SLICES as u32;
-                rec.run(attention_weight_backward::Kernel, buffers, push, threads);
-            }
-        }
-        let grad_weights = &grad_weights.view();
-        let buffers = attention_weight_sum::Buffers { tokens, partial: &self.partial, grad_weights };
-        rec.run(attention_weight_sum::Kernel, buffers, (), WEIGHTS / 4);
+        self.weights_backward(rec, tokens, &features, &grad_updated, &grad_weights.view());
         Pair { inside: &self.sides[0].grad_feature, around: &self.sides[1].grad_feature }
     }
 
@@ -449,30 +506,51 @@ impl Attention {
         &self.skip
     }
 
-    fn shares_backward(&self, rec: &mut Recorder<'_>, tokens: &Buffer<u32>, own: u32) {
-        let Side { qk, value, grad_mixed, rows, grad_qk, grad_value, .. } = &self.sides[own as usize];
-        let Side { qk: other_qk, value: other_value, grad_mixed: other_grad_mixed, rows: other_rows, .. } =
-            &self.sides[1 - own as usize];
-        let capacity = self.capacity;
-        macro_rules! run {
-            ($kernel:ident, $tokens:expr, $parts:expr) => {{
-                let buffers = $kernel::Buffers {
-                    tokens,
-                    qk,
-                    value,
-                    grad_mixed,
-                    rows,
-                    other_qk,
-                    other_value,
-                    other_grad_mixed,
-                    other_rows,
-                    grad_qk,
-                    grad_value,
-                };
-                rec.run($kernel::Kernel, buffers, $kernel::Push { own, capacity }, self.threads($tokens, $parts));
-            }};
+    fn weights_backward(
+        &self,
+        rec: &mut Recorder<'_>,
+        tokens: &Buffer<u32>,
+        features: &[Buffer<[f32; 4]>; 2],
+        grad_updated: &[Buffer<[f32; 4]>; 2],
+        grad_weights: &Buffer<[f32; 4]>,
+    ) {
+        let (capacity, narrow, inner) = (self.capacity, (FEATURE / 4) as u32, (INNER / 4) as u32);
+        let mut partials = self.partials.iter().flatten();
+        for (own, side) in (0..).zip(&self.sides) {
+            let (Offsets { to_qk, to_v, to_out }, at) = (SIDES[own as usize], own as usize);
+            let products = [
+                (&side.grad_qk, inner, &features[at], narrow, to_qk, 0),
+                (&side.grad_value, inner, &features[at], narrow, to_v, 0),
+                (&grad_updated[at], narrow, &side.mixed, inner, to_out, 1),
+            ];
+            for (grad_output, rows, inputs, columns, matrix, bias) in products {
+                if let Some(partial) = partials.next() {
+                    let push = attention_weight_backward::Push { own, capacity, rows, columns, bias };
+                    let buffers = attention_weight_backward::Buffers { tokens, grad_output, inputs, partial };
+                    let threads = rows / 2 * (columns / 2) * SLICES as u32;
+                    rec.run(attention_weight_backward::Kernel, buffers, push, threads);
+                } else {
+                    let matrix = (matrix / 4) as u32;
+                    let push = attention_weight_backward_lanes::Push { own, capacity, rows, columns, matrix, bias };
+                    let buffers =
+                        attention_weight_backward_lanes::Buffers { tokens, grad_output, inputs, grad_weights };
+                    rec.run(attention_weight_backward_lanes::Kernel, buffers, push, rows * columns / 8);
+                }
+            }
         }
-        if self.lanes { run!(attention_backward_lanes, 16, 64) } else { run!(attention_backward, 1, 8) }
+        if let Some([inside_qk, inside_value, inside_out, around_qk, around_value, around_out]) = &self.partials {
+            let buffers = attention_weight_sum::Buffers {
+                tokens,
+                inside_qk,
+                inside_value,
+                inside_out,
+                around_qk,
+                around_value,
+                around_out,
+                grad_weights,
+            };
+            rec.run(attention_weight_sum::Kernel, buffers, (), WEIGHTS / 4);
+        }
     }
 }
 
@@ -514,6 +592,7 @@ mod tests {
     fn run(gpu: &Gpu, inputs: &Inputs, capacity: usize, lanes: bool, checked: bool) -> Run {
         let mut attention = Attention::new(gpu, capacity as u32).expect("memory for the test");
         attention.lanes = lanes;
+        attention.partials = (!lanes).then(|| partials(gpu).expect("memory for the test"));
         let pad = |values: &Vec<f32>| {
             let mut values = values.clone();
             values.resize(capacity * FEATURE, testing::UNWRITTEN);
@@ -534,7 +613,7 @@ mod tests {
             rec.fill(&side.updated, nan);
             rec.fill(&side.grad_feature, nan);
         }
-        rec.fill(&attention.partial, nan);
+        attention.partials.iter().flatten().for_each(|partial| rec.fill(partial, nan));
         rec.fill(&grad_weights, nan);
         let pair = |of: &'static str| match of {
             "features" => Pair { inside: &features[0], around: &features[1] },
