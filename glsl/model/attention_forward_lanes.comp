@@ -44,16 +44,21 @@ void main() {
   for (uint j = 0u; j < n.y; j += 8u) {
     uint at = min(j + lane, n.y - 1u) * INNER + head;
     float s[QUERIES][8], old[QUERIES];
+    [[unroll]] for (uint r = 0u; r < QUERIES; r++) [[unroll]] for (uint c = 0u; c < 8u; c++) s[r][c] = 0.0;
     vec4 their_key[16];
     [[unroll]] for (uint d = 0u; d < 16u; d++) their_key[d] = key[at + d];
-    [[unroll]] for (uint c = 0u; c < 8u; c++) {
+    // Not unrolled, so that the instructions stay in their cache.
+    for (uint c = 0u; c < 8u; c++) {
       vec4 t[QUERIES];
       [[unroll]] for (uint r = 0u; r < QUERIES; r++) t[r] = vec4(0.0);
       [[unroll]] for (uint d = 0u; d < 16u; d++) {
         vec4 k = subgroupShuffle(their_key[d], c);
         [[unroll]] for (uint r = 0u; r < QUERIES; r++) t[r] = fma(q[r][d], k, t[r]);
       }
-      [[unroll]] for (uint r = 0u; r < QUERIES; r++) s[r][c] = sum4(t[r]);
+      [[unroll]] for (uint r = 0u; r < QUERIES; r++) {
+        float logit = sum4(t[r]);
+        [[unroll]] for (uint e = 0u; e < 8u; e++) s[r][e] = e == c ? logit : s[r][e];
+      }
     }
     [[unroll]] for (uint r = 0u; r < QUERIES; r++) {
       float peak = top[r];

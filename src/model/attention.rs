@@ -10,9 +10,10 @@ use rand::{Rng, RngExt};
 
 use crate::gpu::kernels::model::{
     attention_backward, attention_backward_lanes, attention_forward, attention_forward_lanes, attention_output,
-    attention_output_backward, attention_output_backward_lanes, attention_output_lanes, attention_project,
-    attention_project_backward, attention_project_backward_lanes, attention_project_lanes, attention_skip,
-    attention_weight_backward, attention_weight_backward_lanes, attention_weight_sum,
+    attention_output_backward, attention_output_backward_lanes, attention_output_lanes, attention_pairs_apply,
+    attention_pairs_apply_inside, attention_pairs_backward, attention_project, attention_project_backward,
+    attention_project_backward_lanes, attention_project_lanes, attention_skip, attention_weight_backward,
+    attention_weight_backward_lanes, attention_weight_sum,
 };
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::math::attention::{FEATURE, HEAD, HEADS, INNER, Offsets, SIDES, dot, softmax_row};
@@ -173,6 +174,68 @@ macro_rules! backward_twin {
 backward_twin!(attention_backward);
 backward_twin!(attention_backward_lanes);
 
+impl Reference for attention_pairs_backward::Kernel {
+    fn reference(host: attention_pairs_backward::Host<'_>, push: attention_pairs_backward::Push, (): ()) {
+        let (n, m) = sides(host.tokens, 0, push.capacity);
+        let [q, v, g, oq, ov, og] =
+            [host.qk, host.value, host.grad_mixed, host.other_qk, host.other_value, host.other_grad_mixed].map(widen);
+        let (rows, others) = (widen(host.rows), widen(host.other_rows));
+        let [inside, around, grad_s] =
+            [host.inside_share, host.around_share, host.grad_s].map(<[[f32; 4]]>::as_flattened_mut);
+        for (j, h) in (0..m).flat_map(|j| (0..HEADS).map(move |h| (j, h))) {
+            let other = &others[3 * (j * HEADS + h)..];
+            let at = 4 * (h * push.capacity as usize + j) * push.stride as usize;
+            // To the end of a vector: zero behind the last token.
+            for of in [&mut *inside, &mut *around, &mut *grad_s] {
+                of[at..at + n.next_multiple_of(4)].fill(0.0);
+            }
+            for i in 0..n {
+                let row = &rows[3 * (i * HEADS + h)..];
+                let logit = dot(head_of(&q, i, h), head_of(&oq, j, h)) / 8.0;
+                let p = (logit - row[0]).exp() * row[1];
+                let r = (logit - other[0]).exp() * other[1];
+                let s = p * (dot(head_of(&g, i, h), head_of(&ov, j, h)) - row[2])
+                    + r * (dot(head_of(&v, i, h), head_of(&og, j, h)) - other[2]);
+                (inside[at + i], around[at + i], grad_s[at + i]) = (p as f32, r as f32, (s / 8.0) as f32);
+            }
+        }
+    }
+
+    fn check(_: &'static str) -> Check {
+        SOFTMAX
+    }
+}
+
+macro_rules! apply_twin {
+    ($kernel:ident, $own:literal) => {
+        impl Reference for $kernel::Kernel {
+            fn reference(host: $kernel::Host<'_>, push: $kernel::Push, (): ()) {
+                let (n, m) = sides(host.tokens, $own, push.capacity);
+                let (pairs, other) = (host.pairs.as_flattened(), widen(host.other));
+                for (i, h) in (0..n).flat_map(|i| (0..HEADS).map(move |h| (i, h))) {
+                    let mut sum = [0.0; HEAD];
+                    for j in 0..m {
+                        let (around, inside) = if $own == 0 { (j, i) } else { (i, j) };
+                        let row = h * push.capacity as usize + around;
+                        let weight = f64::from(pairs[4 * row * push.stride as usize + inside]);
+                        sum.iter_mut().zip(head_of(&other, j, h)).for_each(|(sum, x)| *sum += weight * x);
+                    }
+                    for (out, sum) in host.applied.as_flattened_mut()[i * INNER + h * HEAD..].iter_mut().zip(sum) {
+                        *out = sum as f32;
+                    }
+                }
+            }
+
+            /// As many terms as there are tokens, which may cancel.
+            fn check(_: &'static str) -> Check {
+                Check { relative: 1e-5, absolute: 4e-6, band: 0.0 }
+            }
+        }
+    };
+}
+apply_twin!(attention_pairs_apply, 1);
+apply_twin!(attention_pairs_apply_inside, 0);
+
 macro_rules! project_backward_twin {
     ($kernel:ident) => {
         impl Reference for $kernel::Kernel {
@@ -267,6 +330,56 @@ impl Reference for attention_skip::Kernel {
     }
 }
 
+/// How the kernels share the work.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Form {
+    /// A token to a thread, shares formed again in the backward pass: for a GPU.
+    Threads,
+    /// A subgroup of 8 shares what its lanes load, 16 or 32 tokens at a time: for a CPU driver, where a load costs as much
+    /// as some forty additions. Shares are formed again, too.
+    Lanes,
+    /// As lanes; the backward pass forms shares and the gradient of the similarity once for both sides and keeps them: 7
+    /// products of all pairs instead of 10, and 2 sets of loads instead of 2 times 3.
+    Pairs,
+}
+
+impl Form {
+    /// Most tokens a side whose pairs are kept: 3 matrices of 8 MiB each then, 2 MiB each at 256 tokens; at 2,000 a matrix
+    /// would be as large as a binding may be.
+    const MOST_KEPT: u32 = 512;
+
+    fn best(kind: &str, subgroup_size: u32, capacity: u32) -> Self {
+        match (kind, subgroup_size) {
+            ("cpu", 8) if capacity <= Self::MOST_KEPT => Self::Pairs,
+            ("cpu", 8) => Self::Lanes,
+            _ => Self::Threads,
+        }
+    }
+}
+
+/// Of every head and pair of tokens, rows of the tokens around.
+#[derive(Debug)]
+struct Pairs {
+    inside_share: Buffer<[f32; 4]>,
+    around_share: Buffer<[f32; 4]>,
+    grad_s: Buffer<[f32; 4]>,
+    /// Vectors of a row.
+    stride: u32,
+}
+
+impl Pairs {
+    fn new(gpu: &Gpu, capacity: u32) -> Result<Self, Error> {
+        let stride = 2 * capacity.div_ceil(8);
+        let matrix = |name| gpu.buffer(name, HEADS * capacity as usize * stride as usize);
+        Ok(Self {
+            inside_share: matrix("inside_share")?,
+            around_share: matrix("around_share")?,
+            grad_s: matrix("grad_similarity")?,
+            stride,
+        })
+    }
+}
+
 /// What belongs to one side of the attention.
 #[derive(Debug)]
 struct Side {
@@ -321,12 +434,12 @@ impl Pair<'_> {
 #[derive(Debug)]
 pub struct Attention {
     capacity: u32,
-    /// A subgroup of 8 shares what its lanes load: right where a load costs as much as some forty additions, on a CPU.
-    lanes: bool,
+    form: Form,
     sides: [Side; 2],
     /// Slices of every matrix's gradient, a buffer for each because passes that write one wait for each other: inside to
     /// queries-or-keys, values and output, then around. The form of lanes sums at once.
     partials: Option<[Buffer<[f32; 4]>; 6]>,
+    pairs: Option<Pairs>,
     skip: Buffer<u32>,
 }
 
@@ -347,7 +460,7 @@ fn partials(gpu: &Gpu) -> Result<[Buffer<[f32; 4]>; 6], Error> {
 macro_rules! run {
     ($self:ident, $rec:ident, $lanes:ident $many:literal tokens $wide:literal,
      $other:ident $few:literal tokens $narrow:literal, $buffers:tt, $push:tt) => {
-        if $self.lanes {
+        if $self.form != Form::Threads {
             $rec.run($lanes::Kernel, $lanes::Buffers $buffers, $lanes::Push $push, $self.threads($many, $wide));
         } else {
             $rec.run($other::Kernel, $other::Buffers $buffers, $other::Push $push, $self.threads($few, $narrow));
@@ -361,11 +474,17 @@ impl Attention {
     /// # Errors
     /// As [`Gpu::buffer`].
     pub fn new(gpu: &Gpu, capacity: u32) -> Result<Self, Error> {
+        let info = gpu.info();
+        Self::with_form(gpu, capacity, Form::best(info.kind, info.subgroup_size, capacity))
+    }
+
+    fn with_form(gpu: &Gpu, capacity: u32, form: Form) -> Result<Self, Error> {
         let side = |names| Side::new(gpu, names, capacity as usize);
-        let lanes = gpu.info().kind == "cpu" && gpu.info().subgroup_size == 8;
         Ok(Self {
             capacity,
-            lanes,
+            form,
+            pairs: if form == Form::Pairs { Some(Pairs::new(gpu, capacity)?) } else { None },
+            partials: if form == Form::Threads { Some(partials(gpu)?) } else { None },
             sides: [
                 side([
                     "inside_qk",
@@ -392,7 +511,6 @@ impl Attention {
                     "grad_around",
                 ])?,
             ],
-            partials: if lanes { None } else { Some(partials(gpu)?) },
             skip: gpu.buffer("attention_skip", 3)?,
         })
     }
@@ -471,15 +589,7 @@ impl Attention {
             run!(self, rec, attention_output_backward_lanes 32 tokens 64, attention_output_backward 4 tokens 8,
                 { tokens, grad_updated, weights, mixed, softmax, grad_mixed, rows }, { own, capacity, to_out });
         }
-        for own in 0..2u32 {
-            let Side { qk, value, grad_mixed, rows, grad_qk, grad_value, .. } = &self.sides[own as usize];
-            let Side { qk: other_qk, value: other_value, grad_mixed: other_grad_mixed, rows: other_rows, .. } =
-                &self.sides[1 - own as usize];
-            run!(self, rec, attention_backward_lanes 16 tokens 64, attention_backward 1 tokens 8, {
-                tokens, qk, value, grad_mixed, rows, other_qk, other_value, other_grad_mixed, other_rows,
-                grad_qk, grad_value
-            }, { own, capacity });
-        }
+        self.shares_backward(rec, tokens);
         for (own, side) in (0..).zip(&self.sides) {
             let Offsets { to_qk, to_v, .. } = SIDES[own as usize];
             let (to_qk, to_v) = ((to_qk / 4) as u32, (to_v / 4) as u32);
@@ -504,6 +614,58 @@ impl Attention {
         let buffers = attention_skip::Buffers { tokens, overflow, skip: &self.skip };
         rec.run(attention_skip::Kernel, buffers, (), 1u32);
         &self.skip
+    }
+
+    fn shares_backward(&self, rec: &mut Recorder<'_>, tokens: &Buffer<u32>) {
+        let capacity = self.capacity;
+        if let Some(pairs) = &self.pairs {
+            return self.pairs_backward(rec, tokens, pairs);
+        }
+        for own in 0..2u32 {
+            let Side { qk, value, grad_mixed, rows, grad_qk, grad_value, .. } = &self.sides[own as usize];
+            let Side { qk: other_qk, value: other_value, grad_mixed: other_grad_mixed, rows: other_rows, .. } =
+                &self.sides[1 - own as usize];
+            run!(self, rec, attention_backward_lanes 16 tokens 64, attention_backward 1 tokens 8, {
+                tokens, qk, value, grad_mixed, rows, other_qk, other_value, other_grad_mixed, other_rows,
+                grad_qk, grad_value
+            }, { own, capacity });
+        }
+    }
+
+    fn pairs_backward(&self, rec: &mut Recorder<'_>, tokens: &Buffer<u32>, pairs: &Pairs) {
+        let (capacity, stride) = (self.capacity, pairs.stride);
+        let Pairs { inside_share, around_share, grad_s, .. } = pairs;
+        let [inside, around] = &self.sides;
+        let buffers = attention_pairs_backward::Buffers {
+            tokens,
+            qk: &inside.qk,
+            value: &inside.value,
+            grad_mixed: &inside.grad_mixed,
+            rows: &inside.rows,
+            other_qk: &around.qk,
+            other_value: &around.value,
+            other_grad_mixed: &around.grad_mixed,
+            other_rows: &around.rows,
+            inside_share,
+            around_share,
+            grad_s,
+        };
+        let push = attention_pairs_backward::Push { capacity, stride };
+        rec.run(attention_pairs_backward::Kernel, buffers, push, self.threads(32, 64));
+        for (pairs, other, applied) in
+            [(grad_s, &around.qk, &inside.grad_qk), (around_share, &around.grad_mixed, &inside.grad_value)]
+        {
+            let buffers = attention_pairs_apply_inside::Buffers { tokens, pairs, other, applied };
+            let push = attention_pairs_apply_inside::Push { capacity, stride };
+            rec.run(attention_pairs_apply_inside::Kernel, buffers, push, self.threads(32, 64));
+        }
+        for (pairs, other, applied) in
+            [(grad_s, &inside.qk, &around.grad_qk), (inside_share, &inside.grad_mixed, &around.grad_value)]
+        {
+            let buffers = attention_pairs_apply::Buffers { tokens, pairs, other, applied };
+            let push = attention_pairs_apply::Push { capacity, stride };
+            rec.run(attention_pairs_apply::Kernel, buffers, push, self.threads(32, 64));
+        }
     }
 
     fn weights_backward(
@@ -563,9 +725,9 @@ mod tests {
     use crate::gpu::{Options, Submission, Timings, testing};
     use crate::math::attention as exact;
 
-    /// The forms to test: the one of lanes needs subgroups of 8.
-    fn both(gpu: &Gpu) -> &'static [bool] {
-        if gpu.info().subgroup_size == 8 { &[false, true] } else { &[false] }
+    /// The forms to test: those of lanes need subgroups of 8.
+    fn forms(gpu: &Gpu) -> &'static [Form] {
+        if gpu.info().subgroup_size == 8 { &[Form::Threads, Form::Lanes, Form::Pairs] } else { &[Form::Threads] }
     }
 
     struct Run {
@@ -589,10 +751,8 @@ mod tests {
     }
 
     /// Every buffer starts as not-a-number. `checked`: every pass beside its twin.
-    fn run(gpu: &Gpu, inputs: &Inputs, capacity: usize, lanes: bool, checked: bool) -> Run {
-        let mut attention = Attention::new(gpu, capacity as u32).expect("memory for the test");
-        attention.lanes = lanes;
-        attention.partials = (!lanes).then(|| partials(gpu).expect("memory for the test"));
+    fn run(gpu: &Gpu, inputs: &Inputs, capacity: usize, form: Form, checked: bool) -> Run {
+        let attention = Attention::with_form(gpu, capacity as u32, form).expect("memory for the test");
         let pad = |values: &Vec<f32>| {
             let mut values = values.clone();
             values.resize(capacity * FEATURE, testing::UNWRITTEN);
@@ -614,6 +774,9 @@ mod tests {
             rec.fill(&side.grad_feature, nan);
         }
         attention.partials.iter().flatten().for_each(|partial| rec.fill(partial, nan));
+        if let Some(Pairs { inside_share, around_share, grad_s, .. }) = &attention.pairs {
+            [inside_share, around_share, grad_s].into_iter().for_each(|matrix| rec.fill(matrix, nan));
+        }
         rec.fill(&grad_weights, nan);
         let pair = |of: &'static str| match of {
             "features" => Pair { inside: &features[0], around: &features[1] },
@@ -678,8 +841,8 @@ mod tests {
         for (i, n) in [[0, 0], [0, 12], [11, 0], [11, 1], [1, 2], [63, 65], [64, 64], [65, 63]].into_iter().enumerate()
         {
             let inputs = inputs(n, i as u64);
-            for &lanes in both(&gpu) {
-                let got = run(&gpu, &inputs, 67, lanes, true);
+            for &form in forms(&gpu) {
+                let got = run(&gpu, &inputs, 67, form, true);
                 compare(&inputs, &got, WHOLE);
             }
         }
@@ -690,8 +853,8 @@ mod tests {
         let gpu = testing::gpu();
         for n in [[1, 1], [1, 200], [200, 1], [200, 200], [257, 300], [77, 211]] {
             let inputs = inputs(n, 11);
-            for &lanes in both(&gpu) {
-                compare(&inputs, &run(&gpu, &inputs, 301, lanes, false), WHOLE);
+            for &form in forms(&gpu) {
+                compare(&inputs, &run(&gpu, &inputs, 301, form, false), WHOLE);
             }
         }
     }
@@ -713,12 +876,22 @@ mod tests {
     }
 
     #[test]
+    fn many_tokens_keep_no_pairs() {
+        let of = |kind, subgroup_size, capacity| Form::best(kind, subgroup_size, capacity);
+        assert_eq!(
+            [256, 512, 513, 2000].map(|n| of("cpu", 8, n)),
+            [Form::Pairs, Form::Pairs, Form::Lanes, Form::Lanes]
+        );
+        assert_eq!([("cpu", 4), ("discrete", 8), ("discrete", 32)].map(|(k, s)| of(k, s, 256)), [Form::Threads; 3]);
+    }
+
+    #[test]
     fn twice_the_same_bytes() {
         let gpu = testing::gpu();
         let inputs = inputs([130, 97], 5);
         let bits = |v: &[f32]| v.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
-        for &lanes in both(&gpu) {
-            let [a, b] = [0, 1].map(|_| run(&gpu, &inputs, 200, lanes, false));
+        for &form in forms(&gpu) {
+            let [a, b] = [0, 1].map(|_| run(&gpu, &inputs, 200, form, false));
             assert_eq!(bits(&a.grad_weights), bits(&b.grad_weights));
             for side in 0..2 {
                 assert_eq!(bits(&a.updated[side]), bits(&b.updated[side]));
@@ -736,8 +909,8 @@ mod tests {
             let first = f[..FEATURE].to_vec();
             f.chunks_mut(FEATURE).for_each(|row| row.copy_from_slice(&first));
         }
-        for &lanes in both(&gpu) {
-            compare(&inputs, &run(&gpu, &inputs, 40, lanes, false), WHOLE);
+        for &form in forms(&gpu) {
+            compare(&inputs, &run(&gpu, &inputs, 40, form, false), WHOLE);
         }
     }
 
@@ -757,8 +930,8 @@ mod tests {
                 .map(|k| dot(head_of(&qk[0], k / n[1], 0), head_of(&qk[1], k % n[1], 0)).abs() / 8.0)
                 .fold(0.0, f64::max);
             assert!(largest > 1e4, "largest logit {largest}");
-            for &lanes in both(&gpu) {
-                let got = run(&gpu, &inputs, 200, lanes, false);
+            for &form in forms(&gpu) {
+                let got = run(&gpu, &inputs, 200, form, false);
                 compare(&inputs, &got, Check { relative: 5e-3, absolute: 5e-3, band: 0.0 });
             }
         }
