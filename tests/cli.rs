@@ -381,7 +381,7 @@ fn plan_and_verify_of_a_scene() {
     let folder = folder.path();
     let few = FEW_STEPS;
     let plan = succeeds(folder, &format!("plan scene --step 2 --validate {few}")).stdout;
-    for part in ["step 2 (view ", "\nleft out\n", "\nbuffers\n", "    barrier: ", "model/attention_project  <"] {
+    for part in ["step 2 (view ", "\nleft out\n", "\nbuffers\n", "    barrier: ", "model/attention_blend_gather  <"] {
         assert!(plan.contains(part), "no {part:?} in {plan}");
     }
     let json = succeeds(folder, &format!("plan scene --step 2 --measure 2 --json --validate {few}")).stdout;
@@ -397,7 +397,7 @@ fn plan_and_verify_of_a_scene() {
     assert!(verify.starts_with("step 3, view "), "{verify}");
     let last = verify.lines().last().expect("lines");
     assert!(last.ends_with(" tensors compared, 0 beyond their bound"), "{last}");
-    assert!(verify.contains("model/attention_project "), "{verify}");
+    assert!(verify.contains("model/attention_blend_gather "), "{verify}");
     // A step before the attention's, although the warm-up went past it.
     let early = succeeds(folder, &format!("verify scene --warm-up 3 --step 1 {few}")).stdout;
     assert!(early.starts_with("step 1, view ") && !early.contains("model/attention"), "{early}");

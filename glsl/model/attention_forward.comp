@@ -1,5 +1,4 @@
 #version 460
-// variant wide: QUERIES=4
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_EXT_control_flow_attributes : require
 #extension GL_GOOGLE_include_directive : require

@@ -10,17 +10,15 @@ layout(local_size_x = 64) in;
 layout(binding = 0, scalar) readonly buffer Tokens { uint tokens[]; };          // [2] tokens inside, around
 layout(binding = 1, scalar) readonly buffer GradOutput { vec4 grad_output[]; }; // [capacity * rows / 4]
 layout(binding = 2, scalar) readonly buffer Input { vec4 inputs[]; };           // [capacity * columns / 4]
-layout(binding = 3, scalar) writeonly buffer Partial { vec4 partial[]; };       // [8 * 24592] slices of all weights' gradient
+layout(binding = 3, scalar) writeonly buffer Partial { vec4 partial[]; };       // [8 * (4 * rows * columns + bias * rows)] slices of the matrix and its bias
 layout(push_constant, scalar) uniform Push {
   uint own;      // 0: the side is inside, 1: around
   uint capacity; // tokens at most
   uint rows;     // vec4 of an output
   uint columns;  // vec4 of an input
-  uint matrix;   // vec4 offset of the matrix in the weights
   uint bias;     // 1: a bias follows
 } push;
 const uint SLICES = 8u;
-const uint ALL = 24592u;
 void main() {
   uint n = sides(tokens[push.own], tokens[1u - push.own], push.capacity).x;
   uint tiles = (push.rows / 2u) * (push.columns / 2u);
@@ -42,7 +40,7 @@ void main() {
       sum[r][1] = fma(vec4(a[r / 4u][r % 4u]), v, sum[r][1]);
     }
   }
-  uint at = slice * ALL + push.matrix;
+  uint at = slice * (4u * push.rows * push.columns + push.bias * push.rows);
   [[unroll]] for (uint r = 0u; r < 8u; r++) {
     partial[at + (4u * row + r) * push.columns + column] = sum[r][0];
     partial[at + (4u * row + r) * push.columns + column + 1u] = sum[r][1];

@@ -232,8 +232,10 @@ fn describe(instance: &ash::Instance, p: vk::PhysicalDevice, index: usize) -> Re
     let operations = vk::SubgroupFeatureFlags::BASIC
         | vk::SubgroupFeatureFlags::VOTE
         | vk::SubgroupFeatureFlags::BALLOT
+        | vk::SubgroupFeatureFlags::SHUFFLE
         | vk::SubgroupFeatureFlags::ARITHMETIC;
-    need(v11.subgroup_supported_operations.contains(operations), "subgroup vote, ballot and arithmetic operations");
+    let wanted = "subgroup vote, ballot, shuffle and arithmetic operations";
+    need(v11.subgroup_supported_operations.contains(operations), wanted);
     need(
         v11.subgroup_supported_stages.contains(vk::ShaderStageFlags::COMPUTE),
         "subgroup operations in compute kernels",

@@ -9,9 +9,11 @@
 use rand::{Rng, RngExt};
 
 use crate::gpu::kernels::model::{
-    attention_backward, attention_backward_wide, attention_forward, attention_forward_wide, attention_output,
-    attention_output_backward, attention_project, attention_project_backward, attention_skip,
-    attention_weight_backward, attention_weight_sum,
+    attention_backward, attention_backward_lanes, attention_forward, attention_forward_lanes, attention_output,
+    attention_output_backward, attention_output_backward_lanes, attention_output_lanes, attention_pairs_apply,
+    attention_pairs_apply_inside, attention_pairs_backward, attention_project, attention_project_backward,
+    attention_project_backward_lanes, attention_project_lanes, attention_skip, attention_weight_backward,
+    attention_weight_backward_lanes, attention_weight_sum,
 };
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::math::attention::{FEATURE, HEAD, HEADS, INNER, Offsets, SIDES, dot, softmax_row};
@@ -35,17 +37,23 @@ fn head_of(x: &[f64], token: usize, head: usize) -> &[f64] {
     crate::math::attention::head(x, token, head)
 }
 
-impl Reference for attention_project::Kernel {
-    fn reference(host: attention_project::Host<'_>, push: attention_project::Push, (): ()) {
-        let (n, _) = sides(host.tokens, push.own, push.capacity);
-        let (feature, weights) = (widen(&host.feature[..n * 8]), widen(host.weights));
-        for (out, at) in [(host.qk, push.to_qk), (host.value, push.to_v)] {
-            let matrix = &weights[4 * at as usize..][..INNER * FEATURE];
-            let y = crate::math::attention::linear(&feature, matrix, FEATURE);
-            out.as_flattened_mut().iter_mut().zip(y).for_each(|(out, y)| *out = y as f32);
+macro_rules! project_twin {
+    ($kernel:ident) => {
+        impl Reference for $kernel::Kernel {
+            fn reference(host: $kernel::Host<'_>, push: $kernel::Push, (): ()) {
+                let (n, _) = sides(host.tokens, push.own, push.capacity);
+                let (feature, weights) = (widen(&host.feature[..n * 8]), widen(host.weights));
+                for (out, at) in [(host.qk, push.to_qk), (host.value, push.to_v)] {
+                    let matrix = &weights[4 * at as usize..][..INNER * FEATURE];
+                    let y = crate::math::attention::linear(&feature, matrix, FEATURE);
+                    out.as_flattened_mut().iter_mut().zip(y).for_each(|(out, y)| *out = y as f32);
+                }
+            }
         }
-    }
+    };
 }
+project_twin!(attention_project);
+project_twin!(attention_project_lanes);
 
 /// The softmax of a row is right to about (3 + 2 |x|) units of the exponential (Vulkan's bound, x at most some tens
 /// where it matters) plus the logit's own error of some 20 units times its terms.
@@ -81,36 +89,49 @@ macro_rules! forward_twin {
     };
 }
 forward_twin!(attention_forward);
-forward_twin!(attention_forward_wide);
+forward_twin!(attention_forward_lanes);
 
-impl Reference for attention_output::Kernel {
-    fn reference(host: attention_output::Host<'_>, push: attention_output::Push, (): ()) {
-        let (n, _) = sides(host.tokens, push.own, push.capacity);
-        let (mixed, weights) = (widen(&host.mixed[..n * INNER / 4]), widen(host.weights));
-        let matrix = &weights[4 * push.to_out as usize..];
-        let y = crate::math::attention::linear(&mixed, &matrix[..INNER * FEATURE], INNER);
-        for (i, (out, y)) in host.updated.as_flattened_mut().iter_mut().zip(y).enumerate() {
-            *out = (y + matrix[INNER * FEATURE + i % FEATURE]) as f32;
+macro_rules! output_twin {
+    ($kernel:ident) => {
+        impl Reference for $kernel::Kernel {
+            fn reference(host: $kernel::Host<'_>, push: $kernel::Push, (): ()) {
+                let (n, _) = sides(host.tokens, push.own, push.capacity);
+                let (mixed, weights) = (widen(&host.mixed[..n * INNER / 4]), widen(host.weights));
+                let matrix = &weights[4 * push.to_out as usize..];
+                let y = crate::math::attention::linear(&mixed, &matrix[..INNER * FEATURE], INNER);
+                for (i, (out, y)) in host.updated.as_flattened_mut().iter_mut().zip(y).enumerate() {
+                    *out = (y + matrix[INNER * FEATURE + i % FEATURE]) as f32;
+                }
+            }
         }
-    }
+    };
 }
+output_twin!(attention_output);
+output_twin!(attention_output_lanes);
 
-impl Reference for attention_output_backward::Kernel {
-    fn reference(host: attention_output_backward::Host<'_>, push: attention_output_backward::Push, (): ()) {
-        let (n, _) = sides(host.tokens, push.own, push.capacity);
-        let (grad, weights) = (widen(&host.grad_updated[..n * 8]), widen(host.weights));
-        let mixed = widen(&host.mixed[..n * INNER / 4]);
-        let matrix = &weights[4 * push.to_out as usize..][..INNER * FEATURE];
-        let grad_mixed = crate::math::attention::times(&grad, matrix, FEATURE, INNER);
-        for (out, g) in host.grad_mixed.as_flattened_mut().iter_mut().zip(&grad_mixed) {
-            *out = *g as f32;
+macro_rules! output_backward_twin {
+    ($kernel:ident) => {
+        impl Reference for $kernel::Kernel {
+            fn reference(host: $kernel::Host<'_>, push: $kernel::Push, (): ()) {
+                let (n, _) = sides(host.tokens, push.own, push.capacity);
+                let (grad, weights) = (widen(&host.grad_updated[..n * 8]), widen(host.weights));
+                let mixed = widen(&host.mixed[..n * INNER / 4]);
+                let matrix = &weights[4 * push.to_out as usize..][..INNER * FEATURE];
+                let grad_mixed = crate::math::attention::times(&grad, matrix, FEATURE, INNER);
+                for (out, g) in host.grad_mixed.as_flattened_mut().iter_mut().zip(&grad_mixed) {
+                    *out = *g as f32;
+                }
+                for (i, h) in (0..n).flat_map(|i| (0..HEADS).map(move |h| (i, h))) {
+                    let [top, inverse] = host.softmax[i * HEADS + h];
+                    host.rows[i * HEADS + h] =
+                        [top, inverse, dot(head_of(&grad_mixed, i, h), head_of(&mixed, i, h)) as f32];
+                }
+            }
         }
-        for (i, h) in (0..n).flat_map(|i| (0..HEADS).map(move |h| (i, h))) {
-            let [top, inverse] = host.softmax[i * HEADS + h];
-            host.rows[i * HEADS + h] = [top, inverse, dot(head_of(&grad_mixed, i, h), head_of(&mixed, i, h)) as f32];
-        }
-    }
+    };
 }
+output_backward_twin!(attention_output_backward);
+output_backward_twin!(attention_output_backward_lanes);
 
 macro_rules! backward_twin {
     ($kernel:ident) => {
@@ -151,26 +172,94 @@ macro_rules! backward_twin {
     };
 }
 backward_twin!(attention_backward);
-backward_twin!(attention_backward_wide);
+backward_twin!(attention_backward_lanes);
 
-impl Reference for attention_project_backward::Kernel {
-    fn reference(host: attention_project_backward::Host<'_>, push: attention_project_backward::Push, (): ()) {
-        let (n, _) = sides(host.tokens, push.own, push.capacity);
-        let weights = widen(host.weights);
-        let [a, b] = [(host.grad_qk, push.to_qk), (host.grad_value, push.to_v)].map(|(grad, at)| {
-            let matrix = &weights[4 * at as usize..][..INNER * FEATURE];
-            crate::math::attention::times(&widen(&grad[..n * INNER / 4]), matrix, INNER, FEATURE)
-        });
-        for ((out, a), b) in host.grad_feature.as_flattened_mut().iter_mut().zip(a).zip(b) {
-            *out = (a + b) as f32;
+impl Reference for attention_pairs_backward::Kernel {
+    fn reference(host: attention_pairs_backward::Host<'_>, push: attention_pairs_backward::Push, (): ()) {
+        let (n, m) = sides(host.tokens, 0, push.capacity);
+        let [q, v, g, oq, ov, og] =
+            [host.qk, host.value, host.grad_mixed, host.other_qk, host.other_value, host.other_grad_mixed].map(widen);
+        let (rows, others) = (widen(host.rows), widen(host.other_rows));
+        let [inside, around, grad_s] =
+            [host.inside_share, host.around_share, host.grad_s].map(<[[f32; 4]]>::as_flattened_mut);
+        for (j, h) in (0..m).flat_map(|j| (0..HEADS).map(move |h| (j, h))) {
+            let other = &others[3 * (j * HEADS + h)..];
+            let at = 4 * (h * push.capacity as usize + j) * push.stride as usize;
+            // To the end of a vector: zero behind the last token.
+            for of in [&mut *inside, &mut *around, &mut *grad_s] {
+                of[at..at + n.next_multiple_of(4)].fill(0.0);
+            }
+            for i in 0..n {
+                let row = &rows[3 * (i * HEADS + h)..];
+                let logit = dot(head_of(&q, i, h), head_of(&oq, j, h)) / 8.0;
+                let p = (logit - row[0]).exp() * row[1];
+                let r = (logit - other[0]).exp() * other[1];
+                let s = p * (dot(head_of(&g, i, h), head_of(&ov, j, h)) - row[2])
+                    + r * (dot(head_of(&v, i, h), head_of(&og, j, h)) - other[2]);
+                (inside[at + i], around[at + i], grad_s[at + i]) = (p as f32, r as f32, (s / 8.0) as f32);
+            }
         }
     }
 
-    /// A thousand terms that may cancel.
     fn check(_: &'static str) -> Check {
-        Check { relative: 1e-5, absolute: 4e-6, band: 0.0 }
+        SOFTMAX
     }
 }
+
+macro_rules! apply_twin {
+    ($kernel:ident, $own:literal) => {
+        impl Reference for $kernel::Kernel {
+            fn reference(host: $kernel::Host<'_>, push: $kernel::Push, (): ()) {
+                let (n, m) = sides(host.tokens, $own, push.capacity);
+                let (pairs, other) = (host.pairs.as_flattened(), widen(host.other));
+                for (i, h) in (0..n).flat_map(|i| (0..HEADS).map(move |h| (i, h))) {
+                    let mut sum = [0.0; HEAD];
+                    for j in 0..m {
+                        let (around, inside) = if $own == 0 { (j, i) } else { (i, j) };
+                        let row = h * push.capacity as usize + around;
+                        let weight = f64::from(pairs[4 * row * push.stride as usize + inside]);
+                        sum.iter_mut().zip(head_of(&other, j, h)).for_each(|(sum, x)| *sum += weight * x);
+                    }
+                    for (out, sum) in host.applied.as_flattened_mut()[i * INNER + h * HEAD..].iter_mut().zip(sum) {
+                        *out = sum as f32;
+                    }
+                }
+            }
+
+            /// As many terms as there are tokens, which may cancel.
+            fn check(_: &'static str) -> Check {
+                Check { relative: 1e-5, absolute: 4e-6, band: 0.0 }
+            }
+        }
+    };
+}
+apply_twin!(attention_pairs_apply, 1);
+apply_twin!(attention_pairs_apply_inside, 0);
+
+macro_rules! project_backward_twin {
+    ($kernel:ident) => {
+        impl Reference for $kernel::Kernel {
+            fn reference(host: $kernel::Host<'_>, push: $kernel::Push, (): ()) {
+                let (n, _) = sides(host.tokens, push.own, push.capacity);
+                let weights = widen(host.weights);
+                let [a, b] = [(host.grad_qk, push.to_qk), (host.grad_value, push.to_v)].map(|(grad, at)| {
+                    let matrix = &weights[4 * at as usize..][..INNER * FEATURE];
+                    crate::math::attention::times(&widen(&grad[..n * INNER / 4]), matrix, INNER, FEATURE)
+                });
+                for ((out, a), b) in host.grad_feature.as_flattened_mut().iter_mut().zip(a).zip(b) {
+                    *out = (a + b) as f32;
+                }
+            }
+
+            /// A thousand terms that may cancel.
+            fn check(_: &'static str) -> Check {
+                Check { relative: 1e-5, absolute: 4e-6, band: 0.0 }
+            }
+        }
+    };
+}
+project_backward_twin!(attention_project_backward);
+project_backward_twin!(attention_project_backward_lanes);
 
 impl Reference for attention_weight_backward::Kernel {
     fn reference(host: attention_weight_backward::Host<'_>, push: attention_weight_backward::Push, (): ()) {
@@ -181,17 +270,32 @@ impl Reference for attention_weight_backward::Kernel {
         let (rows, columns) = (4 * push.rows as usize, 4 * push.columns as usize);
         let (grad, input) = (widen(host.grad_output), widen(host.inputs));
         let length = n.div_ceil(SLICES);
-        for (slice, partial) in host.partial.as_flattened_mut().chunks_mut(WEIGHTS).enumerate() {
+        let all = rows * columns + if push.bias != 0 { rows } else { 0 };
+        for (slice, partial) in host.partial.as_flattened_mut().chunks_mut(all).enumerate() {
             let tokens = (slice * length).min(n)..((slice + 1) * length).min(n);
             let grad = &grad[tokens.start * rows..tokens.end * rows];
             let input = &input[tokens.start * columns..tokens.end * columns];
             let sum = crate::math::attention::outer(grad, rows, input, columns);
-            let at = 4 * push.matrix as usize;
-            partial[at..].iter_mut().zip(sum).for_each(|(out, sum)| *out = sum as f32);
+            partial.iter_mut().zip(sum).for_each(|(out, sum)| *out = sum as f32);
             if push.bias != 0 {
                 let sum = crate::math::attention::outer(grad, rows, &vec![1.0; tokens.len()], 1);
-                partial[at + rows * columns..].iter_mut().zip(sum).for_each(|(out, sum)| *out = sum as f32);
+                partial[rows * columns..].iter_mut().zip(sum).for_each(|(out, sum)| *out = sum as f32);
             }
+        }
+    }
+}
+
+impl Reference for attention_weight_backward_lanes::Kernel {
+    fn reference(host: attention_weight_backward_lanes::Host<'_>, push: attention_weight_backward_lanes::Push, (): ()) {
+        let (n, _) = sides(host.tokens, push.own, push.capacity);
+        let (rows, columns) = (4 * push.rows as usize, 4 * push.columns as usize);
+        let (grad, input) = (widen(&host.grad_output[..n * rows / 4]), widen(&host.inputs[..n * columns / 4]));
+        let out = &mut host.grad_weights.as_flattened_mut()[4 * push.matrix as usize..];
+        let sum = crate::math::attention::outer(&grad, rows, &input, columns);
+        out.iter_mut().zip(sum).for_each(|(out, sum)| *out = sum as f32);
+        if push.bias != 0 {
+            let sum = crate::math::attention::outer(&grad, rows, &vec![1.0; n], 1);
+            out[rows * columns..].iter_mut().zip(sum).for_each(|(out, sum)| *out = sum as f32);
         }
     }
 }
@@ -199,10 +303,22 @@ impl Reference for attention_weight_backward::Kernel {
 impl Reference for attention_weight_sum::Kernel {
     fn reference(host: attention_weight_sum::Host<'_>, (): (), (): ()) {
         let none = host.tokens[0] == 0 || host.tokens[1] == 0;
-        let partial = host.partial.as_flattened();
-        for (i, out) in host.grad_weights.as_flattened_mut().iter_mut().enumerate() {
-            let sum: f64 = (0..SLICES).map(|s| f64::from(partial[s * WEIGHTS + i])).sum();
-            *out = if none { 0.0 } else { sum as f32 };
+        let partials = [
+            (host.inside_qk, SIDES[0].to_qk),
+            (host.around_qk, SIDES[1].to_qk),
+            (host.inside_value, SIDES[0].to_v),
+            (host.around_value, SIDES[1].to_v),
+            (host.inside_out, SIDES[0].to_out),
+            (host.around_out, SIDES[1].to_out),
+        ];
+        let grad_weights = host.grad_weights.as_flattened_mut();
+        for (partial, at) in partials {
+            let partial = partial.as_flattened();
+            let all = partial.len() / SLICES;
+            for (i, out) in grad_weights[at..at + all].iter_mut().enumerate() {
+                let sum: f64 = (0..SLICES).map(|s| f64::from(partial[s * all + i])).sum();
+                *out = if none { 0.0 } else { sum as f32 };
+            }
         }
     }
 }
@@ -211,6 +327,56 @@ impl Reference for attention_skip::Kernel {
     fn reference(host: attention_skip::Host<'_>, (): (), (): ()) {
         let [inside, around] = [0, 1].map(|side| if host.overflow[0] != 0 { 0 } else { host.tokens[side] });
         host.skip[..3].copy_from_slice(&[u32::from(inside == 0 || around == 0), inside, around]);
+    }
+}
+
+/// How the kernels share the work.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Form {
+    /// A token to a thread, shares formed again in the backward pass: for a GPU.
+    Threads,
+    /// A subgroup of 8 shares what its lanes load, 16 or 32 tokens at a time: for a CPU driver, where a load costs as much
+    /// as some forty additions. Shares are formed again, too.
+    Lanes,
+    /// As lanes; the backward pass forms shares and the gradient of the similarity once for both sides and keeps them: 7
+    /// products of all pairs instead of 10, and 2 sets of loads instead of 2 times 3.
+    Pairs,
+}
+
+impl Form {
+    /// Most tokens a side whose pairs are kept: 3 matrices of 8 MiB each then, 2 MiB each at 256 tokens; at 2,000 a matrix
+    /// would be as large as a binding may be.
+    const MOST_KEPT: u32 = 512;
+
+    fn best(kind: &str, subgroup_size: u32, capacity: u32) -> Self {
+        match (kind, subgroup_size) {
+            ("cpu", 8) if capacity <= Self::MOST_KEPT => Self::Pairs,
+            ("cpu", 8) => Self::Lanes,
+            _ => Self::Threads,
+        }
+    }
+}
+
+/// Of every head and pair of tokens, rows of the tokens around.
+#[derive(Debug)]
+struct Pairs {
+    inside_share: Buffer<[f32; 4]>,
+    around_share: Buffer<[f32; 4]>,
+    grad_s: Buffer<[f32; 4]>,
+    /// Vectors of a row.
+    stride: u32,
+}
+
+impl Pairs {
+    fn new(gpu: &Gpu, capacity: u32) -> Result<Self, Error> {
+        let stride = 2 * capacity.div_ceil(8);
+        let matrix = |name| gpu.buffer(name, HEADS * capacity as usize * stride as usize);
+        Ok(Self {
+            inside_share: matrix("inside_share")?,
+            around_share: matrix("around_share")?,
+            grad_s: matrix("grad_similarity")?,
+            stride,
+        })
     }
 }
 
@@ -268,11 +434,38 @@ impl Pair<'_> {
 #[derive(Debug)]
 pub struct Attention {
     capacity: u32,
-    /// Many tokens per thread: right where loads are dear and registers are memory anyway, on a CPU.
-    wide: bool,
+    form: Form,
     sides: [Side; 2],
-    partial: Buffer<[f32; 4]>,
+    /// Slices of every matrix's gradient, a buffer for each because passes that write one wait for each other: inside to
+    /// queries-or-keys, values and output, then around. The form of lanes sums at once.
+    partials: Option<[Buffer<[f32; 4]>; 6]>,
+    pairs: Option<Pairs>,
     skip: Buffer<u32>,
+}
+
+fn partials(gpu: &Gpu) -> Result<[Buffer<[f32; 4]>; 6], Error> {
+    let partial = |name, bias| gpu.buffer(name, SLICES * (INNER * FEATURE + bias) / 4);
+    Ok([
+        partial("inside_qk_partial", 0)?,
+        partial("inside_value_partial", 0)?,
+        partial("inside_out_partial", FEATURE)?,
+        partial("around_qk_partial", 0)?,
+        partial("around_value_partial", 0)?,
+        partial("around_out_partial", FEATURE)?,
+    ])
+}
+
+/// Records one of the two forms of a kernel, which share bindings and push constants. Of each: so many tokens (rounded up)
+/// take so many threads.
+macro_rules! run {
+    ($self:ident, $rec:ident, $lanes:ident $many:literal tokens $wide:literal,
+     $other:ident $few:literal tokens $narrow:literal, $buffers:tt, $push:tt) => {
+        if $self.form != Form::Threads {
+            $rec.run($lanes::Kernel, $lanes::Buffers $buffers, $lanes::Push $push, $self.threads($many, $wide));
+        } else {
+            $rec.run($other::Kernel, $other::Buffers $buffers, $other::Push $push, $self.threads($few, $narrow));
+        }
+    };
 }
 
 impl Attention {
@@ -281,10 +474,17 @@ impl Attention {
     /// # Errors
     /// As [`Gpu::buffer`].
     pub fn new(gpu: &Gpu, capacity: u32) -> Result<Self, Error> {
+        let info = gpu.info();
+        Self::with_form(gpu, capacity, Form::best(info.kind, info.subgroup_size, capacity))
+    }
+
+    fn with_form(gpu: &Gpu, capacity: u32, form: Form) -> Result<Self, Error> {
         let side = |names| Side::new(gpu, names, capacity as usize);
         Ok(Self {
             capacity,
-            wide: gpu.info().kind == "cpu",
+            form,
+            pairs: if form == Form::Pairs { Some(Pairs::new(gpu, capacity)?) } else { None },
+            partials: if form == Form::Threads { Some(partials(gpu)?) } else { None },
             sides: [
                 side([
                     "inside_qk",
@@ -311,7 +511,6 @@ impl Attention {
                     "grad_around",
                 ])?,
             ],
-            partial: gpu.buffer("attention_partial", SLICES * WEIGHTS / 4)?,
             skip: gpu.buffer("attention_skip", 3)?,
         })
     }
@@ -349,31 +548,23 @@ impl Attention {
         let (capacity, features, weights) = (self.capacity, features.vectors(), &weights.view());
         for ((own, side), feature) in (0..).zip(&self.sides).zip(&features) {
             let Offsets { to_qk, to_v, .. } = SIDES[own as usize];
-            let push = attention_project::Push { own, capacity, to_qk: (to_qk / 4) as u32, to_v: (to_v / 4) as u32 };
+            let (to_qk, to_v) = ((to_qk / 4) as u32, (to_v / 4) as u32);
             let Side { qk, value, .. } = side;
-            let buffers = attention_project::Buffers { tokens, feature, weights, qk, value };
-            rec.run(attention_project::Kernel, buffers, push, self.threads(4, 32));
+            run!(self, rec, attention_project_lanes 32 tokens 128, attention_project 4 tokens 32,
+                { tokens, feature, weights, qk, value }, { own, capacity, to_qk, to_v });
         }
         for own in 0..2u32 {
             let (side, other) = (&self.sides[own as usize], &self.sides[1 - own as usize]);
             let (query, mixed, softmax) = (&side.qk, &side.mixed, &side.softmax);
             let (key, value) = (&other.qk, &other.value);
-            if self.wide {
-                let push = attention_forward_wide::Push { own, capacity };
-                let buffers = attention_forward_wide::Buffers { tokens, query, key, value, mixed, softmax };
-                rec.run(attention_forward_wide::Kernel, buffers, push, self.threads(4, 8));
-            } else {
-                let push = attention_forward::Push { own, capacity };
-                let buffers = attention_forward::Buffers { tokens, query, key, value, mixed, softmax };
-                rec.run(attention_forward::Kernel, buffers, push, self.threads(1, 8));
-            }
+            run!(self, rec, attention_forward_lanes 32 tokens 64, attention_forward 1 tokens 8,
+                { tokens, query, key, value, mixed, softmax }, { own, capacity });
         }
         for (own, side) in (0..).zip(&self.sides) {
             let to_out = (SIDES[own as usize].to_out / 4) as u32;
             let updated = &side.updated.view();
-            let buffers = attention_output::Buffers { tokens, mixed: &side.mixed, weights, updated };
-            let push = attention_output::Push { own, capacity, to_out };
-            rec.run(attention_output::Kernel, buffers, push, self.threads(4, 8));
+            run!(self, rec, attention_output_lanes 32 tokens 16, attention_output 4 tokens 8,
+                { tokens, mixed: &side.mixed, weights, updated }, { own, capacity, to_out });
         }
         Pair { inside: &self.sides[0].updated, around: &self.sides[1].updated }
     }
@@ -395,43 +586,19 @@ impl Attention {
         for ((own, side), grad_updated) in (0..).zip(&self.sides).zip(&grad_updated) {
             let to_out = (SIDES[own as usize].to_out / 4) as u32;
             let Side { mixed, softmax, grad_mixed, rows, .. } = side;
-            let buffers =
-                attention_output_backward::Buffers { tokens, grad_updated, weights, mixed, softmax, grad_mixed, rows };
-            let push = attention_output_backward::Push { own, capacity, to_out };
-            rec.run(attention_output_backward::Kernel, buffers, push, self.threads(4, 8));
+            run!(self, rec, attention_output_backward_lanes 32 tokens 64, attention_output_backward 4 tokens 8,
+                { tokens, grad_updated, weights, mixed, softmax, grad_mixed, rows }, { own, capacity, to_out });
         }
-        for own in 0..2u32 {
-            self.shares_backward(rec, tokens, own);
-        }
+        self.shares_backward(rec, tokens);
         for (own, side) in (0..).zip(&self.sides) {
             let Offsets { to_qk, to_v, .. } = SIDES[own as usize];
             let (to_qk, to_v) = ((to_qk / 4) as u32, (to_v / 4) as u32);
-            let push = attention_project_backward::Push { own, capacity, to_qk, to_v };
             let grad_feature = &side.grad_feature.view();
             let Side { grad_qk, grad_value, .. } = side;
-            let buffers = attention_project_backward::Buffers { tokens, weights, grad_qk, grad_value, grad_feature };
-            rec.run(attention_project_backward::Kernel, buffers, push, self.threads(4, 8));
+            run!(self, rec, attention_project_backward_lanes 32 tokens 16, attention_project_backward 4 tokens 8,
+                { tokens, weights, grad_qk, grad_value, grad_feature }, { own, capacity, to_qk, to_v });
         }
-        let (narrow, inner) = ((FEATURE / 4) as u32, (INNER / 4) as u32);
-        for (own, side) in (0..).zip(&self.sides) {
-            let (Offsets { to_qk, to_v, to_out }, at) = (SIDES[own as usize], own as usize);
-            let products = [
-                (&side.grad_qk, inner, &features[at], narrow, to_qk, 0),
-                (&side.grad_value, inner, &features[at], narrow, to_v, 0),
-                (&grad_updated[at], narrow, &side.mixed, inner, to_out, 1),
-            ];
-            for (grad_output, rows, inputs, columns, matrix, bias) in products {
-                let matrix = (matrix / 4) as u32;
-                let push = attention_weight_backward::Push { own, capacity, rows, columns, matrix, bias };
-                let partial = &self.partial;
-                let buffers = attention_weight_backward::Buffers { tokens, grad_output, inputs, partial };
-                let threads = rows / 2 * (columns / 2) * SLICES as u32;
-                rec.run(attention_weight_backward::Kernel, buffers, push, threads);
-            }
-        }
-        let grad_weights = &grad_weights.view();
-        let buffers = attention_weight_sum::Buffers { tokens, partial: &self.partial, grad_weights };
-        rec.run(attention_weight_sum::Kernel, buffers, (), WEIGHTS / 4);
+        self.weights_backward(rec, tokens, &features, &grad_updated, &grad_weights.view());
         Pair { inside: &self.sides[0].grad_feature, around: &self.sides[1].grad_feature }
     }
 
@@ -449,30 +616,103 @@ impl Attention {
         &self.skip
     }
 
-    fn shares_backward(&self, rec: &mut Recorder<'_>, tokens: &Buffer<u32>, own: u32) {
-        let Side { qk, value, grad_mixed, rows, grad_qk, grad_value, .. } = &self.sides[own as usize];
-        let Side { qk: other_qk, value: other_value, grad_mixed: other_grad_mixed, rows: other_rows, .. } =
-            &self.sides[1 - own as usize];
+    fn shares_backward(&self, rec: &mut Recorder<'_>, tokens: &Buffer<u32>) {
         let capacity = self.capacity;
-        macro_rules! run {
-            ($kernel:ident, $tokens:expr) => {{
-                let buffers = $kernel::Buffers {
-                    tokens,
-                    qk,
-                    value,
-                    grad_mixed,
-                    rows,
-                    other_qk,
-                    other_value,
-                    other_grad_mixed,
-                    other_rows,
-                    grad_qk,
-                    grad_value,
-                };
-                rec.run($kernel::Kernel, buffers, $kernel::Push { own, capacity }, self.threads($tokens, 8));
-            }};
+        if let Some(pairs) = &self.pairs {
+            return self.pairs_backward(rec, tokens, pairs);
         }
-        if self.wide { run!(attention_backward_wide, 2) } else { run!(attention_backward, 1) }
+        for own in 0..2u32 {
+            let Side { qk, value, grad_mixed, rows, grad_qk, grad_value, .. } = &self.sides[own as usize];
+            let Side { qk: other_qk, value: other_value, grad_mixed: other_grad_mixed, rows: other_rows, .. } =
+                &self.sides[1 - own as usize];
+            run!(self, rec, attention_backward_lanes 16 tokens 64, attention_backward 1 tokens 8, {
+                tokens, qk, value, grad_mixed, rows, other_qk, other_value, other_grad_mixed, other_rows,
+                grad_qk, grad_value
+            }, { own, capacity });
+        }
+    }
+
+    fn pairs_backward(&self, rec: &mut Recorder<'_>, tokens: &Buffer<u32>, pairs: &Pairs) {
+        let (capacity, stride) = (self.capacity, pairs.stride);
+        let Pairs { inside_share, around_share, grad_s, .. } = pairs;
+        let [inside, around] = &self.sides;
+        let buffers = attention_pairs_backward::Buffers {
+            tokens,
+            qk: &inside.qk,
+            value: &inside.value,
+            grad_mixed: &inside.grad_mixed,
+            rows: &inside.rows,
+            other_qk: &around.qk,
+            other_value: &around.value,
+            other_grad_mixed: &around.grad_mixed,
+            other_rows: &around.rows,
+            inside_share,
+            around_share,
+            grad_s,
+        };
+        let push = attention_pairs_backward::Push { capacity, stride };
+        rec.run(attention_pairs_backward::Kernel, buffers, push, self.threads(32, 64));
+        for (pairs, other, applied) in
+            [(grad_s, &around.qk, &inside.grad_qk), (around_share, &around.grad_mixed, &inside.grad_value)]
+        {
+            let buffers = attention_pairs_apply_inside::Buffers { tokens, pairs, other, applied };
+            let push = attention_pairs_apply_inside::Push { capacity, stride };
+            rec.run(attention_pairs_apply_inside::Kernel, buffers, push, self.threads(32, 64));
+        }
+        for (pairs, other, applied) in
+            [(grad_s, &inside.qk, &around.grad_qk), (inside_share, &inside.grad_mixed, &around.grad_value)]
+        {
+            let buffers = attention_pairs_apply::Buffers { tokens, pairs, other, applied };
+            let push = attention_pairs_apply::Push { capacity, stride };
+            rec.run(attention_pairs_apply::Kernel, buffers, push, self.threads(32, 64));
+        }
+    }
+
+    fn weights_backward(
+        &self,
+        rec: &mut Recorder<'_>,
+        tokens: &Buffer<u32>,
+        features: &[Buffer<[f32; 4]>; 2],
+        grad_updated: &[Buffer<[f32; 4]>; 2],
+        grad_weights: &Buffer<[f32; 4]>,
+    ) {
+        let (capacity, narrow, inner) = (self.capacity, (FEATURE / 4) as u32, (INNER / 4) as u32);
+        let mut partials = self.partials.iter().flatten();
+        for (own, side) in (0..).zip(&self.sides) {
+            let (Offsets { to_qk, to_v, to_out }, at) = (SIDES[own as usize], own as usize);
+            let products = [
+                (&side.grad_qk, inner, &features[at], narrow, to_qk, 0),
+                (&side.grad_value, inner, &features[at], narrow, to_v, 0),
+                (&grad_updated[at], narrow, &side.mixed, inner, to_out, 1),
+            ];
+            for (grad_output, rows, inputs, columns, matrix, bias) in products {
+                if let Some(partial) = partials.next() {
+                    let push = attention_weight_backward::Push { own, capacity, rows, columns, bias };
+                    let buffers = attention_weight_backward::Buffers { tokens, grad_output, inputs, partial };
+                    let threads = rows / 2 * (columns / 2) * SLICES as u32;
+                    rec.run(attention_weight_backward::Kernel, buffers, push, threads);
+                } else {
+                    let matrix = (matrix / 4) as u32;
+                    let push = attention_weight_backward_lanes::Push { own, capacity, rows, columns, matrix, bias };
+                    let buffers =
+                        attention_weight_backward_lanes::Buffers { tokens, grad_output, inputs, grad_weights };
+                    rec.run(attention_weight_backward_lanes::Kernel, buffers, push, rows * columns / 8);
+                }
+            }
+        }
+        if let Some([inside_qk, inside_value, inside_out, around_qk, around_value, around_out]) = &self.partials {
+            let buffers = attention_weight_sum::Buffers {
+                tokens,
+                inside_qk,
+                inside_value,
+                inside_out,
+                around_qk,
+                around_value,
+                around_out,
+                grad_weights,
+            };
+            rec.run(attention_weight_sum::Kernel, buffers, (), WEIGHTS / 4);
+        }
     }
 }
 
@@ -484,6 +724,11 @@ mod tests {
     use super::*;
     use crate::gpu::{Options, Submission, Timings, testing};
     use crate::math::attention as exact;
+
+    /// The forms to test: those of lanes need subgroups of 8.
+    fn forms(gpu: &Gpu) -> &'static [Form] {
+        if gpu.info().subgroup_size == 8 { &[Form::Threads, Form::Lanes, Form::Pairs] } else { &[Form::Threads] }
+    }
 
     struct Run {
         updated: [Vec<f32>; 2],
@@ -506,9 +751,8 @@ mod tests {
     }
 
     /// Every buffer starts as not-a-number. `checked`: every pass beside its twin.
-    fn run(gpu: &Gpu, inputs: &Inputs, capacity: usize, wide: bool, checked: bool) -> Run {
-        let mut attention = Attention::new(gpu, capacity as u32).expect("memory for the test");
-        attention.wide = wide;
+    fn run(gpu: &Gpu, inputs: &Inputs, capacity: usize, form: Form, checked: bool) -> Run {
+        let attention = Attention::with_form(gpu, capacity as u32, form).expect("memory for the test");
         let pad = |values: &Vec<f32>| {
             let mut values = values.clone();
             values.resize(capacity * FEATURE, testing::UNWRITTEN);
@@ -529,7 +773,10 @@ mod tests {
             rec.fill(&side.updated, nan);
             rec.fill(&side.grad_feature, nan);
         }
-        rec.fill(&attention.partial, nan);
+        attention.partials.iter().flatten().for_each(|partial| rec.fill(partial, nan));
+        if let Some(Pairs { inside_share, around_share, grad_s, .. }) = &attention.pairs {
+            [inside_share, around_share, grad_s].into_iter().for_each(|matrix| rec.fill(matrix, nan));
+        }
         rec.fill(&grad_weights, nan);
         let pair = |of: &'static str| match of {
             "features" => Pair { inside: &features[0], around: &features[1] },
@@ -591,11 +838,11 @@ mod tests {
     #[test]
     fn every_pass_matches_its_twin() {
         let gpu = testing::gpu();
-        for (i, n) in [[0, 0], [0, 12], [12, 0], [12, 1], [1, 2], [63, 65], [64, 64], [65, 63]].into_iter().enumerate()
+        for (i, n) in [[0, 0], [0, 12], [11, 0], [11, 1], [1, 2], [63, 65], [64, 64], [65, 63]].into_iter().enumerate()
         {
             let inputs = inputs(n, i as u64);
-            for wide in [false, true] {
-                let got = run(&gpu, &inputs, 67, wide, true);
+            for &form in forms(&gpu) {
+                let got = run(&gpu, &inputs, 67, form, true);
                 compare(&inputs, &got, WHOLE);
             }
         }
@@ -604,10 +851,10 @@ mod tests {
     #[test]
     fn matches_the_dense_attention() {
         let gpu = testing::gpu();
-        for n in [[1, 1], [1, 200], [200, 1], [200, 200], [300, 300], [77, 211]] {
+        for n in [[1, 1], [1, 200], [200, 1], [200, 200], [257, 300], [77, 211]] {
             let inputs = inputs(n, 11);
-            for wide in [false, true] {
-                compare(&inputs, &run(&gpu, &inputs, 301, wide, false), WHOLE);
+            for &form in forms(&gpu) {
+                compare(&inputs, &run(&gpu, &inputs, 301, form, false), WHOLE);
             }
         }
     }
@@ -629,15 +876,27 @@ mod tests {
     }
 
     #[test]
+    fn many_tokens_keep_no_pairs() {
+        let of = |kind, subgroup_size, capacity| Form::best(kind, subgroup_size, capacity);
+        assert_eq!(
+            [256, 512, 513, 2000].map(|n| of("cpu", 8, n)),
+            [Form::Pairs, Form::Pairs, Form::Lanes, Form::Lanes]
+        );
+        assert_eq!([("cpu", 4), ("discrete", 8), ("discrete", 32)].map(|(k, s)| of(k, s, 256)), [Form::Threads; 3]);
+    }
+
+    #[test]
     fn twice_the_same_bytes() {
         let gpu = testing::gpu();
         let inputs = inputs([130, 97], 5);
-        let [a, b] = [0, 1].map(|_| run(&gpu, &inputs, 200, true, false));
         let bits = |v: &[f32]| v.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
-        assert_eq!(bits(&a.grad_weights), bits(&b.grad_weights));
-        for side in 0..2 {
-            assert_eq!(bits(&a.updated[side]), bits(&b.updated[side]));
-            assert_eq!(bits(&a.grad_features[side]), bits(&b.grad_features[side]));
+        for &form in forms(&gpu) {
+            let [a, b] = [0, 1].map(|_| run(&gpu, &inputs, 200, form, false));
+            assert_eq!(bits(&a.grad_weights), bits(&b.grad_weights));
+            for side in 0..2 {
+                assert_eq!(bits(&a.updated[side]), bits(&b.updated[side]));
+                assert_eq!(bits(&a.grad_features[side]), bits(&b.grad_features[side]));
+            }
         }
     }
 
@@ -650,7 +909,9 @@ mod tests {
             let first = f[..FEATURE].to_vec();
             f.chunks_mut(FEATURE).for_each(|row| row.copy_from_slice(&first));
         }
-        compare(&inputs, &run(&gpu, &inputs, 40, true, false), WHOLE);
+        for &form in forms(&gpu) {
+            compare(&inputs, &run(&gpu, &inputs, 40, form, false), WHOLE);
+        }
     }
 
     /// Logits of +-1e4: 120 times larger queries and keys. Float32 logits are then off by up to 16 roundings of
@@ -669,8 +930,8 @@ mod tests {
                 .map(|k| dot(head_of(&qk[0], k / n[1], 0), head_of(&qk[1], k % n[1], 0)).abs() / 8.0)
                 .fold(0.0, f64::max);
             assert!(largest > 1e4, "largest logit {largest}");
-            for wide in [false, true] {
-                let got = run(&gpu, &inputs, 200, wide, false);
+            for &form in forms(&gpu) {
+                let got = run(&gpu, &inputs, 200, form, false);
                 compare(&inputs, &got, Check { relative: 5e-3, absolute: 5e-3, band: 0.0 });
             }
         }
