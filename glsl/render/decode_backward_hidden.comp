@@ -17,8 +17,9 @@ layout(binding = 4, scalar) writeonly buffer GradHidden { vec4 grad_hidden[]; };
 void main() {
   const uint PARTS = HIDDEN_VEC4 / UNITS_VEC4;
   uint t = thread_index(), n = groups[3];
-  uint part = t % PARTS, v = TILE * (t / PARTS);
-  if (v >= n) return;
+  // Neighbours have the same head, and so as many rows.
+  uint tiles = (n + TILE - 1u) / TILE, part = t / max(tiles, 1u), v = TILE * (t - part * tiles);
+  if (n == 0u || part >= PARTS) return;
   uint head = part * UNITS / HIDDEN, column = UNITS_VEC4 * part % ROW_VEC4, stride = head_row(3u, OFFSETS) / 4u;
   vec4 sum[UNITS_VEC4 * TILE];
   [[unroll]] for (uint i = 0u; i < UNITS_VEC4 * TILE; ++i) sum[i] = vec4(0.0);

@@ -165,9 +165,8 @@ impl Reference for decode_opacity::Kernel {
 /// Output `(head, output)` of visible anchor `v`.
 fn second_layer(layout: Layout, packed: &[f32], hidden: &[f32], v: usize, (head, output): (usize, usize)) -> f64 {
     let (second, row) = (4 * FIRST_VEC4, layout.row(head) + output);
-    let product = |j: usize| {
-        f64::from(packed[second + row * HIDDEN + j]) * f64::from(hidden[(v * HEADS + head) * HIDDEN + j])
-    };
+    let product =
+        |j: usize| f64::from(packed[second + row * HIDDEN + j]) * f64::from(hidden[(v * HEADS + head) * HIDDEN + j]);
     (0..HIDDEN).map(product).sum::<f64>() + f64::from(packed[second + layout.rows() * HIDDEN + row])
 }
 
@@ -747,7 +746,8 @@ impl DecodeBackward {
         if let Some(grad_feature) = to.feature {
             let groups = self.per_feature.as_ref().expect("made with features");
             dispatch::record_tiles(rec, flagged, groups, slots, tile * offsets, FEATURE as u32 / UNITS);
-            let buffers = decode_backward_feature::Buffers { groups: count, visible, packed, grad_hidden, grad_feature };
+            let buffers =
+                decode_backward_feature::Buffers { groups: count, visible, packed, grad_hidden, grad_feature };
             let constants = decode_backward_feature::Constants { tile: *tile };
             rec.run_with(decode_backward_feature::Kernel, constants, buffers, (), groups);
         }
@@ -859,7 +859,8 @@ mod tests {
         let mut rng = Pcg64::seed_from_u64(1);
         let every = [(0, 10), (1, 10), (63, 10), (64, 10), (65, 10), (1000, 10), (65, 5), (3, 1), (130, 20)];
         // Tiles of both sizes; those that exist, all, none.
-        for ((count, offsets), (tile, above)) in every.into_iter().zip([(8, 0.0), (16, 0.0), (16, -2.0), (8, 2.0)].into_iter().cycle())
+        for ((count, offsets), (tile, above)) in
+            every.into_iter().zip([(8, 0.0), (16, 0.0), (16, -2.0), (8, 2.0)].into_iter().cycle())
         {
             let m = model(&mut rng, count, offsets);
             let (layout, slots, k) = (m.layout(), count * offsets, offsets as u32);
@@ -1036,7 +1037,7 @@ mod tests {
             grad_hidden: random(&mut rng, count * HIDDEN_VEC4, -1.0, 1.0),
             partial: unwritten(parts * FIRST_VEC4 + 3),
         };
-        let partial = twin(decode_backward_first::Kernel, &gpu, (), case, (), count * 24 / BLOCK).partial;
+        let partial = twin(decode_backward_first::Kernel, &gpu, (), case, (), parts * 24).partial;
         let grad_weights = vec![testing::UNWRITTEN; layout.weights() + 3];
         let case = decode_backward_weights::Arrays { groups, partial, grad_weights };
         let constants = decode_backward_weights::Constants { offsets: 9 };
