@@ -6,9 +6,13 @@ const uint HIDDEN_VEC4 = 24u;      // vec4s of the hidden units of the three hea
 const uint ROW_VEC4 = 8u;          // vec4s of one head's hidden units: a row of the second layer
 const uint FIRST_WEIGHTS = HIDDEN * INPUT + HIDDEN; // of one head, biases included
 const uint FIRST_VEC4 = HEADS * HIDDEN * INPUT_VEC4; // packed first layer; the second one follows, then its biases
-const uint TILE = 8u;              // anchors of a thread: each load of a weight serves so many products
-const uint BLOCK = 64u;            // anchors of the smallest chunk of a weight gradient
-const uint CHUNKS = 1024u;         // chunks at most
+const uint UNITS = 16u;            // units or features of a thread
+const uint UNITS_VEC4 = UNITS / 4u;
+const uint OPACITIES = 5u;         // of an anchor in a thread
+const uint SECOND_VEC4 = 91u;      // vec4s of one Gaussian's second layer: 11 rows, 11 biases
+const uint BLOCK = 64u;            // anchors of the smallest chunk of the first layer's weight gradient, Gaussians of the second's
+const uint CHUNKS = 1024u;         // chunks of the first layer's at most
+const uint SECOND_CHUNKS = 8192u;  // chunks of the second layer's at most, and one for each k
 
 uint padded(uint n) { return (n + 7u) & ~7u; }
 // Outputs per Gaussian: 1, 3, 7; of the heads before: 0, 1, 4.
@@ -41,8 +45,24 @@ uint weight_at(uint i, uint c, uint offsets) {
   row -= head_row(head, offsets);
   return row >= outputs ? PADDING : from + (matrix ? row * HIDDEN + 4u * (i % ROW_VEC4) + c : outputs * HIDDEN + row);
 }
+// Which run of `run` entries of the list of decoded Gaussians a thread has: those of each k make runs of their own.
+// `segments` as of decode_lists; `begin == end` where there is none.
+#define RUN_OF(t, run, k, begin, end) \
+  uint k = 0u, begin = 0u, end = 0u; \
+  for (uint left = t, i = 0u; i < OFFSETS; ++i) { \
+    uint at = segments[i], next = segments[i + 1u], runs = (next - at + run - 1u) / run; \
+    if (left < runs) { \
+      k = i; \
+      begin = at + left * run; \
+      end = min(begin + run, next); \
+    } \
+    left = left < runs ? ~0u : left - runs; \
+  }
 // Anchors of one chunk of a weight gradient.
 uint chunk_anchors(uint anchors) { return BLOCK * max(1u, (anchors + BLOCK * CHUNKS - 1u) / (BLOCK * CHUNKS)); }
+
+// Listed Gaussians of one chunk.
+uint chunk_listed(uint listed) { return BLOCK * max(1u, (listed + BLOCK * SECOND_CHUNKS - 1u) / (BLOCK * SECOND_CHUNKS)); }
 
 float dot_add(float sum, vec4 a, vec4 b) { return fma(a.w, b.w, fma(a.z, b.z, fma(a.y, b.y, fma(a.x, b.x, sum)))); }
 vec4 add_scaled(vec4 sum, float a, vec4 b) { return fma(vec4(a), b, sum); }

@@ -37,7 +37,10 @@ layout(binding = 14, scalar) writeonly buffer GradOffset { vec3 grad_offset[]; }
 #ifndef FIXED_SCALING
 layout(binding = 15, scalar) writeonly buffer GradLogScaling { float grad_log_scaling[]; }; // [N*6] visible anchors only
 #endif
-layout(binding = 16, scalar) writeonly buffer GradOutput { vec4 grad_output[]; };       // [V*D/4] before the activations, padded rows 0
+layout(binding = 16, scalar) writeonly buffer GradOutput { vec4 grad_output[]; };       // [V*D/4] before the activations, 0 of Gaussians not decoded and in padded rows
+layout(push_constant, scalar) uniform Push {
+  float above; // Gaussians with an opacity above this were decoded
+} push;
 void put(uint from, uint row, float value) { grad_output[from + row / 4u][row % 4u] = value; }
 void main() {
   uint v = thread_index();
@@ -53,8 +56,11 @@ void main() {
 #endif
   for (uint k = 0u; k < OFFSETS; ++k) {
     uint slot = v * OFFSETS + k;
+    // What was not decoded has no gradient, and no values.
+    float o = opacity[slot];
+    bool decoded = o > push.above;
 #if !defined(FIXED_OFFSET) || !defined(FIXED_SCALING)
-    vec3 gp = grad_position[slot];
+    vec3 gp = decoded ? grad_position[slot] : vec3(0.0);
 #endif
 #ifndef FIXED_OFFSET
     grad_offset[anchor * OFFSETS + k] = gp * spread;
@@ -63,21 +69,20 @@ void main() {
     // By the displacement, which is finite where there is a Gaussian: the gradient of an offset of 0 may overflow, this not.
     grad_spread += gp * (offset[anchor * OFFSETS + k] * spread);
 #endif
-    float o = opacity[slot];
-    put(to, k, grad_opacity[slot] * ((1.0 - o) * (1.0 + o)));
-    vec3 c = color[slot], gc = grad_color[slot] * c * (1.0 - c);
+    put(to, k, (decoded ? grad_opacity[slot] : 0.0) * ((1.0 - o) * (1.0 + o)));
+    vec3 c = color[slot], gc = decoded ? grad_color[slot] * c * (1.0 - c) : vec3(0.0);
     put(to, color_row + 3u * k, gc.x);
     put(to, color_row + 3u * k + 1u, gc.y);
     put(to, color_row + 3u * k + 2u, gc.z);
-    vec3 s = scale[slot], gs = grad_scale[slot] * s;
+    vec3 s = scale[slot], gs = decoded ? grad_scale[slot] * s : vec3(0.0);
 #ifndef FIXED_SCALING
     grad_size += gs;
 #endif
     // The sigmoid is scale / size; of a size that underflowed to 0 the scale and its gradient are 0.
-    gs *= 1.0 - s / max(size, vec3(1e-37));
+    gs = decoded ? gs * (1.0 - s / max(size, vec3(1e-37))) : vec3(0.0);
     vec4 q = rotation[slot], gq = grad_rotation[slot];
     float norm = rotation_norm[slot];
-    gq = norm < 1e-12 ? gq / 1e-12 : (gq - q * dot(q, gq)) / norm;
+    gq = !decoded ? vec4(0.0) : norm < 1e-12 ? gq / 1e-12 : (gq - q * dot(q, gq)) / norm;
     uint row = cov_row + 7u * k;
     put(to, row, gs.x);
     put(to, row + 1u, gs.y);

@@ -2,8 +2,9 @@
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// Back through the first layer to the features. A thread computes 8 features of 4 anchors.
+// Back through the first layer to the features. A thread computes UNITS features of TILE anchors.
 layout(local_size_x = 64) in;
+layout(constant_id = 0) const uint TILE = 8u; // anchors of a thread
 #include "thread.glsl"
 #include "model.glsl"
 #include "decoder.glsl"
@@ -13,31 +14,28 @@ layout(binding = 2, scalar) readonly buffer Packed { vec4 packed[]; };          
 layout(binding = 3, scalar) readonly buffer GradHidden { vec4 grad_hidden[]; };     // [V*24] of decode_backward_hidden
 layout(binding = 4, scalar) writeonly buffer GradFeature { float grad_feature[]; }; // [N*32] visible anchors only
 void main() {
+  const uint PARTS = FEATURE / UNITS;
   uint t = thread_index(), n = groups[3];
-  uint column = 2u * (t % 4u), v = 4u * (t / 4u);
+  uint column = UNITS_VEC4 * (t % PARTS), v = TILE * (t / PARTS);
   if (v >= n) return;
-  vec4 sum[8];
-  [[unroll]] for (uint i = 0u; i < 8u; ++i) sum[i] = vec4(0.0);
-  uint from[4];
-  [[unroll]] for (uint a = 0u; a < 4u; ++a) from[a] = min(v + a, n - 1u) * HIDDEN_VEC4;
+  vec4 sum[UNITS_VEC4 * TILE];
+  [[unroll]] for (uint i = 0u; i < UNITS_VEC4 * TILE; ++i) sum[i] = vec4(0.0);
+  uint from[TILE];
+  [[unroll]] for (uint a = 0u; a < TILE; ++a) from[a] = min(v + a, n - 1u) * HIDDEN_VEC4;
   for (uint r = 0u; r < HIDDEN_VEC4; ++r) {
-    vec4 g[4];
-    [[unroll]] for (uint a = 0u; a < 4u; ++a) g[a] = grad_hidden[from[a] + r];
+    vec4 g[TILE];
+    [[unroll]] for (uint a = 0u; a < TILE; ++a) g[a] = grad_hidden[from[a] + r];
     [[unroll]] for (uint c = 0u; c < 4u; ++c) {
-      uint w = (4u * r + c) * INPUT_VEC4 + column;
-      vec4 w0 = packed[w], w1 = packed[w + 1u];
-      [[unroll]] for (uint a = 0u; a < 4u; ++a) {
-        sum[2u * a] = add_scaled(sum[2u * a], g[a][c], w0);
-        sum[2u * a + 1u] = add_scaled(sum[2u * a + 1u], g[a][c], w1);
+      [[unroll]] for (uint q = 0u; q < UNITS_VEC4; ++q) {
+        vec4 w = packed[(4u * r + c) * INPUT_VEC4 + column + q];
+        [[unroll]] for (uint a = 0u; a < TILE; ++a) sum[UNITS_VEC4 * a + q] = add_scaled(sum[UNITS_VEC4 * a + q], g[a][c], w);
       }
     }
   }
-  [[unroll]] for (uint a = 0u; a < 4u; ++a) {
-    if (v + a >= n) return;
-    uint to = visible[v + a] * FEATURE + 4u * column;
-    [[unroll]] for (uint c = 0u; c < 4u; ++c) {
-      grad_feature[to + c] = sum[2u * a][c];
-      grad_feature[to + 4u + c] = sum[2u * a + 1u][c];
+  [[unroll]] for (uint a = 0u; a < TILE; ++a) {
+    if (v + a < n) {
+      uint to = visible[v + a] * FEATURE + 4u * column;
+      [[unroll]] for (uint i = 0u; i < UNITS; ++i) grad_feature[to + i] = sum[UNITS_VEC4 * a + i / 4u][i % 4u];
     }
   }
 }

@@ -2,7 +2,7 @@
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// First layer's weight gradients: a workgroup sums over one chunk of visible anchors, a thread computes 8 units by 8 inputs.
+// First layer's weight gradients, summed over each chunk of visible anchors. A thread computes 8 units by 20 inputs.
 layout(local_size_x = 64) in;
 #include "thread.glsl"
 #include "model.glsl"
@@ -12,25 +12,26 @@ layout(binding = 1, scalar) readonly buffer Inputs { vec4 inputs[]; };          
 layout(binding = 2, scalar) readonly buffer GradHidden { vec4 grad_hidden[]; }; // [V*24] of decode_backward_hidden
 layout(binding = 3, scalar) writeonly buffer Partial { vec4 partial[]; };       // [chunk*96*10] like the packed first layer
 void main() {
-  uint n = groups[3], chunk = chunk_anchors(n), part = group_index();
-  uint tile = gl_LocalInvocationID.x, row = 2u * (tile / 5u), column = 2u * (tile % 5u);
-  if (tile >= 60u || part * chunk >= n) return;
-  vec4 sum[16];
-  [[unroll]] for (uint i = 0u; i < 16u; ++i) sum[i] = vec4(0.0);
+  const uint WIDE = INPUT_VEC4 / 2u, PARTS = 24u;
+  uint t = thread_index(), n = groups[3], chunk = chunk_anchors(n);
+  uint tile = t % PARTS, part = t / PARTS, row = 2u * (tile / 2u), column = WIDE * (tile % 2u);
+  if (part * chunk >= n) return;
+  vec4 sum[8u * WIDE];
+  [[unroll]] for (uint i = 0u; i < 8u * WIDE; ++i) sum[i] = vec4(0.0);
   uint end = min(n, (part + 1u) * chunk);
   for (uint v = part * chunk; v < end; ++v) {
-    vec4 x0 = inputs[v * INPUT_VEC4 + column], x1 = inputs[v * INPUT_VEC4 + column + 1u];
-    vec4 g0 = grad_hidden[v * HIDDEN_VEC4 + row], g1 = grad_hidden[v * HIDDEN_VEC4 + row + 1u];
-    [[unroll]] for (uint i = 0u; i < 4u; ++i) {
-      sum[2u * i] = add_scaled(sum[2u * i], g0[i], x0);
-      sum[2u * i + 1u] = add_scaled(sum[2u * i + 1u], g0[i], x1);
-      sum[2u * i + 8u] = add_scaled(sum[2u * i + 8u], g1[i], x0);
-      sum[2u * i + 9u] = add_scaled(sum[2u * i + 9u], g1[i], x1);
+    vec4 x[WIDE];
+    [[unroll]] for (uint i = 0u; i < WIDE; ++i) x[i] = inputs[v * INPUT_VEC4 + column + i];
+    [[unroll]] for (uint r = 0u; r < 2u; ++r) {
+      vec4 g = grad_hidden[v * HIDDEN_VEC4 + row + r];
+      [[unroll]] for (uint c = 0u; c < 4u; ++c) {
+        uint u = (4u * r + c) * WIDE;
+        [[unroll]] for (uint i = 0u; i < WIDE; ++i) sum[u + i] = add_scaled(sum[u + i], g[c], x[i]);
+      }
     }
   }
-  [[unroll]] for (uint i = 0u; i < 8u; ++i) {
-    uint to = part * FIRST_VEC4 + (4u * row + i) * INPUT_VEC4 + column;
-    partial[to] = sum[2u * i];
-    partial[to + 1u] = sum[2u * i + 1u];
+  [[unroll]] for (uint u = 0u; u < 8u; ++u) {
+    uint to = part * FIRST_VEC4 + (4u * row + u) * INPUT_VEC4 + column;
+    [[unroll]] for (uint i = 0u; i < WIDE; ++i) partial[to + i] = sum[u * WIDE + i];
   }
 }

@@ -2,9 +2,10 @@
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// Back through the second layer and the ReLU. A thread computes 8 units of TILE anchors.
+// Back through the second layer and the ReLU. A thread computes UNITS units of TILE anchors.
 layout(local_size_x = 64) in;
 layout(constant_id = 0) const uint OFFSETS = 10u; // Gaussians per anchor
+layout(constant_id = 1) const uint TILE = 8u;     // anchors of a thread
 #include "thread.glsl"
 #include "model.glsl"
 #include "decoder.glsl"
@@ -14,12 +15,14 @@ layout(binding = 2, scalar) readonly buffer Hidden { vec4 hidden[]; };          
 layout(binding = 3, scalar) readonly buffer GradOutput { vec4 grad_output[]; };   // [V*D/4] of decode_backward
 layout(binding = 4, scalar) writeonly buffer GradHidden { vec4 grad_hidden[]; };  // [V*24] before the ReLU
 void main() {
+  const uint PARTS = HIDDEN_VEC4 / UNITS_VEC4;
   uint t = thread_index(), n = groups[3];
-  uint part = t % 12u, v = TILE * (t / 12u);
-  if (v >= n) return;
-  uint head = part / 4u, column = 2u * (part % 4u), stride = head_row(3u, OFFSETS) / 4u;
-  vec4 sum[2u * TILE];
-  [[unroll]] for (uint i = 0u; i < 2u * TILE; ++i) sum[i] = vec4(0.0);
+  // Neighbours have the same head, and so as many rows.
+  uint tiles = (n + TILE - 1u) / TILE, part = t / max(tiles, 1u), v = TILE * (t - part * tiles);
+  if (n == 0u || part >= PARTS) return;
+  uint head = part * UNITS / HIDDEN, column = UNITS_VEC4 * part % ROW_VEC4, stride = head_row(3u, OFFSETS) / 4u;
+  vec4 sum[UNITS_VEC4 * TILE];
+  [[unroll]] for (uint i = 0u; i < UNITS_VEC4 * TILE; ++i) sum[i] = vec4(0.0);
   uint from[TILE];
   [[unroll]] for (uint a = 0u; a < TILE; ++a) from[a] = min(v + a, n - 1u) * stride;
   uint end = head_row(head + 1u, OFFSETS) / 4u;
@@ -27,18 +30,17 @@ void main() {
     vec4 g[TILE];
     [[unroll]] for (uint a = 0u; a < TILE; ++a) g[a] = grad_output[from[a] + r];
     [[unroll]] for (uint c = 0u; c < 4u; ++c) {
-      uint w = FIRST_VEC4 + (4u * r + c) * ROW_VEC4 + column;
-      vec4 w0 = packed[w], w1 = packed[w + 1u];
-      [[unroll]] for (uint a = 0u; a < TILE; ++a) {
-        sum[2u * a] = add_scaled(sum[2u * a], g[a][c], w0);
-        sum[2u * a + 1u] = add_scaled(sum[2u * a + 1u], g[a][c], w1);
+      [[unroll]] for (uint q = 0u; q < UNITS_VEC4; ++q) {
+        vec4 w = packed[FIRST_VEC4 + (4u * r + c) * ROW_VEC4 + column + q];
+        [[unroll]] for (uint a = 0u; a < TILE; ++a) sum[UNITS_VEC4 * a + q] = add_scaled(sum[UNITS_VEC4 * a + q], g[a][c], w);
       }
     }
   }
   [[unroll]] for (uint a = 0u; a < TILE; ++a) {
-    if (v + a >= n) return;
-    uint to = (v + a) * HIDDEN_VEC4 + 2u * part;
-    grad_hidden[to] = mix(vec4(0.0), sum[2u * a], greaterThan(hidden[to], vec4(0.0)));
-    grad_hidden[to + 1u] = mix(vec4(0.0), sum[2u * a + 1u], greaterThan(hidden[to + 1u], vec4(0.0)));
+    if (v + a < n) {
+      uint to = (v + a) * HIDDEN_VEC4 + UNITS_VEC4 * part;
+      [[unroll]] for (uint q = 0u; q < UNITS_VEC4; ++q)
+        grad_hidden[to + q] = mix(vec4(0.0), sum[UNITS_VEC4 * a + q], greaterThan(hidden[to + q], vec4(0.0)));
+    }
   }
 }

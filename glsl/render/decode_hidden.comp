@@ -2,9 +2,9 @@
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// Hidden units of the three heads, ReLU(W x + b). A thread computes 8 units of TILE anchors: each load serves several products.
+// Hidden units of the three heads, ReLU(W x + b). A thread computes UNITS units of TILE anchors: each load serves several products.
 layout(local_size_x = 64) in;
-layout(constant_id = 0) const uint OFFSETS = 10u; // Gaussians per anchor
+layout(constant_id = 0) const uint TILE = 8u; // anchors of a thread
 #include "thread.glsl"
 #include "model.glsl"
 #include "decoder.glsl"
@@ -13,25 +13,29 @@ layout(binding = 1, scalar) readonly buffer Packed { vec4 packed[]; };    // of 
 layout(binding = 2, scalar) readonly buffer Inputs { vec4 inputs[]; };    // [V*10] of decode_input
 layout(binding = 3, scalar) writeonly buffer Hidden { vec4 hidden[]; };   // [V*24] opacity 32, color 32, cov 32
 void main() {
+  const uint PARTS = HEADS * HIDDEN / UNITS;
   uint t = thread_index(), n = groups[3];
-  uint unit = 8u * (t % 12u), v = TILE * (t / 12u);
+  uint unit = UNITS * (t % PARTS), v = TILE * (t / PARTS);
   if (v >= n) return;
-  float sum[8u * TILE];
-  [[unroll]] for (uint i = 0u; i < 8u * TILE; ++i) sum[i] = 0.0;
+  float sum[UNITS * TILE];
+  [[unroll]] for (uint i = 0u; i < UNITS * TILE; ++i) sum[i] = 0.0;
   uint from[TILE];
   [[unroll]] for (uint a = 0u; a < TILE; ++a) from[a] = min(v + a, n - 1u) * INPUT_VEC4;
   for (uint i = 0u; i < INPUT_VEC4; ++i) {
     vec4 x[TILE];
     [[unroll]] for (uint a = 0u; a < TILE; ++a) x[a] = inputs[from[a] + i];
-    [[unroll]] for (uint u = 0u; u < 8u; ++u) {
+    [[unroll]] for (uint u = 0u; u < UNITS; ++u) {
       vec4 w = packed[(unit + u) * INPUT_VEC4 + i];
-      [[unroll]] for (uint a = 0u; a < TILE; ++a) sum[8u * a + u] = dot_add(sum[8u * a + u], x[a], w);
+      [[unroll]] for (uint a = 0u; a < TILE; ++a) sum[UNITS * a + u] = dot_add(sum[UNITS * a + u], x[a], w);
     }
   }
   [[unroll]] for (uint a = 0u; a < TILE; ++a) {
-    if (v + a >= n) return;
-    uint to = (v + a) * HIDDEN_VEC4 + unit / 4u;
-    hidden[to] = max(vec4(sum[8u * a], sum[8u * a + 1u], sum[8u * a + 2u], sum[8u * a + 3u]), 0.0);
-    hidden[to + 1u] = max(vec4(sum[8u * a + 4u], sum[8u * a + 5u], sum[8u * a + 6u], sum[8u * a + 7u]), 0.0);
+    if (v + a < n) {
+      uint to = (v + a) * HIDDEN_VEC4 + unit / 4u;
+      [[unroll]] for (uint q = 0u; q < UNITS_VEC4; ++q) {
+        uint u = UNITS * a + 4u * q;
+        hidden[to + q] = max(vec4(sum[u], sum[u + 1u], sum[u + 2u], sum[u + 3u]), 0.0);
+      }
+    }
   }
 }

@@ -6,7 +6,7 @@ use crate::gpu::{Buffer, Error, Gpu, Groups, Recorder, Reference, Threads};
 impl Reference for dispatch::Kernel {
     fn reference(host: dispatch::Host<'_>, push: dispatch::Push, (): ()) {
         let n = host.count[0].min(push.capacity);
-        let groups = (n * push.factor).div_ceil(push.group);
+        let groups = (n.div_ceil(push.tile) * push.factor).div_ceil(push.group);
         host.groups.copy_from_slice(&[groups.min(push.limit), groups.div_ceil(push.limit), 1, n]);
     }
 }
@@ -21,8 +21,20 @@ pub fn groups(gpu: &Gpu, name: &'static str, group: u32) -> Result<Groups, Error
 
 /// Sets `groups` for `factor` threads per item, at most `capacity` items.
 pub fn record(rec: &mut Recorder<'_>, count: &Buffer<u32>, groups: &Groups, capacity: u32, factor: u32) {
+    record_tiles(rec, count, groups, capacity, 1, factor);
+}
+
+/// Sets `groups` for `factor` threads per tile of `tile` items begun, at most `capacity` items.
+pub fn record_tiles(
+    rec: &mut Recorder<'_>,
+    count: &Buffer<u32>,
+    groups: &Groups,
+    capacity: u32,
+    tile: u32,
+    factor: u32,
+) {
     let limit = rec.gpu().info().max_groups.min(65535);
-    let push = dispatch::Push { capacity, factor, group: groups.group, limit };
+    let push = dispatch::Push { capacity, tile, factor, group: groups.group, limit };
     rec.run(dispatch::Kernel, dispatch::Buffers { count, groups: &groups.buffer }, push, 1u32);
 }
 
@@ -63,7 +75,7 @@ impl Blocks {
             }
             Count::Device(count) => {
                 let limit = rec.gpu().info().max_groups.min(65535);
-                let push = dispatch::Push { capacity: self.capacity, factor: 1, group: self.items, limit };
+                let push = dispatch::Push { capacity: self.capacity, tile: 1, factor: 1, group: self.items, limit };
                 rec.run(dispatch::Kernel, dispatch::Buffers { count, groups: &self.groups.buffer }, push, 1u32);
                 (count, Threads::Counted(&self.groups))
             }
@@ -80,9 +92,9 @@ mod tests {
     fn matches_its_twin() {
         let gpu = testing::gpu();
         for count in [0, 1, 63, 64, 65, 4096, 5_000_000, u32::MAX] {
-            for group in [1, 64, 256] {
+            for (group, tile) in [(1, 1), (64, 1), (256, 1), (64, 16)] {
                 let case = dispatch::Arrays { count: vec![count], groups: vec![u32::MAX; 4] };
-                let push = dispatch::Push { capacity: 10_000_000, factor: 3, group, limit: 65535 };
+                let push = dispatch::Push { capacity: 10_000_000, tile, factor: 3, group, limit: 65535 };
                 testing::assert_twin(dispatch::Kernel, &gpu, case, push, 1u32);
             }
         }

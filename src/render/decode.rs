@@ -1,30 +1,43 @@
 //! Visible anchors into neural Gaussians (Scaffold-GS, section 3.2), and the gradients back to the model.
 //!
-//! Both layers and all their gradients are matrix products in which a thread holds a tile of the result in registers
-//! (8 units of 8 anchors, 8 by 8 weights), so that a load serves several products. Activations are kept from the
-//! forward pass: 40 + 96 values per visible anchor, 11 K padded to heads of 8 more for the backward pass; at K = 10
-//! each of these buffers stays below 128 MiB up to 270,000 visible anchors.
+//! Two in three Gaussians do not exist: their opacity is not positive. Opacities come first; the Gaussians that exist are
+//! listed by their number k, then by anchor, and the other heads and the second layer's weight gradients are computed for
+//! those alone. What is not listed is not written.
 //!
-//! Weight gradients sum over anchors in a fixed tree: in float32 over chunks of 64 anchors (more only beyond 65,536
-//! visible anchors: at most 1,024 chunks), then over runs of 32 chunks, then over the runs. With n visible anchors the
-//! rounding error is at most `(n / 1024 + 64 + 32 + 32) 2^-24` of the sum of the terms' magnitudes.
+//! Both layers and all their gradients are matrix products in which a thread holds a tile of the result in registers
+//! (16 units of 8 anchors, of 16 on a CPU, whose loads cost more than what does not fit its registers), so that a load
+//! serves several products; Gaussians of one thread have the same k and so the same weights. Activations are kept from
+//! the forward pass: 40 + 96 values per visible anchor, 11 K padded to heads of 8 more for the backward pass; at K = 10
+//! each of these buffers stays below 128 MiB up to 240,000 visible anchors.
+//!
+//! Weight gradients sum in a fixed tree: in float32 over chunks of 64 anchors, of 64 listed Gaussians of the same k (more
+//! only beyond 65,536 visible anchors and 524,288 Gaussians: at most 1,024 and 8,192 + K chunks), then over runs of 32
+//! chunks, then over the runs. With n anchors or Gaussians the rounding error is at most
+//! `(n / 1024 + 64 + 32 + 32) 2^-24` of the sum of the terms' magnitudes.
 
 use crate::gpu::kernels::render::{
     decode, decode_backward, decode_backward_feature, decode_backward_first, decode_backward_fixed,
     decode_backward_fixed_offset, decode_backward_fixed_scaling, decode_backward_hidden, decode_backward_second,
-    decode_backward_weights, decode_hidden, decode_input, decode_pack,
+    decode_backward_weights, decode_backward_weights_second, decode_hidden, decode_input, decode_lists, decode_opacity,
+    decode_pack,
 };
 use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
 use crate::math::camera::{from_center, split};
 use crate::math::decoder::{
-    FEATURE, Gaussian, HEADS, HIDDEN, INPUT, Layout, activate, activate_backward, input, outputs_of,
+    ActivationGradient, FEATURE, Gaussian, HEADS, HIDDEN, INPUT, Layout, activate, activate_backward, input, outputs_of,
 };
-use crate::primitives::dispatch;
+use crate::primitives::{Compact, Count, dispatch};
 
 /// Threads of a workgroup of all kernels here.
 const GROUP: u32 = 64;
-/// Anchors of a thread in the kernels that multiply with the weights, where a weight's row has 12 or K threads.
-const TILE: u32 = 8;
+/// Units or features of a thread.
+const UNITS: u32 = 16;
+/// Opacities of an anchor in a thread.
+const OPACITIES: u32 = 5;
+/// Threads that sum one chunk of the first layer's weight gradients.
+const FIRST_PARTS: u32 = 24;
+/// vec4s of one Gaussian's second layer: 11 rows and 11 biases.
+const SECOND_VEC4: usize = 91;
 /// vec4s of a padded input, of the hidden units.
 const INPUT_VEC4: usize = Layout::PADDED_INPUT / 4;
 const HIDDEN_VEC4: usize = HEADS * HIDDEN / 4;
@@ -33,21 +46,21 @@ const FIRST_VEC4: usize = HEADS * HIDDEN * INPUT_VEC4;
 /// Anchors of the smallest chunk of a weight gradient, and chunks at most.
 const BLOCK: usize = 64;
 const CHUNKS: usize = 1024;
+const SECOND_CHUNKS: usize = 8192;
 
 /// Anchors of one chunk.
 fn chunk_anchors(anchors: usize) -> usize {
     BLOCK * anchors.div_ceil(BLOCK * CHUNKS).max(1)
 }
 
-/// Smallest number of threads per item with which groups of [`GROUP`] cover `per` threads for every `tile` items
-/// begun, whatever the number of items.
-fn threads_per_item(per: u32, tile: u32) -> u32 {
-    (per.div_ceil(tile)..)
-        .find(|&f| {
-            // With tile * GROUP items more, the left side grows by tile * GROUP * f, the right by GROUP * per: not more.
-            (1..=tile * GROUP).all(|n| (n * f).next_multiple_of(GROUP) >= n.div_ceil(tile) * per)
-        })
-        .expect("one thread per item and tile member is enough")
+/// Listed Gaussians of one chunk.
+fn chunk_listed(listed: usize) -> usize {
+    BLOCK * listed.div_ceil(BLOCK * SECOND_CHUNKS).max(1)
+}
+
+/// Anchors or Gaussians of a thread in the kernels that multiply with the weights.
+fn tile(gpu: &Gpu) -> u32 {
+    if gpu.info().kind == "cpu" { 16 } else { 8 }
 }
 
 fn wide<const C: usize>(v: [f32; C]) -> [f64; C] {
@@ -128,30 +141,72 @@ impl Reference for decode_hidden::Kernel {
     }
 }
 
+impl Reference for decode_opacity::Kernel {
+    fn reference(host: decode_opacity::Host<'_>, push: decode_opacity::Push, constants: decode_opacity::Constants) {
+        let layout = Layout { offsets: constants.offsets as usize };
+        let (packed, hidden) = (host.packed.as_flattened(), host.hidden.as_flattened());
+        let n = host.groups[3] as usize;
+        host.flagged[0] = (n * layout.offsets) as u32;
+        for v in 0..n {
+            for k in 0..layout.offsets {
+                let opacity = second_layer(layout, packed, hidden, v, (0, k)).tanh() as f32;
+                host.opacity[v * layout.offsets + k] = opacity;
+                host.flags[k * n + v] = (opacity > push.above).into();
+            }
+        }
+    }
+
+    /// As `decode`'s.
+    fn check(_: &'static str) -> Check {
+        sums(33 + 27)
+    }
+}
+
+/// Output `(head, output)` of visible anchor `v`.
+fn second_layer(layout: Layout, packed: &[f32], hidden: &[f32], v: usize, (head, output): (usize, usize)) -> f64 {
+    let (second, row) = (4 * FIRST_VEC4, layout.row(head) + output);
+    let product =
+        |j: usize| f64::from(packed[second + row * HIDDEN + j]) * f64::from(hidden[(v * HEADS + head) * HIDDEN + j]);
+    (0..HIDDEN).map(product).sum::<f64>() + f64::from(packed[second + layout.rows() * HIDDEN + row])
+}
+
+impl Reference for decode_lists::Kernel {
+    fn reference(host: decode_lists::Host<'_>, (): (), constants: decode_lists::Constants) {
+        let (n, offsets, end) = (host.groups[3], constants.offsets, host.listed_count[0]);
+        for k in 0..=offsets {
+            let before = host.listed[..end as usize].iter().filter(|&&i| i < k * n).count();
+            host.segments[k as usize] = before as u32;
+        }
+        host.segments[offsets as usize + 1] = n;
+        host.bound[0] = end + offsets * BLOCK as u32;
+    }
+}
+
+/// The listed Gaussians, `(k, visible anchors)`, and how many anchors are visible.
+fn lists<'a>(segments: &'a [u32], listed: &'a [u32], offsets: usize) -> impl Iterator<Item = (usize, Vec<usize>)> + 'a {
+    let n = segments[offsets + 1] as usize;
+    (0..offsets).map(move |k| {
+        let of = &listed[segments[k] as usize..segments[k + 1] as usize];
+        (k, of.iter().map(|&i| i as usize - k * n).collect())
+    })
+}
+
 impl Reference for decode::Kernel {
     fn reference(host: decode::Host<'_>, push: decode::Push, constants: decode::Constants) {
         let layout = Layout { offsets: constants.offsets as usize };
         let (packed, hidden) = (host.packed.as_flattened(), host.hidden.as_flattened());
-        let second = 4 * FIRST_VEC4;
-        for v in 0..host.groups[3] as usize {
-            let anchor = host.visible[v] as usize;
-            let seen = from_center(host.anchor_position[anchor], [push.center, push.center_low]);
-            for k in 0..layout.offsets {
+        for (k, anchors) in lists(host.segments, host.listed, layout.offsets) {
+            for v in anchors {
+                let anchor = host.visible[v] as usize;
+                let seen = from_center(host.anchor_position[anchor], [push.center, push.center_low]);
                 let mut raw = [0.0; 11];
-                for (at, (head, output)) in outputs_of(k).enumerate() {
-                    let row = layout.row(head) + output;
-                    let product = |j: usize| {
-                        f64::from(packed[second + row * HIDDEN + j])
-                            * f64::from(hidden[(v * HEADS + head) * HIDDEN + j])
-                    };
-                    let bias = f64::from(packed[second + layout.rows() * HIDDEN + row]);
-                    raw[at] = (0..HIDDEN).map(product).sum::<f64>() + bias;
+                for (raw, of) in raw.iter_mut().zip(outputs_of(k)) {
+                    *raw = second_layer(layout, packed, hidden, v, of);
                 }
                 let slot = v * layout.offsets + k;
                 let offset = wide(host.offset[anchor * layout.offsets + k]);
                 let g = activate(raw, wide(seen), offset, six(host.log_scaling, anchor));
                 host.position[slot] = narrow(g.position);
-                host.opacity[slot] = g.opacity as f32;
                 host.color[slot] = narrow(g.color);
                 host.scale[slot] = narrow(g.scale);
                 host.rotation[slot] = narrow(g.rotation);
@@ -170,7 +225,7 @@ impl Reference for decode::Kernel {
 macro_rules! backward_twin {
     ($module:ident $(, position: $position:ident)? $(, offset: $offset:ident)? $(, scaling: $scaling:ident)?) => {
         impl Reference for $module::Kernel {
-            fn reference(host: $module::Host<'_>, (): (), constants: $module::Constants) {
+            fn reference(host: $module::Host<'_>, push: $module::Push, constants: $module::Constants) {
                 let layout = Layout { offsets: constants.offsets as usize };
                 let grad_output = host.grad_output.as_flattened_mut();
                 for v in 0..host.groups[3] as usize {
@@ -202,7 +257,11 @@ macro_rules! backward_twin {
                             rotation: wide(host.grad_rotation[slot]),
                             norm: 0.0,
                         };
-                        let g = activate_backward(&of, _offset, log_scaling, &grad);
+                        let g = if host.opacity[slot] > push.above {
+                            activate_backward(&of, _offset, log_scaling, &grad)
+                        } else {
+                            ActivationGradient::default()
+                        };
                         let _ = at;
                         $(host.$offset[at] = narrow(g.offset);)?
                         sum.iter_mut().zip(g.log_scaling).for_each(|(s, g)| *s += g);
@@ -252,7 +311,7 @@ impl Reference for decode_backward_hidden::Kernel {
 }
 
 impl Reference for decode_backward_feature::Kernel {
-    fn reference(host: decode_backward_feature::Host<'_>, (): (), (): ()) {
+    fn reference(host: decode_backward_feature::Host<'_>, (): (), _: decode_backward_feature::Constants) {
         let (packed, grad_hidden) = (host.packed.as_flattened(), host.grad_hidden.as_flattened());
         for v in 0..host.groups[3] as usize {
             for i in 0..FEATURE {
@@ -298,21 +357,28 @@ impl Reference for decode_backward_first::Kernel {
     }
 }
 
+/// Chunks of the lists: k, and the visible anchors of each.
+fn listed_chunks(segments: &[u32], listed: &[u32], offsets: usize) -> Vec<(usize, Vec<usize>)> {
+    let chunk = chunk_listed(segments[offsets] as usize);
+    lists(segments, listed, offsets)
+        .flat_map(|(k, anchors)| anchors.chunks(chunk).map(|c| (k, c.to_vec())).collect::<Vec<_>>())
+        .collect()
+}
+
 impl Reference for decode_backward_second::Kernel {
     fn reference(host: decode_backward_second::Host<'_>, (): (), constants: decode_backward_second::Constants) {
         let layout = Layout { offsets: constants.offsets as usize };
-        let (hidden, grad_output) = (host.hidden.as_flattened(), host.grad_output.as_flattened());
-        let (partial, rows) = (host.partial.as_flattened_mut(), layout.rows());
-        for (part, anchors) in chunks(host.groups[3] as usize).enumerate() {
-            let partial = &mut partial[part * rows * (HIDDEN + 1)..][..rows * (HIDDEN + 1)];
-            for row in 0..rows {
-                let (head, _) = layout.output_of(row);
-                let grad = |v: usize| f64::from(grad_output[v * rows + row]);
+        let head = constants.head as usize;
+        let (hidden, partial) = (host.hidden.as_flattened(), host.partial.as_flattened_mut());
+        for (part, (k, anchors)) in listed_chunks(host.segments, host.listed, layout.offsets).into_iter().enumerate() {
+            let partial = &mut partial[4 * SECOND_VEC4 * part..][..4 * SECOND_VEC4];
+            for (at, (of, output)) in outputs_of(k).enumerate().filter(|(_, (of, _))| *of == head) {
+                let grad = |v: usize| f64::from(host.grad_output[v * layout.rows() + layout.row(of) + output]);
                 for j in 0..HIDDEN {
-                    let product = |v: usize| grad(v) * f64::from(hidden[(v * HEADS + head) * HIDDEN + j]);
-                    partial[row * HIDDEN + j] = anchors.clone().map(product).sum::<f64>() as f32;
+                    let product = |&v: &usize| grad(v) * f64::from(hidden[(v * HEADS + head) * HIDDEN + j]);
+                    partial[at * HIDDEN + j] = anchors.iter().map(product).sum::<f64>() as f32;
                 }
-                partial[rows * HIDDEN + row] = anchors.clone().map(grad).sum::<f64>() as f32;
+                partial[11 * HIDDEN + at] = anchors.iter().map(|&v| grad(v)).sum::<f64>() as f32;
             }
         }
     }
@@ -324,25 +390,42 @@ impl Reference for decode_backward_second::Kernel {
 impl Reference for decode_backward_weights::Kernel {
     fn reference(host: decode_backward_weights::Host<'_>, (): (), constants: decode_backward_weights::Constants) {
         let layout = Layout { offsets: constants.offsets as usize };
-        let rows = layout.rows();
-        let parts = chunks(host.groups[3] as usize).count();
-        let sum = |from: &[[f32; 4]], stride: usize, at: usize| {
-            (0..parts).map(|part| f64::from(from.as_flattened()[4 * stride * part + at])).sum::<f64>() as f32
-        };
+        let (partial, parts) = (host.partial.as_flattened(), chunks(host.groups[3] as usize).count());
         for head in 0..HEADS {
             for unit in 0..HIDDEN {
                 for i in 0..=INPUT {
                     let at = (head * HIDDEN + unit) * Layout::PADDED_INPUT + i;
-                    host.grad_weights[layout.first(head, unit, i)] = sum(host.first, FIRST_VEC4, at);
+                    let terms = (0..parts).map(|part| f64::from(partial[4 * FIRST_VEC4 * part + at]));
+                    host.grad_weights[layout.first(head, unit, i)] = terms.sum::<f64>() as f32;
                 }
             }
-            for output in 0..layout.outputs(head) {
-                let row = layout.row(head) + output;
+        }
+    }
+    fn check(_: &'static str) -> Check {
+        sums(BLOCK)
+    }
+}
+
+impl Reference for decode_backward_weights_second::Kernel {
+    fn reference(
+        host: decode_backward_weights_second::Host<'_>,
+        (): (),
+        constants: decode_backward_weights_second::Constants,
+    ) {
+        let layout = Layout { offsets: constants.offsets as usize };
+        let (partial, segments) = (host.partial.as_flattened(), host.segments);
+        let chunk = chunk_listed(segments[layout.offsets] as usize);
+        let mut first = 0;
+        for k in 0..layout.offsets {
+            let parts = first..first + ((segments[k + 1] - segments[k]) as usize).div_ceil(chunk);
+            for (row, (head, output)) in outputs_of(k).enumerate() {
                 for j in 0..=HIDDEN {
-                    let at = if j < HIDDEN { row * HIDDEN + j } else { rows * HIDDEN + row };
-                    host.grad_weights[layout.second(head, output, j)] = sum(host.second, rows * (HIDDEN + 1) / 4, at);
+                    let at = if j < HIDDEN { row * HIDDEN + j } else { 11 * HIDDEN + row };
+                    let terms = parts.clone().map(|part| f64::from(partial[4 * SECOND_VEC4 * part + at]));
+                    host.grad_weights[layout.second(head, output, j)] = terms.sum::<f64>() as f32;
                 }
             }
+            first = parts.end;
         }
     }
     fn check(_: &'static str) -> Check {
@@ -414,7 +497,8 @@ impl<'a> From<AnchorGradients<'a>> for WantedGradients<'a> {
     }
 }
 
-/// The forward stage. Slot `s = v K + k` is Gaussian `k` of visible anchor `v`.
+/// The forward stage. Slot `s = v K + k` is Gaussian `k` of visible anchor `v`; its opacity says whether it was decoded,
+/// and where it was not, nothing else was written.
 #[derive(Debug)]
 pub struct Decode {
     /// Seen from the camera's centre, world axes, \[slot\].
@@ -431,37 +515,48 @@ pub struct Decode {
     packed: Buffer<[f32; 4]>,
     inputs: Buffer<[f32; 4]>,
     hidden: Buffer<[f32; 4]>,
-    per_anchor: Counted,
-    per_tile: Counted,
+    /// `[K*V]` which are decoded, and how many flags there are.
+    flags: Buffer<u32>,
+    flagged: Buffer<u32>,
+    /// `[list]` k V + v of those that are, and how many.
+    listed: Buffer<u32>,
+    listed_count: Buffer<u32>,
+    /// `[K+2]` of `decode_lists`.
+    segments: Buffer<u32>,
+    bound: Buffer<u32>,
+    compact: Compact,
+    per_anchor: Groups,
+    per_hidden: Groups,
+    per_opacity: Groups,
+    per_listed: Groups,
     layout: Layout,
     capacity: u32,
-}
-
-/// Workgroups for so many threads per visible anchor.
-#[derive(Debug)]
-struct Counted {
-    groups: Groups,
-    factor: u32,
-}
-
-impl Counted {
-    fn new(gpu: &Gpu, name: &'static str, factor: u32) -> Result<Self, Error> {
-        Ok(Self { groups: dispatch::groups(gpu, name, GROUP)?, factor })
-    }
-
-    fn record(&self, rec: &mut Recorder<'_>, count: &Buffer<u32>, capacity: u32) {
-        dispatch::record(rec, count, &self.groups, capacity, self.factor);
-    }
+    above: f32,
+    tile: u32,
 }
 
 impl Decode {
-    /// Buffers for `capacity` visible anchors of `offsets` Gaussians each.
+    /// For [`Decode::of`]: what exists.
+    pub const EXISTING: f32 = 0.0;
+    /// For [`Decode::of`]: every Gaussian, whether it exists or not.
+    pub const ALL: f32 = -2.0;
+
+    /// Buffers for `capacity` visible anchors of `offsets` Gaussians each; those that exist are decoded.
     ///
     /// # Errors
     /// When the device has no memory for them.
     pub fn new(gpu: &Gpu, capacity: u32, offsets: u32) -> Result<Self, Error> {
+        Self::of(gpu, capacity, offsets, Self::EXISTING)
+    }
+
+    /// As [`Decode::new`], where the Gaussians with an opacity above `above` are decoded.
+    ///
+    /// # Errors
+    /// As [`Decode::new`].
+    pub fn of(gpu: &Gpu, capacity: u32, offsets: u32, above: f32) -> Result<Self, Error> {
         let (anchors, layout) = (capacity as usize, Layout { offsets: offsets as usize });
         let slots = anchors * layout.offsets;
+        let groups = |name| dispatch::groups(gpu, name, GROUP);
         Ok(Self {
             position: gpu.buffer("position", slots)?,
             opacity: gpu.buffer("opacity", slots)?,
@@ -472,62 +567,77 @@ impl Decode {
             packed: gpu.buffer("packed", layout.packed())?,
             inputs: gpu.buffer("inputs", anchors * INPUT_VEC4)?,
             hidden: gpu.buffer("hidden", anchors * HIDDEN_VEC4)?,
-            per_anchor: Counted::new(gpu, "decode groups", 1)?,
-            per_tile: Counted::new(gpu, "decode tile groups", threads_per_item(offsets.max(12), TILE))?,
+            flags: gpu.buffer("decoded", slots)?,
+            flagged: gpu.buffer("decoded_flags", 1)?,
+            listed: gpu.buffer("listed", slots)?,
+            listed_count: gpu.buffer("listed_count", 1)?,
+            segments: gpu.buffer("segments", layout.offsets + 2)?,
+            bound: gpu.buffer("listed_bound", 1)?,
+            compact: Compact::new(gpu, slots as u32)?,
+            per_anchor: groups("decode groups")?,
+            per_hidden: groups("decode hidden groups")?,
+            per_opacity: groups("decode opacity groups")?,
+            per_listed: groups("decode listed groups")?,
             layout,
             capacity,
+            above,
+            tile: tile(gpu),
         })
+    }
+
+    /// Most entries of the lists if each k's were padded to chunks.
+    fn most_bound(&self) -> u32 {
+        (self.capacity + BLOCK as u32) * self.layout.offsets as u32
     }
 
     /// Records the decoding of the first `visible_count` anchors of the visible list for a camera centre (world).
     /// More than the capacity are not decoded.
     pub fn record(&self, rec: &mut Recorder<'_>, anchors: Anchors<'_>, visible_count: &Buffer<u32>, center: [f64; 3]) {
         let [center, center_low] = split(center);
-        for counted in [&self.per_anchor, &self.per_tile] {
-            counted.record(rec, visible_count, self.capacity);
-        }
-        let offsets = self.layout.offsets as u32;
+        let (offsets, tile, capacity) = (self.layout.offsets as u32, self.tile, self.capacity);
+        dispatch::record(rec, visible_count, &self.per_anchor, capacity, 1);
+        let parts = (HEADS * HIDDEN) as u32 / UNITS;
+        dispatch::record_tiles(rec, visible_count, &self.per_hidden, capacity, tile, parts);
+        dispatch::record_tiles(rec, visible_count, &self.per_opacity, capacity, tile, offsets.div_ceil(OPACITIES));
         let pack = decode_pack::Buffers { weights: anchors.weights, packed: &self.packed };
         rec.run_with(decode_pack::Kernel, decode_pack::Constants { offsets }, pack, (), self.layout.packed());
-        let groups = &self.per_anchor.groups;
+        let Self { packed, inputs, hidden, opacity, flags, flagged, listed, listed_count, segments, bound, .. } = self;
+        let groups = &self.per_anchor.buffer;
         let buffers = decode_input::Buffers {
-            groups: &groups.buffer,
+            groups,
             visible: anchors.visible,
             position: anchors.position,
             feature: anchors.feature,
-            inputs: &self.inputs,
+            inputs,
         };
-        rec.run(decode_input::Kernel, buffers, decode_input::Push { center, center_low }, groups);
-        let groups = &self.per_tile.groups;
-        let buffers = decode_hidden::Buffers {
-            groups: &groups.buffer,
-            packed: &self.packed,
-            inputs: &self.inputs,
-            hidden: &self.hidden,
-        };
-        rec.run_with(decode_hidden::Kernel, decode_hidden::Constants { offsets }, buffers, (), groups);
+        rec.run(decode_input::Kernel, buffers, decode_input::Push { center, center_low }, &self.per_anchor);
+        let buffers = decode_hidden::Buffers { groups, packed, inputs, hidden };
+        rec.run_with(decode_hidden::Kernel, decode_hidden::Constants { tile }, buffers, (), &self.per_hidden);
+        let buffers = decode_opacity::Buffers { groups, packed, hidden, opacity, flags, flagged };
+        let push = decode_opacity::Push { above: self.above };
+        let constants = decode_opacity::Constants { offsets, tile };
+        rec.run_with(decode_opacity::Kernel, constants, buffers, push, &self.per_opacity);
+        self.compact.record(rec, flags, listed, listed_count, Count::Device(flagged));
+        let buffers = decode_lists::Buffers { groups, listed, listed_count, segments, bound };
+        rec.run_with(decode_lists::Kernel, decode_lists::Constants { offsets }, buffers, (), offsets + 1);
+        dispatch::record_tiles(rec, bound, &self.per_listed, self.most_bound(), tile, 1);
         let buffers = decode::Buffers {
-            groups: &groups.buffer,
+            segments,
+            listed,
             visible: anchors.visible,
             anchor_position: anchors.position,
             offset: anchors.offset,
             log_scaling: anchors.log_scaling,
-            packed: &self.packed,
-            hidden: &self.hidden,
+            packed,
+            hidden,
             position: &self.position,
-            opacity: &self.opacity,
             color: &self.color,
             scale: &self.scale,
             rotation: &self.rotation,
             rotation_norm: &self.rotation_norm,
         };
-        rec.run_with(
-            decode::Kernel,
-            decode::Constants { offsets },
-            buffers,
-            decode::Push { center, center_low },
-            groups,
-        );
+        let push = decode::Push { center, center_low };
+        rec.run_with(decode::Kernel, decode::Constants { offsets, tile }, buffers, push, &self.per_listed);
     }
 }
 
@@ -536,6 +646,7 @@ impl Decode {
 pub struct DecodeBackward {
     grad_output: Buffer<[f32; 4]>,
     grad_hidden: Option<Buffer<[f32; 4]>>,
+    per_feature: Option<Groups>,
     sums: Option<Sums>,
 }
 
@@ -544,6 +655,8 @@ pub struct DecodeBackward {
 struct Sums {
     first: Buffer<[f32; 4]>,
     second: Buffer<[f32; 4]>,
+    per_first: Groups,
+    per_second: Groups,
 }
 
 impl DecodeBackward {
@@ -561,17 +674,21 @@ impl DecodeBackward {
     /// When the device has no memory for it.
     pub fn of(gpu: &Gpu, forward: &Decode, feature: bool, weights: bool) -> Result<Self, Error> {
         let (anchors, rows) = (forward.capacity as usize, forward.layout.rows());
-        let parts = anchors.div_ceil(BLOCK).min(CHUNKS);
+        let first = anchors.div_ceil(BLOCK).min(CHUNKS);
+        let second = (anchors * forward.layout.offsets).div_ceil(BLOCK).min(SECOND_CHUNKS) + forward.layout.offsets;
         let sums = || -> Result<Sums, Error> {
             Ok(Sums {
-                first: gpu.buffer("first", parts * FIRST_VEC4)?,
-                second: gpu.buffer("second", parts * rows * (HIDDEN + 1) / 4)?,
+                first: gpu.buffer("first", first * FIRST_VEC4)?,
+                second: gpu.buffer("second", second * SECOND_VEC4)?,
+                per_first: dispatch::groups(gpu, "first groups", GROUP)?,
+                per_second: dispatch::groups(gpu, "second groups", GROUP)?,
             })
         };
         let hidden = || gpu.buffer("grad_hidden", anchors * HIDDEN_VEC4);
         Ok(Self {
             grad_output: gpu.buffer("grad_output", anchors * rows / 4)?,
             grad_hidden: if feature || weights { Some(hidden()?) } else { None },
+            per_feature: if feature { Some(dispatch::groups(gpu, "feature groups", GROUP)?) } else { None },
             sums: if weights { Some(sums()?) } else { None },
         })
     }
@@ -590,7 +707,7 @@ impl DecodeBackward {
     ) {
         let to: WantedGradients<'_> = to.into();
         let offsets = forward.layout.offsets as u32;
-        let groups = &forward.per_anchor.groups;
+        let (groups, count) = (&forward.per_anchor, &forward.per_anchor.buffer);
         let (offset, log_scaling) = (anchors.offset, anchors.log_scaling);
         let (visible, grad_output) = (anchors.visible, &self.grad_output);
         let Decode { opacity, color, scale, rotation, rotation_norm, .. } = forward;
@@ -599,10 +716,11 @@ impl DecodeBackward {
         macro_rules! back {
             ($module:ident $(, $field:ident)*) => {{
                 let buffers = $module::Buffers {
-                    groups: &groups.buffer, visible, log_scaling, opacity, color, scale, rotation, rotation_norm,
+                    groups: count, visible, log_scaling, opacity, color, scale, rotation, rotation_norm,
                     grad_opacity, grad_color, grad_scale, grad_rotation, grad_output $(, $field)*
                 };
-                rec.run_with($module::Kernel, $module::Constants { offsets }, buffers, (), groups);
+                let push = $module::Push { above: forward.above };
+                rec.run_with($module::Kernel, $module::Constants { offsets }, buffers, push, groups);
             }};
         }
         match (to.offset, to.log_scaling) {
@@ -619,47 +737,41 @@ impl DecodeBackward {
             return;
         }
         let grad_hidden = self.grad_hidden.as_ref().expect("made with features or weights");
-        let groups = &forward.per_tile.groups;
-        let buffers = decode_backward_hidden::Buffers {
-            groups: &groups.buffer,
-            packed: &forward.packed,
-            hidden: &forward.hidden,
-            grad_output: &self.grad_output,
-            grad_hidden,
-        };
-        let constants = decode_backward_hidden::Constants { offsets };
-        rec.run_with(decode_backward_hidden::Kernel, constants, buffers, (), groups);
-        let groups = &forward.per_anchor.groups;
+        let Decode { packed, inputs, hidden, flagged, segments, listed, tile, .. } = forward;
+        // Flags are counted, K of them per anchor.
+        let slots = forward.capacity * offsets;
+        let buffers = decode_backward_hidden::Buffers { groups: count, packed, hidden, grad_output, grad_hidden };
+        let constants = decode_backward_hidden::Constants { offsets, tile: *tile };
+        rec.run_with(decode_backward_hidden::Kernel, constants, buffers, (), &forward.per_hidden);
         if let Some(grad_feature) = to.feature {
-            let buffers = decode_backward_feature::Buffers {
-                groups: &groups.buffer,
-                visible: anchors.visible,
-                packed: &forward.packed,
-                grad_hidden,
-                grad_feature,
-            };
-            rec.run(decode_backward_feature::Kernel, buffers, (), groups);
+            let groups = self.per_feature.as_ref().expect("made with features");
+            dispatch::record_tiles(rec, flagged, groups, slots, tile * offsets, FEATURE as u32 / UNITS);
+            let buffers =
+                decode_backward_feature::Buffers { groups: count, visible, packed, grad_hidden, grad_feature };
+            let constants = decode_backward_feature::Constants { tile: *tile };
+            rec.run_with(decode_backward_feature::Kernel, constants, buffers, (), groups);
         }
         let Some(grad_weights) = to.weights else { return };
-        let Sums { first, second } = self.sums.as_ref().expect("made with weights");
-        let buffers = decode_backward_first::Buffers {
-            groups: &groups.buffer,
-            inputs: &forward.inputs,
-            grad_hidden,
-            partial: first,
-        };
-        rec.run(decode_backward_first::Kernel, buffers, (), groups);
-        let buffers = decode_backward_second::Buffers {
-            groups: &groups.buffer,
-            hidden: &forward.hidden,
-            grad_output: &self.grad_output,
-            partial: second,
-        };
-        let constants = decode_backward_second::Constants { offsets };
-        rec.run_with(decode_backward_second::Kernel, constants, buffers, (), groups);
-        let buffers = decode_backward_weights::Buffers { groups: &groups.buffer, first, second, grad_weights };
+        let Sums { first, second, per_first, per_second } = self.sums.as_ref().expect("made with weights");
+        dispatch::record_tiles(rec, flagged, per_first, slots, BLOCK as u32 * offsets, FIRST_PARTS);
+        let buffers = decode_backward_first::Buffers { groups: count, inputs, grad_hidden, partial: first };
+        rec.run(decode_backward_first::Kernel, buffers, (), per_first);
+        let parts = HIDDEN as u32 / UNITS;
+        dispatch::record_tiles(rec, &forward.bound, per_second, forward.most_bound(), BLOCK as u32, parts);
+        let rows = self.grad_output.view();
+        for head in 0..HEADS as u32 {
+            let buffers =
+                decode_backward_second::Buffers { segments, listed, hidden, grad_output: &rows, partial: second };
+            let constants = decode_backward_second::Constants { offsets, head };
+            rec.run_with(decode_backward_second::Kernel, constants, buffers, (), per_second);
+        }
+        let buffers = decode_backward_weights::Buffers { groups: count, partial: first, grad_weights };
         let constants = decode_backward_weights::Constants { offsets };
-        rec.run_with(decode_backward_weights::Kernel, constants, buffers, (), forward.layout.packed());
+        rec.run_with(decode_backward_weights::Kernel, constants, buffers, (), FIRST_VEC4);
+        let buffers = decode_backward_weights_second::Buffers { segments, partial: second, grad_weights };
+        let constants = decode_backward_weights_second::Constants { offsets };
+        let threads = forward.layout.offsets * SECOND_VEC4;
+        rec.run_with(decode_backward_weights_second::Kernel, constants, buffers, (), threads);
     }
 }
 
@@ -681,6 +793,7 @@ mod tests {
         weights: Vec<f32>,
         visible: Vec<u32>,
         center: [f64; 3],
+        above: f32,
     }
 
     fn random<const C: usize>(rng: &mut Pcg64, n: usize, low: f32, high: f32) -> Vec<[f32; C]> {
@@ -704,6 +817,7 @@ mod tests {
             weights: flat(rng, Layout { offsets }.weights(), -0.3, 0.3),
             visible: ids,
             center: [0.2, -0.3, -3.0],
+            above: Decode::ALL,
         }
     }
 
@@ -743,7 +857,10 @@ mod tests {
     fn kernels_match_their_twins() {
         let gpu = testing::gpu();
         let mut rng = Pcg64::seed_from_u64(1);
-        for (count, offsets) in [(0, 10), (1, 10), (63, 10), (64, 10), (65, 10), (1000, 10), (65, 5), (3, 1), (130, 20)]
+        let every = [(0, 10), (1, 10), (63, 10), (64, 10), (65, 10), (1000, 10), (65, 5), (3, 1), (130, 20)];
+        // Tiles of both sizes; those that exist, all, none.
+        for ((count, offsets), (tile, above)) in
+            every.into_iter().zip([(8, 0.0), (16, 0.0), (16, -2.0), (8, 2.0)].into_iter().cycle())
         {
             let m = model(&mut rng, count, offsets);
             let (layout, slots, k) = (m.layout(), count * offsets, offsets as u32);
@@ -766,10 +883,37 @@ mod tests {
                 inputs: inputs.clone(),
                 hidden: unwritten(count * HIDDEN_VEC4 + 3),
             };
-            let constants = decode_hidden::Constants { offsets: k };
-            let hidden = twin(decode_hidden::Kernel, &gpu, constants, case, (), count.div_ceil(8) * 12).hidden;
-            let case = decode::Arrays {
+            let tiles = |n: usize| n.div_ceil(tile as usize);
+            let hidden =
+                twin(decode_hidden::Kernel, &gpu, decode_hidden::Constants { tile }, case, (), tiles(count) * 6).hidden;
+            let case = decode_opacity::Arrays {
                 groups: m.counted(),
+                packed: packed.clone(),
+                hidden: hidden.clone(),
+                opacity: vec![testing::UNWRITTEN; slots + 3],
+                flags: vec![7; slots + 3],
+                flagged: vec![7],
+            };
+            let constants = decode_opacity::Constants { offsets: k, tile };
+            let push = decode_opacity::Push { above };
+            let threads = tiles(count) * offsets.div_ceil(5);
+            let flagged = twin(decode_opacity::Kernel, &gpu, constants, case, push, threads);
+            let mut listed: Vec<u32> = (0..slots as u32).filter(|&i| flagged.flags[i as usize] == 1).collect();
+            assert!(above == 0.0 || listed.len() == if above < 0.0 { slots } else { 0 });
+            let found = listed.len();
+            listed.extend([0; 3]);
+            let case = decode_lists::Arrays {
+                groups: m.counted(),
+                listed: listed.clone(),
+                listed_count: vec![found as u32],
+                segments: vec![7; offsets + 4],
+                bound: vec![7; 2],
+            };
+            let constants = decode_lists::Constants { offsets: k };
+            let segments = twin(decode_lists::Kernel, &gpu, constants, case, (), offsets + 1).segments;
+            let case = decode::Arrays {
+                segments: segments.clone(),
+                listed: listed.clone(),
                 visible: m.visible.clone(),
                 anchor_position: m.position.clone(),
                 offset: m.offset.clone(),
@@ -777,28 +921,21 @@ mod tests {
                 packed: packed.clone(),
                 hidden: hidden.clone(),
                 position: unwritten(slots + 3),
-                opacity: vec![testing::UNWRITTEN; slots + 3],
                 color: unwritten(slots + 3),
                 scale: unwritten(slots + 3),
                 rotation: unwritten(slots + 3),
                 rotation_norm: vec![testing::UNWRITTEN; slots + 3],
             };
-            let constants = decode::Constants { offsets: k };
-            let forward = twin(
-                decode::Kernel,
-                &gpu,
-                constants,
-                case,
-                decode::Push { center, center_low },
-                count.div_ceil(8) * offsets,
-            );
+            let constants = decode::Constants { offsets: k, tile };
+            let push = decode::Push { center, center_low };
+            let forward = twin(decode::Kernel, &gpu, constants, case, push, tiles(found) + offsets);
 
             let case = decode_backward::Arrays {
                 groups: m.counted(),
                 visible: m.visible.clone(),
                 offset: m.offset.clone(),
                 log_scaling: m.log_scaling.clone(),
-                opacity: forward.opacity,
+                opacity: flagged.opacity,
                 color: forward.color,
                 scale: forward.scale,
                 rotation: forward.rotation,
@@ -821,14 +958,15 @@ mod tests {
                         grad_opacity: c.grad_opacity, grad_color: c.grad_color, grad_scale: c.grad_scale,
                         grad_rotation: c.grad_rotation, grad_output: c.grad_output $(, $field: c.$field)*
                     };
-                    twin($module::Kernel, &gpu, $module::Constants { offsets: k }, case, (), count);
+                    twin($module::Kernel, &gpu, $module::Constants { offsets: k }, case, $module::Push { above }, count);
                 }};
             }
             fixed!(decode_backward_fixed_offset, offset, grad_position, grad_log_scaling);
             fixed!(decode_backward_fixed_scaling, grad_position, grad_offset);
             fixed!(decode_backward_fixed);
             let constants = decode_backward::Constants { offsets: k };
-            let grad_output = twin(decode_backward::Kernel, &gpu, constants, case, (), count).grad_output;
+            let push = decode_backward::Push { above };
+            let grad_output = twin(decode_backward::Kernel, &gpu, constants, case, push, count).grad_output;
             let case = decode_backward_hidden::Arrays {
                 groups: m.counted(),
                 packed: packed.clone(),
@@ -836,8 +974,8 @@ mod tests {
                 grad_output: grad_output.clone(),
                 grad_hidden: unwritten(count * HIDDEN_VEC4 + 3),
             };
-            let constants = decode_backward_hidden::Constants { offsets: k };
-            let threads = count.div_ceil(8) * 12;
+            let constants = decode_backward_hidden::Constants { offsets: k, tile };
+            let threads = tiles(count) * 6;
             let grad_hidden = twin(decode_backward_hidden::Kernel, &gpu, constants, case, (), threads).grad_hidden;
             let case = decode_backward_feature::Arrays {
                 groups: m.counted(),
@@ -846,7 +984,8 @@ mod tests {
                 grad_hidden: grad_hidden.clone(),
                 grad_feature: vec![testing::UNWRITTEN; m.feature.len()],
             };
-            twin(decode_backward_feature::Kernel, &gpu, (), case, (), count.div_ceil(4) * 4);
+            let constants = decode_backward_feature::Constants { tile };
+            twin(decode_backward_feature::Kernel, &gpu, constants, case, (), tiles(count) * 2);
             let parts = count.div_ceil(BLOCK);
             let case = decode_backward_first::Arrays {
                 groups: m.counted(),
@@ -854,32 +993,40 @@ mod tests {
                 grad_hidden: grad_hidden.clone(),
                 partial: unwritten(parts * FIRST_VEC4 + 3),
             };
-            let first = twin(decode_backward_first::Kernel, &gpu, (), case, (), parts * 64).partial;
-            let case = decode_backward_second::Arrays {
-                groups: m.counted(),
-                hidden: hidden.clone(),
-                grad_output: grad_output.clone(),
-                partial: unwritten(parts * layout.rows() * (HIDDEN + 1) / 4 + 3),
-            };
-            let constants = decode_backward_second::Constants { offsets: k };
-            let second = twin(decode_backward_second::Kernel, &gpu, constants, case, (), parts * 64).partial;
-            let case = decode_backward_weights::Arrays {
-                groups: m.counted(),
-                first,
-                second,
-                grad_weights: vec![testing::UNWRITTEN; layout.weights() + 3],
-            };
+            let first = twin(decode_backward_first::Kernel, &gpu, (), case, (), parts * 24).partial;
+            let grad_weights = vec![testing::UNWRITTEN; layout.weights() + 3];
+            let chunks = listed_chunks(&segments, &listed, offsets).len();
+            let rows = grad_output.into_flattened();
+            let mut second = unwritten(chunks * SECOND_VEC4 + 3);
+            for head in 0..3 {
+                let case = decode_backward_second::Arrays {
+                    segments: segments.clone(),
+                    listed: listed.clone(),
+                    hidden: hidden.clone(),
+                    grad_output: rows.clone(),
+                    partial: second,
+                };
+                let constants = decode_backward_second::Constants { offsets: k, head };
+                second = twin(decode_backward_second::Kernel, &gpu, constants, case, (), chunks * 2).partial;
+            }
+            let case = decode_backward_weights::Arrays { groups: m.counted(), partial: first, grad_weights };
             let constants = decode_backward_weights::Constants { offsets: k };
-            twin(decode_backward_weights::Kernel, &gpu, constants, case, (), layout.packed());
+            let grad_weights =
+                twin(decode_backward_weights::Kernel, &gpu, constants, case, (), FIRST_VEC4).grad_weights;
+            let case = decode_backward_weights_second::Arrays { segments, partial: second, grad_weights };
+            let constants = decode_backward_weights_second::Constants { offsets: k };
+            let threads = offsets * SECOND_VEC4;
+            let all = twin(decode_backward_weights_second::Kernel, &gpu, constants, case, (), threads).grad_weights;
+            assert!(all[..layout.weights()].iter().all(|g| g.is_finite()), "every weight has a gradient");
         }
     }
 
-    /// Beyond 65,536 anchors a chunk has more than 64.
+    /// Beyond 65,536 anchors, and 524,288 Gaussians, a chunk has more than 64.
     #[test]
     fn long_chunks_match_their_twins() {
         let gpu = testing::gpu();
         let mut rng = Pcg64::seed_from_u64(11);
-        let (count, offsets) = (65_601, 2);
+        let (count, offsets) = (65_601, 9);
         let layout = Layout { offsets };
         let groups = vec![1, 1, 1, count as u32];
         let parts = chunks(count).count();
@@ -890,25 +1037,48 @@ mod tests {
             grad_hidden: random(&mut rng, count * HIDDEN_VEC4, -1.0, 1.0),
             partial: unwritten(parts * FIRST_VEC4 + 3),
         };
-        let first = twin(decode_backward_first::Kernel, &gpu, (), case, (), count).partial;
-        let case = decode_backward_second::Arrays {
-            groups: groups.clone(),
-            hidden: random(&mut rng, count * HIDDEN_VEC4, -1.0, 1.0),
-            grad_output: random(&mut rng, count * layout.rows() / 4, -1.0, 1.0),
-            partial: unwritten(parts * layout.rows() * (HIDDEN + 1) / 4 + 3),
-        };
-        let constants = decode_backward_second::Constants { offsets: 2 };
-        let second = twin(decode_backward_second::Kernel, &gpu, constants, case, (), count).partial;
+        let partial = twin(decode_backward_first::Kernel, &gpu, (), case, (), parts * 24).partial;
         let grad_weights = vec![testing::UNWRITTEN; layout.weights() + 3];
-        let case = decode_backward_weights::Arrays { groups, first, second, grad_weights };
-        let constants = decode_backward_weights::Constants { offsets: 2 };
-        twin(decode_backward_weights::Kernel, &gpu, constants, case, (), layout.packed());
+        let case = decode_backward_weights::Arrays { groups, partial, grad_weights };
+        let constants = decode_backward_weights::Constants { offsets: 9 };
+        let grad_weights = twin(decode_backward_weights::Kernel, &gpu, constants, case, (), FIRST_VEC4).grad_weights;
+        let listed: Vec<u32> = (0..(count * offsets) as u32).collect();
+        let segments: Vec<u32> = (0..=9).map(|k| k * count as u32).chain([count as u32]).collect();
+        let chunks = listed_chunks(&segments, &listed, offsets).len();
+        assert_eq!(chunks, 9 * 513);
+        let case = decode_backward_second::Arrays {
+            segments: segments.clone(),
+            listed,
+            hidden: random(&mut rng, count * HIDDEN_VEC4, -1.0, 1.0),
+            grad_output: flat(&mut rng, count * layout.rows(), -1.0, 1.0),
+            partial: vec![[0.0; 4]; chunks * SECOND_VEC4 + 3],
+        };
+        let constants = decode_backward_second::Constants { offsets: 9, head: 0 };
+        let partial = twin(decode_backward_second::Kernel, &gpu, constants, case, (), chunks * 2).partial;
+        let case = decode_backward_weights_second::Arrays { segments, partial, grad_weights };
+        let constants = decode_backward_weights_second::Constants { offsets: 9 };
+        twin(decode_backward_weights_second::Kernel, &gpu, constants, case, (), offsets * SECOND_VEC4);
     }
 
     struct Results {
         outputs: Vec<(&'static str, Vec<f32>)>,
         gradients: Vec<(&'static str, Vec<f32>)>,
         upstream: Vec<Gaussian>,
+    }
+
+    impl Results {
+        /// Sets a Gaussian's outputs but its opacity, and its gradient, to 0.
+        fn forget(&mut self, slot: usize) {
+            for (name, values) in &mut self.outputs {
+                let width = match *name {
+                    "opacity" => continue,
+                    "rotation" => 4,
+                    _ => 3,
+                };
+                values[width * slot..][..width].fill(0.0);
+            }
+            self.upstream[slot] = Gaussian::default();
+        }
     }
 
     /// Both stages on the device. Gradient buffers start at `before`.
@@ -938,7 +1108,7 @@ mod tests {
         let to_offset = gpu.upload("grad_offset", &vec![[before; 3]; m.offset.len()]).expect(fine);
         let to_scaling = gpu.upload("grad_log_scaling", &vec![before; m.log_scaling.len()]).expect(fine);
         let to_weights = gpu.upload("grad_weights", &vec![before; m.weights.len()]).expect(fine);
-        let forward = Decode::new(gpu, capacity, m.offsets as u32).expect(fine);
+        let forward = Decode::of(gpu, capacity, m.offsets as u32, m.above).expect(fine);
         let backward = DecodeBackward::new(gpu, &forward).expect(fine);
         let anchors = Anchors {
             position: &position,
@@ -998,9 +1168,12 @@ mod tests {
     fn stages_match_the_decoder() {
         let gpu = testing::gpu();
         let mut rng = Pcg64::seed_from_u64(2);
-        for (count, offsets) in [(0usize, 10), (1, 10), (85, 10), (500, 10), (77, 7)] {
-            let m = model(&mut rng, count, offsets);
-            let got = run(&gpu, &m, &mut rng, count as u32 + 5, 7.0, None);
+        let cases = [(0usize, 10, Decode::ALL), (1, 10, Decode::ALL), (85, 10, Decode::EXISTING)];
+        let more = [(500, 10, Decode::ALL), (500, 10, Decode::EXISTING), (77, 7, Decode::EXISTING)];
+        for (count, offsets, above) in cases.into_iter().chain(more) {
+            let mut m = model(&mut rng, count, offsets);
+            m.above = above;
+            let mut got = run(&gpu, &m, &mut rng, count as u32 + 5, 7.0, None);
             let layout = m.layout();
             let weights: Vec<f64> = m.weights.iter().map(|&w| w.into()).collect();
             let before = |n: usize| vec![7.0; n];
@@ -1015,7 +1188,12 @@ mod tests {
                 let ls = six(&m.log_scaling, a);
                 let x = input(row, at);
                 let o: Vec<[f64; 3]> = m.offset[a * offsets..][..offsets].iter().map(|o| wide(*o)).collect();
-                for g in decoder::decode(layout, &weights, &x, at, &o, ls) {
+                for (k, mut g) in decoder::decode(layout, &weights, &x, at, &o, ls).into_iter().enumerate() {
+                    // What is not decoded is not written, and its gradient is not read.
+                    if g.opacity <= f64::from(above) {
+                        g = Gaussian { opacity: g.opacity, ..Gaussian::default() };
+                        got.forget(v * offsets + k);
+                    }
                     outputs[0].extend(g.position);
                     outputs[1].push(g.opacity);
                     outputs[2].extend(g.color);
@@ -1076,18 +1254,6 @@ mod tests {
         assert!(results.outputs.iter().chain(&results.gradients).all(|(_, v)| v.iter().all(|x| x.is_finite())));
         let x = input([0.5; FEATURE], [0.0; 3]);
         assert_eq!(x[32..], [0.0; 4]);
-    }
-
-    #[test]
-    fn groups_cover_every_tile() {
-        assert_eq!([threads_per_item(1, 1), threads_per_item(4, 4)], [1, 1]);
-        for (per, tile) in [(12, 8), (10, 8), (5, 8), (1, 8), (20, 8), (33, 8), (12, 4)] {
-            let f = threads_per_item(per, tile);
-            assert!(f <= per.div_ceil(tile) * 2, "{f} threads for {per} per {tile}");
-            for n in 0..5000u32 {
-                assert!((n * f).next_multiple_of(GROUP) >= n.div_ceil(tile) * per);
-            }
-        }
     }
 
     /// Chunks stay at 64 anchors up to 65,536 and at most 1,024 afterwards; none is empty, none is missed.

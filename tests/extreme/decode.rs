@@ -77,7 +77,7 @@ fn run(gpu: &Gpu, feature: &[f32], weights: &[f32], what: &str) -> Outcome {
     let to_weights = unwritten("grad_weights", weights.len());
     let to =
         AnchorGradients { feature: &to_feature, offset: &to_offset, log_scaling: &to_scaling, weights: &to_weights };
-    let forward = Decode::new(gpu, n as u32, K as u32).expect(fine);
+    let forward = Decode::of(gpu, n as u32, K as u32, Decode::ALL).expect(fine);
     let backward = DecodeBackward::new(gpu, &forward).expect(fine);
     let mut rec = gpu.recorder().expect(fine);
     forward.record(&mut rec, anchors, &count, [0.0; 3]);

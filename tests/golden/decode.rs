@@ -36,7 +36,7 @@ fn decode() {
         let (to_feature, to_scaling) = (empty("grad_feature", n * 32), empty("grad_log_scaling", n * 6));
         let to_weights = empty("grad_weights", flat.len());
         let to_offset = gpu.upload("grad_offset", &vec![[testing::UNWRITTEN; 3]; n * k]).expect(fine);
-        let forward = Decode::new(&gpu, n as u32, k as u32).expect(fine);
+        let forward = Decode::of(&gpu, n as u32, k as u32, Decode::ALL).expect(fine);
         let backward = DecodeBackward::new(&gpu, &forward).expect(fine);
         let anchors = Anchors {
             position: &position,
