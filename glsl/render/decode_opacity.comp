@@ -13,7 +13,7 @@ layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };  // [4] x
 layout(binding = 1, scalar) readonly buffer Packed { vec4 packed[]; };     // of decode_pack
 layout(binding = 2, scalar) readonly buffer Hidden { vec4 hidden[]; };     // [V*24] of decode_hidden
 layout(binding = 3, scalar) writeonly buffer Opacity { float opacity[]; }; // [V*K] -1 to 1; the Gaussian exists where > 0
-layout(binding = 4, scalar) writeonly buffer Flags { uint flags[]; };      // [K*V] 1 where the Gaussian is decoded, all first ones first
+layout(binding = 4, scalar) writeonly buffer Flags { uint flags[]; };      // [K*V] 1 where the Gaussian is decoded, 0 elsewhere
 layout(binding = 5, scalar) writeonly buffer Flagged { uint flagged[]; };  // [1] flags written
 layout(push_constant, scalar) uniform Push {
   float above; // Gaussians with an opacity above this are decoded

@@ -182,7 +182,7 @@ impl Reference for decode_lists::Kernel {
     }
 }
 
-/// The listed Gaussians, `(k, visible anchors)`, and how many anchors are visible.
+/// For each k the visible anchors whose Gaussian k is listed.
 fn lists<'a>(segments: &'a [u32], listed: &'a [u32], offsets: usize) -> impl Iterator<Item = (usize, Vec<usize>)> + 'a {
     let n = segments[offsets + 1] as usize;
     (0..offsets).map(move |k| {
