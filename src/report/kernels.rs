@@ -436,6 +436,16 @@ impl Bench {
         })
     }
 
+    /// The views' names.
+    pub(crate) fn views(&self) -> Vec<String> {
+        self.photographs.iter().map(|photograph| photograph.name.clone()).collect()
+    }
+
+    /// Width and height of a view's picture.
+    pub(crate) fn size(&self, view: usize) -> [u32; 2] {
+        self.photographs[view].camera.size
+    }
+
     /// The words that the step leaves in the buffers of these names.
     pub(crate) fn trace(
         &mut self,
