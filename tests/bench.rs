@@ -52,7 +52,7 @@ fn a_step_is_measured_and_compared() {
     let record = json(&folder.join("first/bench.json"));
 
     let ceilings = record["ceilings"].as_object().expect("ceilings");
-    assert_eq!(ceilings.len(), 7);
+    assert_eq!(ceilings.len(), 8);
     assert!(ceilings.values().all(|c| number(&c["median"]) >= 0.0 && c["repetitions"] == 3));
 
     // With everything on there is no pass without a formula, and nothing of a step is missing.
@@ -98,7 +98,9 @@ fn a_step_is_measured_and_compared() {
     assert!(count("visible") <= count("anchors") && count("drawn") <= count("gaussians"));
     assert!(count("gaussians") <= count("visible") * 10.0 && count("pairs") >= count("drawn"));
     assert!(count("drawn") > 0.0 && count("evaluated") <= count("pairs") && count("evaluated") > 0.0);
-    assert!(count("samples") <= count("evaluated") * count("tile_side").powi(2) && count("blended") <= count("samples"));
+    assert!(
+        count("samples") <= count("evaluated") * count("tile_side").powi(2) && count("blended") <= count("samples")
+    );
     assert!(count("tokens") > 1.0, "the measured step has attention");
     assert!(count("anchors") != 300.0, "anchors have grown or been pruned in the warm-up");
 
@@ -119,7 +121,9 @@ fn a_step_is_measured_and_compared() {
     assert_eq!(error, "error: first: holds a record already: choose another --out, or --overwrite");
     let error = fails(folder, &format!("{measured} --against first/bench.json --set render.near=0.1"));
     assert!(
-        error.starts_with("error: first/bench.json: was measured with render.near = 0.2, this run is with render.near = 0.1"),
+        error.starts_with(
+            "error: first/bench.json: was measured with render.near = 0.2, this run is with render.near = 0.1"
+        ),
         "{error}"
     );
     let error = fails(folder, "scene --against scene/sparse/0/cameras.txt");

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use super::loads::LoadFigures;
 use super::text::digits;
 use super::{Device, Record};
 use crate::report::SceneFacts;
@@ -51,8 +52,7 @@ pub enum Error {
 /// # Errors
 /// A file that cannot be read, or is none.
 pub fn read(path: &Path) -> Result<Record, Error> {
-    let text =
-        std::fs::read_to_string(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
+    let text = std::fs::read_to_string(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
     serde_json::from_str(&text).map_err(|error| Error::Form { path: path.to_owned(), what: error.to_string() })
 }
 
@@ -129,8 +129,7 @@ pub fn ensure_comparable(path: &Path, old: &Record, new: Subject<'_>) -> Result<
         Some(step) => format!("at step {step} behind {warm_up} steps of warm-up"),
         None => "without a step".to_owned(),
     };
-    let (theirs, ours) =
-        (state(old.warm_up, old.step.as_ref().map(|s| s.step)), state(new.warm_up, new.step));
+    let (theirs, ours) = (state(old.warm_up, old.step.as_ref().map(|s| s.step)), state(new.warm_up, new.step));
     if new.scene.is_some() && theirs != ours {
         return other(theirs, ours, "give the same --warm-up and --step");
     }
@@ -185,14 +184,17 @@ pub struct Comparison {
     pub passes: Vec<Change>,
     /// Milliseconds of the whole step, and of the host's part.
     pub whole: Vec<Change>,
+    /// Milliseconds of the steps of generated loads.
+    pub loads: Vec<Change>,
 }
 
 /// Compares two records that [`ensure_comparable`] lets through.
 pub fn compare(old: &Record, new: &Record, notes: Vec<String>) -> Comparison {
     let (then, now) = (old.ceilings.rows(), new.ceilings.rows());
-    let ceilings = then.iter().zip(&now).map(|((name, unit, old), (.., new))| {
-        Change::of(&format!("{name}, {unit}"), Some(old), Some(new))
-    });
+    let ceilings = then
+        .iter()
+        .zip(&now)
+        .map(|((name, unit, old), (.., new))| Change::of(&format!("{name}, {unit}"), Some(old), Some(new)));
     let mut comparison = Comparison { notes, ceilings: ceilings.collect(), ..Comparison::default() };
     if let (Some(old), Some(new)) = (&old.step, &new.step) {
         let then = |name: &str| old.passes.iter().find(|p| p.pass == name).map(|p| &p.milliseconds);
@@ -210,6 +212,14 @@ pub fn compare(old: &Record, new: &Record, notes: Vec<String>) -> Comparison {
             Change::of("host: waiting", Some(&old.host.waiting), Some(&new.host.waiting)),
         ];
     }
+    if let (Some(old), Some(new)) = (&old.loads, &new.loads) {
+        let then = |run: &LoadFigures| {
+            let same = |other: &&LoadFigures| other.sweep == run.sweep && other.load == run.load;
+            old.runs.iter().find(same).map(|other| &other.step.total)
+        };
+        let change = |run: &LoadFigures| Change::of(&run.load.to_string(), then(run), Some(&run.step.total));
+        comparison.loads = new.runs.iter().map(change).collect();
+    }
     comparison
 }
 
@@ -218,8 +228,12 @@ impl std::fmt::Display for Comparison {
         for note in &self.notes {
             writeln!(f, "note: {note}")?;
         }
-        writeln!(f, "{:<42} {:>10} {:>10} {:>8}  range by quartiles", "against the older record", "then", "now", "ratio")?;
-        for change in self.ceilings.iter().chain(&self.passes).chain(&self.whole) {
+        writeln!(
+            f,
+            "{:<42} {:>10} {:>10} {:>8}  range by quartiles",
+            "against the older record", "then", "now", "ratio"
+        )?;
+        for change in self.ceilings.iter().chain(&self.passes).chain(&self.whole).chain(&self.loads) {
             let or = |value: Option<f64>| value.map_or("-".to_owned(), digits);
             let range = change.range.map_or(String::new(), |[low, high]| format!("{}..{}", digits(low), digits(high)));
             let line = format!(

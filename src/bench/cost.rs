@@ -283,9 +283,7 @@ pub const TABLE: &[Formula] = &[
         variants: &[],
         derivation: "per slot covariance 12, opacity 4, depth 4, conic 12, tiles 4 B; for a Gaussian that exists mean 8 B, a \
                      logarithm and 35 operations (support); per row of tiles 40 (the square root of Gaussians times pairs)",
-        work: |c, _| {
-            work(36.0 * c.slots() + 8.0 * c.gaussians, 35.0 * c.gaussians + 40.0 * c.tile_rows(), c.gaussians)
-        },
+        work: |c, _| work(36.0 * c.slots() + 8.0 * c.gaussians, 35.0 * c.gaussians + 40.0 * c.tile_rows(), c.gaussians),
     },
     Formula {
         pass: "render/bin_depth_keys",
@@ -305,11 +303,7 @@ pub const TABLE: &[Formula] = &[
         derivation: "per Gaussian drawn slot 4, first pair 4, tiles 4, mean 8, covariance 12, opacity 4, first pair 4 B, a \
                      logarithm and 35 operations; per row of tiles 40; per pair 12 B and 4 operations",
         work: |c, _| {
-            work(
-                40.0 * c.drawn + 12.0 * c.pairs,
-                35.0 * c.drawn + 40.0 * c.tile_rows() + 4.0 * c.pairs,
-                c.drawn,
-            )
+            work(40.0 * c.drawn + 12.0 * c.pairs, 35.0 * c.drawn + 40.0 * c.tile_rows() + 4.0 * c.pairs, c.drawn)
         },
     },
     Formula {
@@ -328,7 +322,10 @@ pub const TABLE: &[Formula] = &[
         work: |c, d| {
             let depth = if_so(!d.is("color"));
             work(
-                8.0 * c.tiles + 8.0 * c.evaluated + splat_bytes(depth > 0.0) * c.drawn + (12.0 + 8.0 * depth) * c.pixels,
+                8.0 * c.tiles
+                    + 8.0 * c.evaluated
+                    + splat_bytes(depth > 0.0) * c.drawn
+                    + (12.0 + 8.0 * depth) * c.pixels,
                 (25.0 + depth) * c.samples,
                 c.samples,
             )
@@ -391,10 +388,10 @@ pub const TABLE: &[Formula] = &[
                      output 4 B; per slot offset 12 and its gradient 12, Gaussian 48 and its gradients 44 B and 62 operations \
                      (offset 9, opacity 3, colour 9, scale 15, rotation 26)",
         work: |c, d| {
-            let (offset, scaling) =
-                (!d.is("fixed") || d.is("scaling"), !d.is("fixed") || d.is("offset"));
+            let (offset, scaling) = (!d.is("fixed") || d.is("scaling"), !d.is("fixed") || d.is("offset"));
             work(
-                (28.0 + 24.0 * if_so(scaling) + 4.0 * c.rows()) * c.visible + (104.0 + 12.0 * if_so(offset)) * c.slots(),
+                (28.0 + 24.0 * if_so(scaling) + 4.0 * c.rows()) * c.visible
+                    + (104.0 + 12.0 * if_so(offset)) * c.slots(),
                 62.0 * c.slots(),
                 6.0 * c.visible,
             )
@@ -433,11 +430,7 @@ pub const TABLE: &[Formula] = &[
         derivation: "per visible anchor hidden units 384 and 4 B per padded output; 11 K outputs times 33; per chunk of anchors a \
                      second layer written",
         work: |c, _| {
-            work(
-                (384.0 + 4.0 * c.rows()) * c.visible + c.chunks() * c.second_bytes(),
-                11.0 * 33.0 * c.slots(),
-                0.0,
-            )
+            work((384.0 + 4.0 * c.rows()) * c.visible + c.chunks() * c.second_bytes(), 11.0 * 33.0 * c.slots(), 0.0)
         },
     },
     Formula {
@@ -633,9 +626,7 @@ pub const TABLE: &[Formula] = &[
         variants: &[],
         derivation: "per slot tiles 4, opacity 4 B, 3 operations; per Gaussian drawn gradient 8, two sums read and written 16 B, 12 \
                      operations; per visible anchor its number 4, two sums 16 B",
-        work: |c, _| {
-            work(8.0 * c.slots() + 24.0 * c.drawn + 20.0 * c.visible, 3.0 * c.slots() + 12.0 * c.drawn, 0.0)
-        },
+        work: |c, _| work(8.0 * c.slots() + 24.0 * c.drawn + 20.0 * c.visible, 3.0 * c.slots() + 12.0 * c.drawn, 0.0),
     },
     Formula {
         pass: "optimizer/adam",

@@ -61,8 +61,20 @@ impl Counts {
             gradient_scales,
         } = self;
         [
-            anchors, offsets, visible, gaussians, drawn, pairs, evaluated, samples, blended, pixels, tiles, tile_side,
-            tokens, gradient_scales,
+            anchors,
+            offsets,
+            visible,
+            gaussians,
+            drawn,
+            pairs,
+            evaluated,
+            samples,
+            blended,
+            pixels,
+            tiles,
+            tile_side,
+            tokens,
+            gradient_scales,
         ]
     }
 
@@ -108,12 +120,7 @@ pub struct Known {
 }
 
 /// Counts a traced step. The schedule says in which of the sort's two arrays the tiles' lists ended up.
-pub fn count(
-    words: &BTreeMap<&'static str, Vec<u32>>,
-    schedule: &Schedule,
-    method: Method,
-    known: Known,
-) -> Counts {
+pub fn count(words: &BTreeMap<&'static str, Vec<u32>>, schedule: &Schedule, method: Method, known: Known) -> Counts {
     let of = |name: &str| words.get(name).map_or(&[][..], Vec::as_slice);
     let first = |name: &str| of(name).first().copied().unwrap_or(0);
     let visible = first("visible_count");
@@ -184,7 +191,8 @@ impl Lists<'_> {
             .map(|&tile| self.tile([tile % columns, tile / columns], tile, tiling.side(), size, method))
             .reduce(|| [0; 3], |a, b| std::array::from_fn(|i| a[i] + b[i]));
         // By pairs, not by tiles: a tile stands for others as full as it is.
-        let walked: u64 = chosen.iter().map(|&t| self.ranges.get(t as usize).map_or(0, |[a, b]| u64::from(b - a))).sum();
+        let walked: u64 =
+            chosen.iter().map(|&t| self.ranges.get(t as usize).map_or(0, |[a, b]| u64::from(b - a))).sum();
         let scale = if walked > 0 { pairs as f64 / walked as f64 } else { 0.0 };
         sums.map(|sum| sum as f64 * scale)
     }

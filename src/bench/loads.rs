@@ -91,12 +91,12 @@ pub fn sweep(which: Sweep, offsets: u32) -> Vec<Load> {
         Sweep::Anchors => [1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000]
             .map(|anchors| Load { anchors, pairs: 2.0 * gaussians(anchors), size: [640, 360] })
             .into(),
-        Sweep::Pairs => [3e5, 1e6, 3e6, 1e7, 3e7].map(|pairs| Load { anchors: 40_000, pairs, size: [1920, 1080] }).into(),
-        Sweep::Pixels => {
-            [[160, 90], [320, 180], [640, 360], [1280, 720], [1920, 1080], [2560, 1440], [3840, 2160]]
-                .map(|size| Load { anchors: 4_000, pairs: 1e5, size })
-                .into()
+        Sweep::Pairs => {
+            [3e5, 1e6, 3e6, 1e7, 3e7].map(|pairs| Load { anchors: 40_000, pairs, size: [1920, 1080] }).into()
         }
+        Sweep::Pixels => [[160, 90], [320, 180], [640, 360], [1280, 720], [1920, 1080], [2560, 1440], [3840, 2160]]
+            .map(|size| Load { anchors: 4_000, pairs: 1e5, size })
+            .into(),
     }
 }
 
@@ -330,31 +330,30 @@ pub fn exponents(runs: &[LoadFigures], ceilings: &Ceilings) -> Vec<Exponent> {
     all
 }
 
-/// Bytes that a step of this load takes, from its ledger.
-fn rehearse(gpu: &Gpu, settings: &Settings, load: &Load) -> Result<u64, gpu::Error> {
+/// Bytes of device memory that a step of this load takes, at most, with room for so much: from the ledger of a rehearsal.
+fn bytes(gpu: &Gpu, settings: &Settings, load: &Load, capacity: Capacity) -> Result<u64, gpu::Error> {
     let rehearsal = gpu.rehearsal();
-    let scene = load.blank();
-    let plan = Plan::new(&scene, settings);
+    let plan = Plan::new(&load.blank(), settings);
+    let (anchors, offsets) = (load.anchors as usize, settings.model.offsets as usize);
     let anchors = Anchors {
-        position: vec![[0.0; 3]; load.anchors as usize],
-        feature: vec![[0.0; FEATURES]; load.anchors as usize],
-        offset: vec![0.0; load.anchors as usize * 3 * settings.model.offsets as usize],
-        offsets_per_anchor: settings.model.offsets as usize,
-        log_scaling: vec![[0.0; 6]; load.anchors as usize],
+        position: vec![[0.0; 3]; anchors],
+        feature: vec![[0.0; FEATURES]; anchors],
+        offset: vec![0.0; anchors * 3 * offsets],
+        offsets_per_anchor: offsets,
+        log_scaling: vec![[0.0; 6]; anchors],
     };
-    let weights = init::weights(0, settings.model.offsets as usize, plan.attention);
+    let weights = init::weights(0, offsets, plan.attention);
     let number = super::usual_step(&plan, settings, 0);
     let mut step = Step::new(&rehearsal, plan, settings, &anchors, &weights, 1.0)?;
-    step.resize(load.capacity())?;
+    step.resize(capacity)?;
     step.prepare(number)?;
-    Ok(rehearsal.memory().1)
+    Ok(rehearsal.memory().0)
 }
 
 impl Load {
     /// The scene without its pictures' contents: for rehearsals.
     fn blank(&self) -> Scene {
-        let small = Load { size: [8, 8], ..*self }.scene();
-        let mut scene = small;
+        let mut scene = Load { size: [8, 8], ..*self }.scene();
         scene.train[0].camera = self.camera();
         scene
     }
@@ -367,38 +366,21 @@ impl Load {
 pub fn memory(gpu: &Gpu, settings: &Settings) -> Result<Memory, gpu::Error> {
     // Differences of what is large enough for the allocator's granularity not to matter.
     let base = Load { anchors: 40_000, pairs: 4e5, size: [320, 180] };
-    let bytes = |load: &Load, capacity: &dyn Fn(&mut Capacity)| {
-        let rehearsal = gpu.rehearsal();
-        let scene = load.blank();
-        let plan = Plan::new(&scene, settings);
-        let offsets = settings.model.offsets as usize;
-        let anchors = Anchors {
-            position: vec![[0.0; 3]; load.anchors as usize],
-            feature: vec![[0.0; FEATURES]; load.anchors as usize],
-            offset: vec![0.0; load.anchors as usize * 3 * offsets],
-            offsets_per_anchor: offsets,
-            log_scaling: vec![[0.0; 6]; load.anchors as usize],
-        };
-        let weights = init::weights(0, offsets, plan.attention);
-        let number = super::usual_step(&plan, settings, 0);
-        let mut step = Step::new(&rehearsal, plan, settings, &anchors, &weights, 1.0)?;
-        let mut wanted = base.capacity();
-        wanted.anchors = load.anchors;
-        capacity(&mut wanted);
-        step.resize(wanted)?;
-        step.prepare(number)?;
-        Ok::<_, gpu::Error>(rehearsal.memory().0 as f64)
+    let of = |load: &Load, change: &dyn Fn(&mut Capacity)| {
+        let mut capacity = Capacity { anchors: load.anchors, ..base.capacity() };
+        change(&mut capacity);
+        Ok::<_, gpu::Error>(bytes(gpu, settings, load, capacity)? as f64)
     };
     let same = |_: &mut Capacity| {};
-    let first = bytes(&base, &same)?;
+    let first = of(&base, &same)?;
     let more = Load { anchors: 2 * base.anchors, ..base };
     let larger = Load { size: [640, 180], ..base };
     let visible = base.visible();
     Ok(Memory {
-        per_anchor: (bytes(&more, &same)? - first) / f64::from(base.anchors),
-        per_visible: (bytes(&base, &|c| c.visible += visible)? - first) / f64::from(visible),
-        per_pair: (bytes(&base, &|c| c.pairs += 400_000)? - first) / 4e5,
-        per_pixel: (bytes(&larger, &same)? - first) / (320.0 * 180.0),
+        per_anchor: (of(&more, &same)? - first) / f64::from(base.anchors),
+        per_visible: (of(&base, &|c| c.visible += visible)? - first) / f64::from(visible),
+        per_pair: (of(&base, &|c| c.pairs += 400_000)? - first) / 4e5,
+        per_pixel: (of(&larger, &same)? - first) / (320.0 * 180.0),
     })
 }
 
@@ -416,10 +398,8 @@ pub fn measure(
     super::ensure_timestamps(gpu)?;
     let started = Instant::now();
     let (mut runs, mut left_out): (Vec<LoadFigures>, Vec<LeftOut>) = (vec![], vec![]);
-    let mut sweeps: Vec<(Sweep, std::vec::IntoIter<Load>, Option<(f64, f64)>)> = Sweep::ALL
-        .into_iter()
-        .map(|which| (which, sweep(which, settings.model.offsets).into_iter(), None))
-        .collect();
+    let mut sweeps: Vec<(Sweep, std::vec::IntoIter<Load>, Option<(f64, f64)>)> =
+        Sweep::ALL.into_iter().map(|which| (which, sweep(which, settings.model.offsets).into_iter(), None)).collect();
     // The next of each in turn, so that a short time leaves something of all.
     while sweeps.iter().any(|(_, loads, _)| !loads.as_slice().is_empty()) {
         for (which, loads, last) in &mut sweeps {
@@ -437,7 +417,7 @@ pub fn measure(
                 leave(format!("it would take about {expected:.0} s of the {:.0} s left", rest.max(0.0)));
                 continue;
             }
-            match rehearse(gpu, settings, &load) {
+            match bytes(gpu, settings, &load, load.capacity()) {
                 Err(error @ (gpu::Error::TooLarge { .. } | gpu::Error::OutOfMemory { .. })) => {
                     leave(error.to_string());
                     continue;
@@ -474,6 +454,17 @@ pub fn measure(
     Ok(Loads { seconds, runs, left_out, exponents, memory: memory(gpu, settings)? })
 }
 
+/// The load on the device, under settings that may be another choice's.
+pub(super) fn furnish(gpu: &Gpu, settings: &Settings, load: &Load) -> Result<Bench, Error> {
+    let scene = load.scene();
+    let plan = Plan::new(&scene, settings);
+    let number = super::usual_step(&plan, settings, 0);
+    let photographs = Rc::new(photographs::upload(gpu, &scene, &plan, 1)?);
+    let warm = load.warm(gpu, settings, plan.attention)?;
+    let variant = Variant { name: String::new(), changes: vec![], settings: settings.clone() };
+    Bench::new(gpu, &scene, &variant, plan, photographs, &warm, number)
+}
+
 /// Measures one load.
 fn one(
     gpu: &Gpu,
@@ -482,14 +473,7 @@ fn one(
     repetitions: usize,
     load: &Load,
 ) -> Result<StepFigures, Error> {
-    let scene = load.scene();
-    let plan = Plan::new(&scene, settings);
-    let number = super::usual_step(&plan, settings, 0);
-    let photographs = Rc::new(photographs::upload(gpu, &scene, &plan, 1)?);
-    let warm = load.warm(gpu, settings, plan.attention)?;
-    let variant = Variant { name: String::new(), changes: vec![], settings: settings.clone() };
-    let mut bench = Bench::new(gpu, &scene, &variant, plan, photographs, &warm, number)?;
-    drop(warm);
+    let mut bench = furnish(gpu, settings, load)?;
     step::measure(gpu, &mut bench, settings, ceilings, repetitions)
 }
 

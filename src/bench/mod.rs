@@ -3,15 +3,20 @@
 //! [`ceilings`] measures what the device gives at most; [`cost`] says what every pass has to do, from the numbers that
 //! [`counts`] reads back from a traced step; [`step`] times the step beside it. [`loads`] generates scenes of chosen sizes
 //! and fits how every pass grows; [`tune`] runs the choices that exist as data. [`compare`] sets one record against
-//! another, [`text`] and [`tables`] write them down.
+//! another, [`text`], [`tables`] and [`figures`] write them down.
 
 pub mod ceilings;
 pub mod compare;
 pub mod cost;
 pub mod counts;
+pub mod figures;
+pub mod loads;
 pub mod step;
 pub mod tables;
 pub mod text;
+pub mod tune;
+
+use std::rc::Rc;
 
 use serde::{Deserialize, Serialize};
 
@@ -72,6 +77,12 @@ pub struct Record {
     /// A step on the scene.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub step: Option<step::StepFigures>,
+    /// Generated loads.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub loads: Option<loads::Loads>,
+    /// Choices of shapes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tune: Option<Vec<tune::ChoiceFigures>>,
 }
 
 impl Record {
@@ -79,19 +90,6 @@ impl Record {
     pub fn to_json(&self) -> String {
         serde_json::to_string_pretty(self).expect("plain numbers and strings") + "\n"
     }
-}
-
-/// How much is measured of a scene.
-#[derive(Clone, Copy, Debug)]
-pub struct Options {
-    /// Steps trained before.
-    pub warm_up: u32,
-    /// The number that the measured step counts as; nothing: [`usual_step`].
-    pub step: Option<u32>,
-    /// Views, the reference view among them if there is one.
-    pub views: usize,
-    /// Timed rounds.
-    pub repetitions: usize,
 }
 
 /// The first step behind the warm-up that has attention, if the plan has it, and does not search everything for values
@@ -114,29 +112,79 @@ pub fn ensure_timestamps(gpu: &Gpu) -> Result<(), Error> {
     Err(Error::NoTimestamps { device: gpu.info().name.clone() })
 }
 
-/// Trains the scene for the warm-up, with growing and pruning as set, and measures a step of what is there then.
+/// A scene and the model behind the warm-up.
+pub struct Trained<'a> {
+    scene: &'a Scene,
+    subset: Scene,
+    warm: Warm,
+    number: u32,
+}
+
+impl<'a> Trained<'a> {
+    /// Trains the scene for so many steps, with growing and pruning as set. `number` is what the measured step counts as,
+    /// on so many views.
+    ///
+    /// # Errors
+    /// When the device has no room.
+    pub fn new(
+        gpu: &Gpu,
+        scene: &'a Scene,
+        settings: &Settings,
+        warm_up: u32,
+        (number, views): (u32, usize),
+        say: &mut dyn FnMut(&str),
+    ) -> Result<Self, Error> {
+        say(&format!("bench: {warm_up} steps of warm-up"));
+        let warm = Warm::train(gpu, scene, settings, warm_up)?;
+        Ok(Self { scene, subset: choose_views(scene, views), warm, number })
+    }
+
+    /// The step on the device.
+    fn furnish(&self, gpu: &Gpu, settings: &Settings) -> Result<Bench, Error> {
+        let plan = Plan::new(self.scene, settings);
+        let photographs = Rc::new(photographs::upload(gpu, &self.subset, &plan, 1)?);
+        let variant = Variant { name: String::new(), changes: vec![], settings: settings.clone() };
+        Bench::new(gpu, self.scene, &variant, plan, photographs, &self.warm, self.number)
+    }
+
+    /// Measures the step in so many rounds.
+    ///
+    /// # Errors
+    /// When the device has no room, or no timestamps.
+    pub fn measure(
+        &self,
+        gpu: &Gpu,
+        settings: &Settings,
+        ceilings: &ceilings::Ceilings,
+        repetitions: usize,
+        say: &mut dyn FnMut(&str),
+    ) -> Result<step::StepFigures, Error> {
+        ensure_timestamps(gpu)?;
+        let mut bench = self.furnish(gpu, settings)?;
+        say(&format!("bench: step {}, {repetitions} rounds", self.number));
+        step::measure(gpu, &mut bench, settings, ceilings, repetitions)
+    }
+}
+
+/// The load that shapes are judged by where there is no scene.
+const TUNED: loads::Load = loads::Load { anchors: 40_000, pairs: 5e5, size: [640, 360] };
+
+/// Runs the choices of shapes, on a scene or on a generated load.
 ///
 /// # Errors
 /// When the device has no room, or no timestamps.
-pub fn scene(
+pub fn tune(
     gpu: &Gpu,
-    scene: &Scene,
+    trained: Option<&Trained<'_>>,
     settings: &Settings,
-    ceilings: &ceilings::Ceilings,
-    options: Options,
+    repetitions: usize,
     say: &mut dyn FnMut(&str),
-) -> Result<step::StepFigures, Error> {
-    ensure_timestamps(gpu)?;
-    say(&format!("bench: {} steps of warm-up", options.warm_up));
-    let warm = Warm::train(gpu, scene, settings, options.warm_up)?;
-    let plan = Plan::new(scene, settings);
-    let number = options.step.unwrap_or_else(|| usual_step(&plan, settings, options.warm_up));
-    let subset = choose_views(scene, options.views);
-    let photographs = std::rc::Rc::new(photographs::upload(gpu, &subset, &plan, 1)?);
-    let variant = Variant { name: String::new(), changes: vec![], settings: settings.clone() };
-    let mut bench = Bench::new(gpu, scene, &variant, plan, photographs, &warm, number)?;
-    say(&format!("bench: step {number}, {} rounds", options.repetitions));
-    step::measure(gpu, &mut bench, settings, ceilings, options.repetitions)
+) -> Result<Vec<tune::ChoiceFigures>, Error> {
+    let mut make = |settings: &Settings| match trained {
+        Some(trained) => trained.furnish(gpu, settings),
+        None => loads::furnish(gpu, settings, &TUNED),
+    };
+    tune::measure(gpu, settings, repetitions, &mut make, say)
 }
 
 #[cfg(test)]

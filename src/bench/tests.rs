@@ -59,7 +59,8 @@ pub(super) fn record() -> Record {
     let spread = |median: f64| Spread::of(&[0.9 * median, median, 1.2 * median]);
     let ceilings = Ceilings {
         copy_f32: spread(2.0),
-        copy_vec4: spread(4.0),
+        copy_vec4: spread(3.0),
+        copy_cached: spread(4.0),
         fma: spread(10.0),
         exp: spread(2.5),
         dispatch: spread(10.0),
@@ -85,13 +86,7 @@ pub(super) fn record() -> Record {
         passes: vec![
             pass("render/rasterize_backward_narrow", 8.0),
             pass("optimizer/adam", 4.0),
-            PassFigures {
-                work: None,
-                floor: None,
-                bound: None,
-                ratio: None,
-                ..pass("render/unheard_of", 1.0)
-            },
+            PassFigures { work: None, floor: None, bound: None, ratio: None, ..pass("render/unheard_of", 1.0) },
         ],
         barriers: 2.0,
         between: spread(0.5),
@@ -125,6 +120,8 @@ pub(super) fn record() -> Record {
         warm_up: 50,
         ceilings,
         step: Some(step),
+        loads: None,
+        tune: None,
     }
 }
 
@@ -133,7 +130,8 @@ fn floors_are_the_longest_of_three() {
     let ceilings = record().ceilings;
     let of = |bytes, operations, exponentials| floor(&cost::Work { bytes, operations, exponentials }, 2.0, &ceilings);
     // 4 GB/s, 10 G/s, 2.5 G/s; two dispatches of 10 us.
-    let close = |(ms, by): (f64, Bound), want: f64, bound| assert!((ms - want).abs() < 1e-9 && by == bound, "{ms} {by:?}");
+    let close =
+        |(ms, by): (f64, Bound), want: f64, bound| assert!((ms - want).abs() < 1e-9 && by == bound, "{ms} {by:?}");
     close(of(8e6, 1e6, 1e5), 2.02, Bound::Memory);
     close(of(8e6, 30e6, 1e5), 3.02, Bound::Operations);
     close(of(8e6, 30e6, 10e6), 4.02, Bound::Exponentials);

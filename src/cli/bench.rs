@@ -5,12 +5,13 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, bail};
 
 use super::report::{command_line, last_part};
-use super::shared::{DeviceArgs, SceneArgs, with_gpu};
+use super::shared::{DeviceArgs, SceneArgs, load_scene, with_gpu};
 use crate::bench::compare::{self, Subject};
-use crate::bench::{self, Device, Record, ceilings, tables, text};
+use crate::bench::{self, Device, Record, Trained, ceilings, figures, loads, tables, text};
+use crate::config::SettingsArgs;
 use crate::gpu::{Gpu, Options};
-use crate::report::SceneFacts;
 use crate::report::tables::write;
+use crate::report::{SceneFacts, plots};
 use crate::train::plan::Plan;
 
 /// Measure every pass of a step against the time it would take at the device's own ceilings
@@ -20,15 +21,33 @@ use crate::train::plan::Plan;
 /// pass, beside what it has to do by the numbers read back from it: bytes, operations, exponentials. A ratio of 1 is the
 /// floor; below it the arrays stay in a cache.
 ///
-/// With --out writes bench.json and passes.csv.
+/// With --loads generated scenes of 1e3 to 1e6 anchors, 160 x 90 to 3840 x 2160 pixels and up to 3e7 pairs are measured
+/// instead, and how every pass grows with them. With --tune the choices of tile and group shapes are run in turn, on
+/// the scene or on a generated load, and the best printed as a table for the source.
+///
+/// With --out writes bench.json, the tables as CSV and the plots as SVG.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   gscream-vk bench synthetic --preset demo
   gscream-vk bench garden --preset lavapipe --warm-up 200 --repetitions 15 --out before
-  gscream-vk bench garden --preset lavapipe --warm-up 200 --repetitions 15 --against before/bench.json")]
+  gscream-vk bench garden --preset lavapipe --warm-up 200 --repetitions 15 --against before/bench.json
+  gscream-vk bench --loads --seconds 600 --preset lavapipe --out loads
+  gscream-vk bench --tune --preset lavapipe")]
 pub(super) struct Args {
+    /// Folder of the scene, or the word `synthetic` for the built-in one
+    #[arg(value_name = "SCENE", required_unless_present_any = ["loads", "tune"])]
+    scene: Option<PathBuf>,
     #[command(flatten)]
-    scene: SceneArgs,
+    settings: SettingsArgs,
+    /// Measure generated scenes of growing size
+    #[arg(long, conflicts_with_all = ["scene", "tune"])]
+    loads: bool,
+    /// Seconds that they may take; what does not fit is named
+    #[arg(long, value_name = "S", default_value_t = 120.0, requires = "loads", value_parser = seconds)]
+    seconds: f64,
+    /// Run the choices of tile and group shapes
+    #[arg(long)]
+    tune: bool,
     /// Folder for bench.json and the tables; must not hold a record already
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
@@ -64,40 +83,65 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         bail!("{}: holds a record already: choose another --out, or --overwrite", out.display());
     }
     let old = args.against.as_deref().map(|path| Ok::<_, compare::Error>((path, compare::read(path)?))).transpose()?;
-    let (scene, settings) = args.scene.load()?;
-    let facts = SceneFacts::new(last_part(&args.scene.name()), &scene);
+    let settings = args.settings.resolve()?;
+    let loaded = args
+        .scene
+        .clone()
+        .map(|scene| {
+            let args = SceneArgs { scene, settings: args.settings.clone() };
+            let scene = load_scene(&args.scene, &settings)?;
+            let facts = SceneFacts::new(last_part(&args.name()), &scene);
+            Ok::<_, anyhow::Error>((scene, facts))
+        })
+        .transpose()?;
+    let (scene, facts) = loaded.map_or((None, None), |(scene, facts)| (Some(scene), Some(facts)));
     let json = serde_json::to_value(&settings).context("the settings as JSON")?;
-    let plan = Plan::new(&scene, &settings);
-    let step = args.step.unwrap_or_else(|| bench::usual_step(&plan, &settings, args.warm_up));
+    let number =
+        |scene| args.step.unwrap_or_else(|| bench::usual_step(&Plan::new(scene, &settings), &settings, args.warm_up));
+    let step = scene.as_ref().map(number);
+    let repetitions = args.repetitions as usize;
     let mut say = |line: &str| eprintln!("{line}");
     let options = Options { timestamps: true, ..args.device.options() };
     let (record, notes) = with_gpu(&options, |gpu| {
         bench::ensure_timestamps(gpu)?;
         let device = Device::from(gpu.info());
-        let subject =
-            Subject { device: &device, scene: Some(&facts), settings: &json, warm_up: args.warm_up, step: Some(step) };
+        let subject = Subject { device: &device, scene: facts.as_ref(), settings: &json, warm_up: args.warm_up, step };
         let notes = old
             .as_ref()
             .map(|(path, old)| compare::ensure_comparable(path, old, subject))
             .transpose()?
             .unwrap_or_default();
-        let ceilings = measure_ceilings(gpu, args.repetitions as usize, &mut say)?;
-        let options = bench::Options {
-            warm_up: args.warm_up,
-            step: Some(step),
-            views: args.views as usize,
-            repetitions: args.repetitions as usize,
+        let ceilings = measure_ceilings(gpu, repetitions, &mut say)?;
+        let trained = scene
+            .as_ref()
+            .zip(step)
+            .map(|(scene, step)| {
+                Trained::new(gpu, scene, &settings, args.warm_up, (step, args.views as usize), &mut say)
+            })
+            .transpose()?;
+        let figures = match &trained {
+            Some(trained) => Some(trained.measure(gpu, &settings, &ceilings, repetitions, &mut say)?),
+            None => None,
         };
-        let figures = bench::scene(gpu, &scene, &settings, &ceilings, options, &mut say)?;
+        let loads = match args.loads {
+            true => Some(loads::measure(gpu, &settings, &ceilings, (repetitions, args.seconds), &mut say)?),
+            false => None,
+        };
+        let tune = match args.tune {
+            true => Some(bench::tune(gpu, trained.as_ref(), &settings, repetitions, &mut say)?),
+            false => None,
+        };
         let record = Record {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             command: command_line(),
             device,
             settings: json.clone(),
-            scene: Some(facts.clone()),
+            scene: facts.clone(),
             warm_up: args.warm_up,
             ceilings,
-            step: Some(figures),
+            step: figures,
+            loads,
+            tune,
         };
         Ok((record, notes))
     })?;
@@ -112,11 +156,12 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn measure_ceilings(
-    gpu: &Gpu,
-    repetitions: usize,
-    say: &mut dyn FnMut(&str),
-) -> anyhow::Result<ceilings::Ceilings> {
+fn seconds(text: &str) -> Result<f64, String> {
+    let seconds: f64 = text.parse().map_err(|_| "not a number of seconds".to_owned())?;
+    if seconds.is_finite() && seconds >= 0.0 { Ok(seconds) } else { Err("must be 0 or more".to_owned()) }
+}
+
+fn measure_ceilings(gpu: &Gpu, repetitions: usize, say: &mut dyn FnMut(&str)) -> anyhow::Result<ceilings::Ceilings> {
     say("bench: ceilings of the device");
     ceilings::measure(gpu, repetitions).map_err(|e| crate::report::Error::Gpu(e).into())
 }
@@ -126,6 +171,12 @@ fn write_files(record: &Record, out: &Path) -> anyhow::Result<Vec<&'static str>>
     let mut files: Vec<(&'static str, Vec<u8>)> = vec![];
     if let Some(step) = &record.step {
         files.push(("passes.csv", tables::passes(step)));
+        files.push(("passes.svg", plots::draw(&figures::passes(step))?.into_bytes()));
+    }
+    if let Some(loads) = record.loads.as_ref().filter(|loads| !loads.runs.is_empty()) {
+        files.push(("loads.csv", tables::loads(loads)));
+        files.push(("exponents.csv", tables::exponents(loads)));
+        files.push(("loads.svg", plots::draw(&figures::loads(loads))?.into_bytes()));
     }
     // Last: its presence says that the record is complete.
     files.push((JSON, record.to_json().into_bytes()));

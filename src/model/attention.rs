@@ -269,7 +269,7 @@ impl Pair<'_> {
 pub struct Attention {
     capacity: u32,
     /// Many tokens per thread: right where loads are dear and registers are memory anyway, on a CPU.
-    wide: bool,
+    pub(crate) wide: bool,
     sides: [Side; 2],
     partial: Buffer<[f32; 4]>,
     skip: Buffer<u32>,

@@ -501,10 +501,7 @@ pub(crate) struct Clocked {
     pub(crate) host: [Duration; 3],
 }
 
-fn take_trace(
-    mut submission: Submission<'_>,
-    _: [Instant; 3],
-) -> Result<BTreeMap<&'static str, Vec<u32>>, gpu::Error> {
+fn take_trace(mut submission: Submission<'_>, _: [Instant; 3]) -> Result<BTreeMap<&'static str, Vec<u32>>, gpu::Error> {
     let words = std::mem::take(&mut submission.trace);
     submission.wait()?;
     Ok(words)
