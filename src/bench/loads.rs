@@ -106,6 +106,15 @@ const OPACITY: f64 = 0.03;
 const DEPTHS: [f64; 2] = [2.0, 6.0];
 
 impl Load {
+    /// How much there is of what a sweep varies.
+    fn quantity(&self, sweep: Sweep) -> f64 {
+        match sweep {
+            Sweep::Anchors => f64::from(self.anchors),
+            Sweep::Pairs => self.pairs,
+            Sweep::Pixels => f64::from(self.size[0]) * f64::from(self.size[1]),
+        }
+    }
+
     /// Anchors in view.
     pub fn visible(&self) -> u32 {
         (self.anchors / 4).max(1)
@@ -384,6 +393,20 @@ pub fn memory(gpu: &Gpu, settings: &Settings) -> Result<Memory, gpu::Error> {
     })
 }
 
+/// What is left of a sweep.
+struct Queue {
+    sweep: Sweep,
+    loads: std::vec::IntoIter<Load>,
+    /// Seconds that the last load took per unit of what is varied.
+    per_unit: f64,
+}
+
+impl Queue {
+    fn new(which: Sweep, settings: &Settings) -> Self {
+        Self { sweep: which, loads: sweep(which, settings.model.offsets).into_iter(), per_unit: 0.0 }
+    }
+}
+
 /// Measures the loads of all sweeps, from the smallest of each, for so many seconds.
 ///
 /// # Errors
@@ -398,23 +421,21 @@ pub fn measure(
     super::ensure_timestamps(gpu)?;
     let started = Instant::now();
     let (mut runs, mut left_out): (Vec<LoadFigures>, Vec<LeftOut>) = (vec![], vec![]);
-    let mut sweeps: Vec<(Sweep, std::vec::IntoIter<Load>, Option<(f64, f64)>)> =
-        Sweep::ALL.into_iter().map(|which| (which, sweep(which, settings.model.offsets).into_iter(), None)).collect();
+    let mut queues: Vec<Queue> = Sweep::ALL.into_iter().map(|sweep| Queue::new(sweep, settings)).collect();
     // The next of each in turn, so that a short time leaves something of all.
-    while sweeps.iter().any(|(_, loads, _)| !loads.as_slice().is_empty()) {
-        for (which, loads, last) in &mut sweeps {
+    while queues.iter().any(|queue| !queue.loads.as_slice().is_empty()) {
+        for Queue { sweep, loads, per_unit } in &mut queues {
             let Some(load) = loads.next() else { continue };
-            let mut leave = |why: String| left_out.push(LeftOut { sweep: *which, load, why });
-            let size = match which {
-                Sweep::Anchors => f64::from(load.anchors),
-                Sweep::Pairs => load.pairs,
-                Sweep::Pixels => f64::from(load.size[0]) * f64::from(load.size[1]),
-            };
+            let mut leave = |why: String| left_out.push(LeftOut { sweep: *sweep, load, why });
             // No load takes longer than in proportion to the one before.
-            let expected = last.map_or(0.0, |(seconds, before)| seconds * size / before);
+            let expected = *per_unit * load.quantity(*sweep);
             let rest = seconds - started.elapsed().as_secs_f64();
-            if expected > rest || rest <= 0.0 {
-                leave(format!("it would take about {expected:.0} s of the {:.0} s left", rest.max(0.0)));
+            if rest <= 0.0 {
+                leave(format!("nothing is left of the {seconds} s"));
+                continue;
+            }
+            if expected > rest {
+                leave(format!("it would take about {expected:.0} s, and {rest:.0} s are left"));
                 continue;
             }
             match bytes(gpu, settings, &load, load.capacity()) {
@@ -438,8 +459,8 @@ pub fn measure(
             let begun = Instant::now();
             match one(gpu, settings, ceilings, repetitions, &load) {
                 Ok(step) => {
-                    *last = Some((begun.elapsed().as_secs_f64(), size));
-                    runs.push(LoadFigures { sweep: *which, load, step });
+                    *per_unit = begun.elapsed().as_secs_f64() / load.quantity(*sweep);
+                    runs.push(LoadFigures { sweep: *sweep, load, step });
                 }
                 Err(Error::Gpu(error @ (gpu::Error::TooLarge { .. } | gpu::Error::OutOfMemory { .. }))) => {
                     leave(error.to_string());
