@@ -1,7 +1,8 @@
 //! What the device gives at most: the ceilings under which every pass is judged.
 //!
-//! Each is a kernel that does one thing only, timed by timestamp queries in rounds in which every one has its turn. Work
-//! grows until one run takes [`LONG_ENOUGH`], so that neither a fast nor a slow device is measured by its clock's ticks.
+//! Each is a kernel that does one thing only, timed by timestamp queries in rounds in which every one has its turn, and
+//! what is measured beside them too. Work grows until one run takes [`LONG_ENOUGH`], so that neither a fast nor a slow
+//! device is measured by its clock's ticks. Whatever else the machine does only takes away: floors are of the best round.
 
 use serde::{Deserialize, Serialize};
 
@@ -92,7 +93,23 @@ pub struct Ceilings {
 impl Ceilings {
     /// The best of the copies, 1e9 bytes per second: what a pass finds in a cache is a floor too.
     pub fn bandwidth(&self) -> f64 {
-        self.copy_f32.median.max(self.copy_vec4.median).max(self.copy_cached.median)
+        self.copy_f32.max.max(self.copy_vec4.max).max(self.copy_cached.max)
+    }
+
+    /// Milliseconds that so many bytes, operations and exponentials take, each at its ceiling.
+    pub fn milliseconds(&self, bytes: f64, operations: f64, exponentials: f64) -> [f64; 3] {
+        // 1e9 per second are 1e6 per millisecond.
+        [bytes / self.bandwidth(), operations / self.fma.max, exponentials / self.exp.max].map(|time| time * 1e-6)
+    }
+
+    /// Milliseconds of an empty dispatch between its timestamps.
+    pub fn dispatching(&self) -> f64 {
+        self.dispatch.min * 1e-3
+    }
+
+    /// Milliseconds of a barrier. Its rounds are differences, whose smallest is the noise's: the lower quartile.
+    pub fn waiting(&self) -> f64 {
+        self.barrier.lower * 1e-3
     }
 
     /// Every ceiling: what it is, its unit, its value.
@@ -202,52 +219,81 @@ fn calibrate(mut run: impl FnMut(u32) -> Result<f64, Error>) -> Result<u32, Erro
     Ok(rounds)
 }
 
-/// Measures all ceilings of a device that has timestamps, in so many rounds.
-///
-/// # Errors
-/// When the device has no room for the arrays.
-pub fn measure(gpu: &Gpu, repetitions: usize) -> Result<Ceilings, Error> {
-    let probe = Probe::new(gpu)?;
-    let fmas = calibrate(|rounds| probe.fma(rounds))?;
-    let exps = calibrate(|rounds| probe.exp(rounds))?;
-    let (all_of_it, few) = (probe.from.len(), probe.from.len().min((CACHED / 4) as usize));
-    probe.copy(false, all_of_it)?;
-    probe.copy(true, all_of_it)?;
-    probe.copy(true, few)?;
-    probe.empty(false)?;
-    probe.empty(true)?;
-    let bytes = |floats: usize| 8.0 * floats as f64;
-    let per_thread = |rounds: u32, each: u32| f64::from(THREADS) * f64::from(rounds) * f64::from(each);
-    let mut all: [Vec<f64>; 8] = Default::default();
-    for _ in 0..repetitions.max(1) {
+/// The stage that the ceilings' own arrays belong to.
+pub const STAGE: &str = "ceilings";
+
+/// Measures ceilings, a round at a time.
+pub struct Prober<'g> {
+    probe: Probe<'g>,
+    fmas: u32,
+    exps: u32,
+    /// Floats copied in one go.
+    few: usize,
+    rounds: [Vec<f64>; 8],
+}
+
+impl<'g> Prober<'g> {
+    /// On a device that has timestamps: finds out how much work takes long enough.
+    ///
+    /// # Errors
+    /// When the device has no room for the arrays.
+    pub fn new(gpu: &'g Gpu) -> Result<Self, Error> {
+        let probe = gpu.stage(STAGE, || Probe::new(gpu))?;
+        let fmas = calibrate(|rounds| probe.fma(rounds))?;
+        let exps = calibrate(|rounds| probe.exp(rounds))?;
+        let few = probe.from.len().min((CACHED / 4) as usize);
+        probe.copy(false, probe.from.len())?;
+        probe.copy(true, probe.from.len())?;
+        probe.copy(true, few)?;
+        probe.empty(false)?;
+        probe.empty(true)?;
+        Ok(Self { probe, fmas, exps, few, rounds: Default::default() })
+    }
+
+    /// One round.
+    ///
+    /// # Errors
+    /// When the device is lost.
+    pub fn round(&mut self) -> Result<(), Error> {
+        let Self { probe, fmas, exps, few, .. } = self;
+        let bytes = |floats: usize| 8.0 * floats as f64;
+        let per_thread = |rounds: u32, each: u32| f64::from(THREADS) * f64::from(rounds) * f64::from(each);
         let empty = probe.empty(false)?;
         let behind_barriers = probe.empty(true)?;
-        // Of the passes in between: the first one starts while nothing else runs.
         let spacing = |passes: &[Timing]| {
             let starts: Vec<f64> = passes.windows(2).map(|pair| (pair[1].start - pair[0].start) * 1e-3).collect();
-            if starts.is_empty() { 0.0 } else { Spread::of(&starts).median }
+            Spread::of(&starts).median
         };
         let durations: Vec<f64> = empty.iter().map(|pass| pass.duration * 1e-3).collect();
         let dispatch = Spread::of(&durations).median;
-        let cached = probe.copy(true, few)?;
+        let all_of_it = probe.from.len();
+        let cached = probe.copy(true, *few)?;
         let values = [
             bytes(all_of_it) / probe.copy(false, all_of_it)?,
             bytes(all_of_it) / probe.copy(true, all_of_it)?,
             // A dispatch that was slow just then must not take all of it.
-            bytes(few) / (cached - dispatch * 1e3).max(0.25 * cached),
-            per_thread(fmas, FMAS) / probe.fma(fmas)?,
-            per_thread(exps, EXPS) / probe.exp(exps)?,
+            bytes(*few) / (cached - dispatch * 1e3).max(0.5 * cached),
+            per_thread(*fmas, FMAS) / probe.fma(*fmas)?,
+            per_thread(*exps, EXPS) / probe.exp(*exps)?,
             dispatch,
             spacing(&empty),
             (spacing(&behind_barriers) - spacing(&empty)).max(0.0),
         ];
-        for (list, value) in all.iter_mut().zip(values) {
+        for (list, value) in self.rounds.iter_mut().zip(values) {
             list.push(value);
         }
+        Ok(())
     }
-    let [copy_f32, copy_vec4, copy_cached, fma, exp, dispatch, spacing, barrier] =
-        all.map(|values| Spread::of(&values));
-    Ok(Ceilings { copy_f32, copy_vec4, copy_cached, fma, exp, dispatch, spacing, barrier })
+
+    /// What the rounds so far say.
+    ///
+    /// # Panics
+    /// Without a round.
+    pub fn ceilings(&self) -> Ceilings {
+        let [copy_f32, copy_vec4, copy_cached, fma, exp, dispatch, spacing, barrier] =
+            self.rounds.each_ref().map(|values| Spread::of(values));
+        Ceilings { copy_f32, copy_vec4, copy_cached, fma, exp, dispatch, spacing, barrier }
+    }
 }
 
 #[cfg(test)]
@@ -293,11 +339,14 @@ mod tests {
             println!("skipped: {} has no timestamps", gpu.info().name);
             return;
         }
-        let ceilings = measure(&gpu, 2).expect("the device has room");
+        let mut prober = Prober::new(&gpu).expect("the device has room");
+        (0..2).for_each(|_| prober.round().expect("the device is there"));
+        let ceilings = prober.ceilings();
         for (name, unit, spread) in ceilings.rows() {
             assert!(spread.median.is_finite() && spread.repetitions == 2, "{name}: {spread:?} {unit}");
             assert!(spread.min > 0.0 || name.starts_with("barrier"), "{name}: {spread:?} {unit}");
         }
-        assert!(ceilings.bandwidth() >= ceilings.copy_f32.median);
+        assert!(ceilings.bandwidth() >= ceilings.copy_f32.max);
+        assert_eq!(gpu.stages()[STAGE].0, 4 + DISPATCHES);
     }
 }

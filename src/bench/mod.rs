@@ -147,7 +147,7 @@ impl<'a> Trained<'a> {
         Bench::new(gpu, self.scene, &variant, plan, photographs, &self.warm, self.number)
     }
 
-    /// Measures the step in so many rounds.
+    /// Measures the step in so many rounds, each with one of the device's ceilings.
     ///
     /// # Errors
     /// When the device has no room, or no timestamps.
@@ -155,14 +155,18 @@ impl<'a> Trained<'a> {
         &self,
         gpu: &Gpu,
         settings: &Settings,
-        ceilings: &ceilings::Ceilings,
+        prober: &mut ceilings::Prober<'_>,
         repetitions: usize,
         say: &mut dyn FnMut(&str),
     ) -> Result<step::StepFigures, Error> {
         ensure_timestamps(gpu)?;
         let mut bench = self.furnish(gpu, settings)?;
         say(&format!("bench: step {}, {repetitions} rounds", self.number));
-        step::measure(gpu, &mut bench, settings, ceilings, repetitions)
+        let mut ceilings = || {
+            prober.round()?;
+            Ok(prober.ceilings())
+        };
+        step::measure(gpu, &mut bench, settings, &mut ceilings, repetitions)
     }
 }
 

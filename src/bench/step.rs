@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::ceilings::{Ceilings, span};
+use super::ceilings::{Ceilings, STAGE, span};
 use super::cost::{self, Dispatch, Work};
 use super::counts::{self, Counts, Known};
 use crate::config::Settings;
@@ -42,14 +42,10 @@ impl Bound {
 
 /// Milliseconds that work takes at the ceilings, in so many dispatches, and what holds it back.
 pub fn floor(work: &Work, dispatches: f64, ceilings: &Ceilings) -> (f64, Bound) {
-    // 1e9 per second are 1e6 per millisecond.
-    let times = [
-        (work.bytes / ceilings.bandwidth() * 1e-6, Bound::Memory),
-        (work.operations / ceilings.fma.median * 1e-6, Bound::Operations),
-        (work.exponentials / ceilings.exp.median * 1e-6, Bound::Exponentials),
-    ];
+    let [memory, operations, exponentials] = ceilings.milliseconds(work.bytes, work.operations, work.exponentials);
+    let times = [(memory, Bound::Memory), (operations, Bound::Operations), (exponentials, Bound::Exponentials)];
     let (most, bound) = times.into_iter().fold((0.0, Bound::Dispatch), |a, b| if b.0 > a.0 { b } else { a });
-    let dispatching = dispatches * ceilings.dispatch.median * 1e-3;
+    let dispatching = dispatches * ceilings.dispatching();
     (most + dispatching, if dispatching > most { Bound::Dispatch } else { bound })
 }
 
@@ -68,8 +64,10 @@ pub struct PassFigures {
     pub floor: Option<f64>,
     /// What holds it back.
     pub bound: Option<Bound>,
-    /// The time in terms of the floor.
+    /// The median time in terms of the floor.
     pub ratio: Option<f64>,
+    /// The shortest time in terms of the floor: what is left of the ratio on a machine that does nothing else.
+    pub best_ratio: Option<f64>,
 }
 
 /// The host's part, milliseconds per step.
@@ -188,7 +186,8 @@ fn trace(gpu: &Gpu, bench: &mut Bench, settings: &Settings, view: usize) -> Resu
     Ok((counts::count(&words, &schedule, Method::new(gpu, &settings.render)?, known), schedule))
 }
 
-/// Measures the step on its views in rounds; those before the first counted one warm up.
+/// Measures the step on its views in rounds; the one before the first counted one warms up. `ceilings` has a round of its
+/// own before each, and returns what it knows by then.
 ///
 /// # Errors
 /// When the device has no room, or is lost.
@@ -196,7 +195,7 @@ pub(crate) fn measure(
     gpu: &Gpu,
     bench: &mut Bench,
     settings: &Settings,
-    ceilings: &Ceilings,
+    ceilings: &mut dyn FnMut() -> Result<Ceilings, Error>,
     repetitions: usize,
 ) -> Result<StepFigures, Error> {
     let names = bench.views();
@@ -204,12 +203,17 @@ pub(crate) fn measure(
     let traced: Vec<(Counts, Schedule)> =
         (0..views).map(|view| trace(gpu, bench, settings, view)).collect::<Result<_, _>>()?;
     let mut rounds = vec![];
+    let mut known = ceilings()?;
     for round in 0..=repetitions.max(1) {
+        if round > 0 {
+            known = ceilings()?;
+        }
         let clocked: Vec<Clocked> = (0..views).map(|view| bench.clock(gpu, view)).collect::<Result<_, _>>()?;
         if round > 0 {
             rounds.push(Round::of(&clocked));
         }
     }
+    let ceilings = &known;
     let mut works: BTreeMap<&'static str, (f64, Option<Work>)> = BTreeMap::new();
     let (scale, mut barriers) = (1.0 / views as f64, 0.0);
     for (counts, schedule) in &traced {
@@ -244,11 +248,12 @@ pub(crate) fn measure(
                 floor: floor.map(|f| f.0),
                 bound: floor.map(|f| f.1),
                 ratio: floor.map(|f| milliseconds.median / f.0),
+                best_ratio: floor.map(|f| milliseconds.min / f.0),
             }
         })
         .collect();
     passes.sort_by(|a, b| b.milliseconds.median.total_cmp(&a.milliseconds.median).then(a.pass.cmp(&b.pass)));
-    let between_floor = barriers * ceilings.barrier.median * 1e-3;
+    let between_floor = barriers * ceilings.waiting();
     let total_floor = passes.iter().filter_map(|pass| pass.floor).sum::<f64>() + between_floor;
     Ok(StepFigures {
         step: bench.number,
@@ -261,7 +266,7 @@ pub(crate) fn measure(
         between_floor,
         total: spread(&|round| round.total),
         total_floor,
-        device_bytes: gpu.memory().0,
+        device_bytes: gpu.stages().iter().filter(|(name, _)| **name != STAGE).map(|(_, (_, bytes))| bytes).sum(),
         host: HostFigures {
             recording: spread(&|round| round.host[0]),
             submission: spread(&|round| round.host[1]),

@@ -36,9 +36,11 @@ fn line(text: &mut String, arguments: std::fmt::Arguments<'_>) {
 /// The ceilings.
 pub fn ceilings(ceilings: &Ceilings) -> String {
     let mut text = String::new();
-    line(&mut text, format_args!("{:<26} {:>10} {:>6}  {}", "ceiling", "median", "", "quartiles"));
+    line(&mut text, format_args!("{:<26} {:>10} {:>10} {:>6}  {}", "ceiling", "best", "median", "", "quartiles"));
     for (name, unit, spread) in ceilings.rows() {
-        line(&mut text, format_args!("{name:<26} {:>10} {unit:>6}  {}", digits(spread.median), quartiles(&spread)));
+        let best = digits(if unit == "us" { spread.min } else { spread.max });
+        let median = digits(spread.median);
+        line(&mut text, format_args!("{name:<26} {best:>10} {median:>10} {unit:>6}  {}", quartiles(&spread)));
     }
     text
 }
@@ -69,8 +71,8 @@ pub fn step(figures: &StepFigures) -> String {
     line(
         &mut text,
         format_args!(
-            "{:<42} {:>4} {:>9} {:>17} {:>8} {:>8} {:>7} {:>9} {:>10} {:>7}",
-            "pass", "n", "ms", "quartiles", "MB", "M op", "M exp", "floor ms", "by", "ratio"
+            "{:<42} {:>5} {:>9} {:>17} {:>8} {:>8} {:>7} {:>9} {:>11} {:>7} {:>7}",
+            "pass", "n", "ms", "quartiles", "MB", "M op", "M exp", "floor ms", "by", "ratio", "at best"
         ),
     );
     for pass in &figures.passes {
@@ -79,9 +81,9 @@ pub fn step(figures: &StepFigures) -> String {
         line(
             &mut text,
             format_args!(
-                "{:<42} {:>4} {:>9} {:>17} {:>8} {:>8} {:>7} {:>9} {:>10} {:>7}",
+                "{:<42} {:>5} {:>9} {:>17} {:>8} {:>8} {:>7} {:>9} {:>11} {:>7} {:>7}",
                 pass.pass,
-                digits(pass.dispatches).trim_end_matches('0').trim_end_matches('.'),
+                (100.0 * pass.dispatches).round() / 100.0,
                 digits(pass.milliseconds.median),
                 quartiles(&pass.milliseconds),
                 millions(work.bytes),
@@ -90,15 +92,16 @@ pub fn step(figures: &StepFigures) -> String {
                 or(pass.floor),
                 pass.bound.map_or("not counted", |bound| bound.name()),
                 or(pass.ratio),
+                or(pass.best_ratio),
             ),
         );
     }
     let mut whole = |name: &str, n: f64, spread: &Spread, floor: f64| {
-        let ratio = if floor > 0.0 { digits(spread.median / floor) } else { "-".to_owned() };
+        let ratio = |time: f64| if floor > 0.0 { digits(time / floor) } else { "-".to_owned() };
         line(
             &mut text,
             format_args!(
-                "{name:<42} {n:>4.0} {:>9} {:>17} {:>8} {:>8} {:>7} {:>9} {:>10} {ratio:>7}",
+                "{name:<42} {n:>5.0} {:>9} {:>17} {:>8} {:>8} {:>7} {:>9} {:>11} {:>7} {:>7}",
                 digits(spread.median),
                 quartiles(spread),
                 "",
@@ -106,6 +109,8 @@ pub fn step(figures: &StepFigures) -> String {
                 "",
                 digits(floor),
                 "",
+                ratio(spread.median),
+                ratio(spread.min),
             ),
         );
     };

@@ -6,20 +6,21 @@ use anyhow::{Context as _, bail};
 
 use super::report::{command_line, last_part};
 use super::shared::{DeviceArgs, SceneArgs, load_scene, with_gpu};
+use crate::bench::ceilings::Prober;
 use crate::bench::compare::{self, Subject};
-use crate::bench::{self, Device, Record, Trained, ceilings, figures, loads, tables, text};
+use crate::bench::{self, Device, Record, Trained, figures, loads, tables, text};
 use crate::config::SettingsArgs;
-use crate::gpu::{Gpu, Options};
+use crate::gpu::Options;
 use crate::report::tables::write;
 use crate::report::{SceneFacts, plots};
 use crate::train::plan::Plan;
 
 /// Measure every pass of a step against the time it would take at the device's own ceilings
 ///
-/// The device's copy bandwidth, multiply-adds, exponentials, dispatches and barriers are measured first. The scene is
-/// then trained for the warm-up, with growing and pruning as set, and one step is timed by timestamp queries, pass by
-/// pass, beside what it has to do by the numbers read back from it: bytes, operations, exponentials. A ratio of 1 is the
-/// floor; below it the arrays stay in a cache.
+/// The scene is trained for the warm-up, with growing and pruning as set, and one step is timed by timestamp queries,
+/// pass by pass, beside what it has to do by the numbers read back from it: bytes, operations, exponentials. In the same
+/// rounds the device's copy bandwidth, multiply-adds, exponentials, dispatches and barriers are measured. A ratio of 1 is
+/// the floor.
 ///
 /// With --loads generated scenes of 1e3 to 1e6 anchors, 160 x 90 to 3840 x 2160 pixels and up to 3e7 pairs are measured
 /// instead, and how every pass grows with them. With --tune the choices of tile and group shapes are run in turn, on
@@ -111,7 +112,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             .map(|(path, old)| compare::ensure_comparable(path, old, subject))
             .transpose()?
             .unwrap_or_default();
-        let ceilings = measure_ceilings(gpu, repetitions, &mut say)?;
+        say("bench: ceilings of the device");
+        let mut prober = Prober::new(gpu)?;
+        (0..repetitions).try_for_each(|_| prober.round())?;
         let trained = scene
             .as_ref()
             .zip(step)
@@ -120,9 +123,12 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             })
             .transpose()?;
         let figures = match &trained {
-            Some(trained) => Some(trained.measure(gpu, &settings, &ceilings, repetitions, &mut say)?),
+            Some(trained) => Some(trained.measure(gpu, &settings, &mut prober, repetitions, &mut say)?),
             None => None,
         };
+        let ceilings = prober.ceilings();
+        // The loads need the room.
+        drop(prober);
         let loads = match args.loads {
             true => Some(loads::measure(gpu, &settings, &ceilings, (repetitions, args.seconds), &mut say)?),
             false => None,
@@ -159,11 +165,6 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
 fn seconds(text: &str) -> Result<f64, String> {
     let seconds: f64 = text.parse().map_err(|_| "not a number of seconds".to_owned())?;
     if seconds.is_finite() && seconds >= 0.0 { Ok(seconds) } else { Err("must be 0 or more".to_owned()) }
-}
-
-fn measure_ceilings(gpu: &Gpu, repetitions: usize, say: &mut dyn FnMut(&str)) -> anyhow::Result<ceilings::Ceilings> {
-    say("bench: ceilings of the device");
-    ceilings::measure(gpu, repetitions).map_err(|e| crate::report::Error::Gpu(e).into())
 }
 
 fn write_files(record: &Record, out: &Path) -> anyhow::Result<Vec<&'static str>> {
