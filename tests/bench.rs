@@ -147,7 +147,7 @@ fn loads_are_generated_and_what_does_not_fit_is_named() {
     assert!(left.iter().all(|l| l["why"] == "nothing is left of the 0.001 s"), "{left:?}");
     assert_eq!((number(&runs[0]["step"]["counts"]["anchors"]), &runs[0]["sweep"]), (1000.0, &Value::from("anchors")));
     assert!(
-        stdout.contains("left out, pairs varied: 40000 anchors, 3e7 pairs, 1920 x 1080: nothing is left"),
+        stdout.contains("left out, pairs varied: 40000 anchors, 3e7 pairs, 1280 x 720: nothing is left"),
         "{stdout}"
     );
     let memory = loads["memory"].as_object().expect("memory");

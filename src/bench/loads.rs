@@ -1,9 +1,10 @@
 //! Generated loads: scenes of chosen numbers of anchors, pairs and pixels, and how every pass grows with them.
 //!
 //! A load is one view of anchors spread evenly over the picture, a quarter of them in view and the others behind the
-//! camera. Their decoders' last layers are made so that every Gaussian exists, round, with an opacity of 0.03: of a few
-//! hundred over a pixel none ends it, and pairs are chosen by the Gaussians' size alone. Everything else is the step as
-//! the settings have it, mask, depth and attention included.
+//! camera. Their decoders' last layers are made so that every Gaussian exists, round, with an opacity of 0.015: of a
+//! thousand over a pixel none ends it, and pairs are chosen by the Gaussians' size alone. Everything else is the step as
+//! the settings have it, mask, depth and attention included, but that the attention's patch is the whole picture: as many
+//! tokens as there are anchors for, whatever the picture's size.
 
 use std::collections::BTreeMap;
 use std::rc::Rc;
@@ -101,7 +102,7 @@ pub fn sweep(which: Sweep, offsets: u32) -> Vec<Load> {
 }
 
 /// Opacity of every Gaussian.
-const OPACITY: f64 = 0.03;
+const OPACITY: f64 = 0.015;
 /// Nearest and farthest anchor, scene units from the camera.
 const DEPTHS: [f64; 2] = [2.0, 6.0];
 
@@ -397,13 +398,23 @@ pub fn memory(gpu: &Gpu, settings: &Settings) -> Result<Memory, gpu::Error> {
 struct Queue {
     sweep: Sweep,
     loads: std::vec::IntoIter<Load>,
-    /// Seconds that the last load took per unit of what is varied.
-    per_unit: f64,
+    /// Loads so far: how much there was of what is varied, and the seconds that it took.
+    taken: Vec<(f64, f64)>,
 }
 
 impl Queue {
     fn new(which: Sweep, settings: &Settings) -> Self {
-        Self { sweep: which, loads: sweep(which, settings.model.offsets).into_iter(), per_unit: 0.0 }
+        Self { sweep: which, loads: sweep(which, settings.model.offsets).into_iter(), taken: vec![] }
+    }
+
+    /// Seconds that so much may take: on the line through the last two, if it rises; in proportion to the root behind a
+    /// single one, of which nobody knows how much does not grow.
+    fn expected(&self, quantity: f64) -> f64 {
+        match self.taken[..] {
+            [] => 0.0,
+            [(before, seconds)] => seconds * (quantity / before).max(1.0).sqrt(),
+            [.., (a, first), (b, second)] => second + ((second - first) / (b - a)).max(0.0) * (quantity - b).max(0.0),
+        }
     }
 }
 
@@ -424,11 +435,11 @@ pub fn measure(
     let mut queues: Vec<Queue> = Sweep::ALL.into_iter().map(|sweep| Queue::new(sweep, settings)).collect();
     // The next of each in turn, so that a short time leaves something of all.
     while queues.iter().any(|queue| !queue.loads.as_slice().is_empty()) {
-        for Queue { sweep, loads, per_unit } in &mut queues {
-            let Some(load) = loads.next() else { continue };
-            let mut leave = |why: String| left_out.push(LeftOut { sweep: *sweep, load, why });
-            // No load takes longer than in proportion to the one before.
-            let expected = *per_unit * load.quantity(*sweep);
+        for queue in &mut queues {
+            let Some(load) = queue.loads.next() else { continue };
+            let sweep = queue.sweep;
+            let mut leave = |why: String| left_out.push(LeftOut { sweep, load, why });
+            let expected = queue.expected(load.quantity(sweep));
             let rest = seconds - started.elapsed().as_secs_f64();
             if rest <= 0.0 {
                 leave(format!("nothing is left of the {seconds} s"));
@@ -459,8 +470,8 @@ pub fn measure(
             let begun = Instant::now();
             match one(gpu, settings, ceilings, repetitions, &load) {
                 Ok(step) => {
-                    *per_unit = begun.elapsed().as_secs_f64() / load.quantity(*sweep);
-                    runs.push(LoadFigures { sweep: *sweep, load, step });
+                    queue.taken.push((load.quantity(sweep), begun.elapsed().as_secs_f64()));
+                    runs.push(LoadFigures { sweep, load, step });
                 }
                 Err(Error::Gpu(error @ (gpu::Error::TooLarge { .. } | gpu::Error::OutOfMemory { .. }))) => {
                     leave(error.to_string());
@@ -477,6 +488,9 @@ pub fn measure(
 
 /// The load on the device, under settings that may be another choice's.
 pub(super) fn furnish(gpu: &Gpu, settings: &Settings, load: &Load) -> Result<Bench, Error> {
+    let mut settings = settings.clone();
+    settings.model.attention.patch = load.size[0].max(load.size[1]);
+    let settings = &settings;
     let scene = load.scene();
     let plan = Plan::new(&scene, settings);
     let number = super::usual_step(&plan, settings, 0);
@@ -575,6 +589,18 @@ mod tests {
         // arrays of the sort and ten gradients.
         assert!(memory.per_anchor >= 4.0 * 272.0 + 12.0, "{memory:?}");
         assert!(memory.per_pair >= 60.0 && memory.per_visible >= 1000.0 && memory.per_pixel >= 50.0, "{memory:?}");
+    }
+
+    #[test]
+    fn the_next_load_is_on_the_line_through_the_last_two() {
+        let mut queue = Queue::new(Sweep::Pairs, &Settings::default());
+        assert_eq!(queue.expected(1e6), 0.0, "the first is begun whatever it takes");
+        queue.taken = vec![(1e5, 2.0)];
+        assert_eq!(queue.expected(4e5), 4.0);
+        queue.taken.push((2e5, 3.0));
+        assert!((queue.expected(1e6) - 11.0).abs() < 1e-9);
+        queue.taken.push((4e5, 2.5));
+        assert_eq!(queue.expected(1e6), 2.5, "it does not fall");
     }
 
     #[test]
