@@ -203,17 +203,17 @@ pub(crate) fn measure(
     let traced: Vec<(Counts, Schedule)> =
         (0..views).map(|view| trace(gpu, bench, settings, view)).collect::<Result<_, _>>()?;
     let mut rounds = vec![];
-    let mut known = ceilings()?;
+    let mut known = None;
     for round in 0..=repetitions.max(1) {
         if round > 0 {
-            known = ceilings()?;
+            known = Some(ceilings()?);
         }
         let clocked: Vec<Clocked> = (0..views).map(|view| bench.clock(gpu, view)).collect::<Result<_, _>>()?;
         if round > 0 {
             rounds.push(Round::of(&clocked));
         }
     }
-    let ceilings = &known;
+    let ceilings = &known.expect("there is at least one round");
     let mut works: BTreeMap<&'static str, (f64, Option<Work>)> = BTreeMap::new();
     let (scale, mut barriers) = (1.0 / views as f64, 0.0);
     for (counts, schedule) in &traced {
