@@ -7,6 +7,7 @@
 //! in float64 beside the code that dispatches it. [`gpu`] is the only place that knows Vulkan; [`primitives`] are
 //! sorts, scans and sums that know nothing of splats. [`cli`] has one file per command.
 
+pub mod bench;
 pub mod cli;
 pub mod config;
 pub mod densify;

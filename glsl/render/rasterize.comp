@@ -4,6 +4,7 @@
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_vote : require
 #extension GL_KHR_shader_subgroup_ballot : require
+#extension GL_KHR_shader_subgroup_shuffle : require
 // variant narrow: NARROW
 // variant color: COLOR_ONLY
 // variant narrow_color: NARROW COLOR_ONLY
@@ -120,7 +121,7 @@ void main() {
 #else
     float z = depth[g];
 #endif
-#define BLEND(k) blend(subgroupBroadcast(m, k), subgroupBroadcast(q, k), subgroupBroadcast(o, k), subgroupBroadcast(c, k), subgroupBroadcast(z, k))
+#define BLEND(k) blend(subgroupShuffle(m, k), subgroupShuffle(q, k), subgroupShuffle(o, k), subgroupShuffle(c, k), subgroupShuffle(z, k))
     BLEND(0u); BLEND(1u); BLEND(2u); BLEND(3u); BLEND(4u); BLEND(5u); BLEND(6u); BLEND(7u);
     bool any_live = false;
     [[unroll]] for (uint r = 0u; r < ROWS; r++) any_live = any_live || live[r];

@@ -216,7 +216,7 @@ void main() {
 #else
     float z = 0.0;
 #endif
-#define SUMS(k) sums_of(subgroupBroadcast(m, k), subgroupBroadcast(q, k), subgroupBroadcast(o, k), subgroupBroadcast(c, k), subgroupBroadcast(z, k))
+#define SUMS(k) sums_of(subgroupShuffle(m, k), subgroupShuffle(q, k), subgroupShuffle(o, k), subgroupShuffle(c, k), subgroupShuffle(z, k))
     Sums a = SUMS(0u);
     a = meet(a, SUMS(1u), 1u);
     Sums b = SUMS(2u);

@@ -6,6 +6,7 @@
 //! wrong.
 
 mod ablate;
+mod bench;
 mod devices;
 mod eval;
 pub mod folders;
@@ -57,6 +58,7 @@ enum Command {
     Verify(verify::Args),
     Ablate(ablate::Args),
     Report(report::Args),
+    Bench(bench::Args),
 }
 
 /// Runs the command.
@@ -74,6 +76,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
         Command::Verify(args) => verify::run(&args),
         Command::Ablate(args) => ablate::run(&args),
         Command::Report(args) => report::run(&args),
+        Command::Bench(args) => bench::run(&args),
     }
 }
 

@@ -170,12 +170,12 @@ fn read(args: &Args, settings: &Settings) -> anyhow::Result<Scene> {
 }
 
 /// The folder's own name: where it lies is nobody's business who reads the page.
-fn last_part(name: &str) -> &str {
+pub(super) fn last_part(name: &str) -> &str {
     name.rsplit(['/', '\\']).find(|part| !part.is_empty()).unwrap_or(name)
 }
 
 /// The command line without the place of the program.
-fn command_line() -> String {
+pub(super) fn command_line() -> String {
     let quoted = |word: std::borrow::Cow<'_, str>| {
         let plain = |c: char| c.is_alphanumeric() || "-_=.,/:+".contains(c);
         if word.chars().all(plain) { word.into_owned() } else { format!("'{}'", word.replace('\'', "'\\''")) }

@@ -332,7 +332,7 @@ impl Reference for attention_skip::Kernel {
 
 /// How the kernels share the work.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Form {
+pub(crate) enum Form {
     /// A token to a thread, shares formed again in the backward pass: for a GPU.
     Threads,
     /// A subgroup of 8 shares what its lanes load, 16 or 32 tokens at a time: for a CPU driver, where a load costs as much
@@ -348,7 +348,13 @@ impl Form {
     /// would be as large as a binding may be.
     const MOST_KEPT: u32 = 512;
 
-    fn best(kind: &str, subgroup_size: u32, capacity: u32) -> Self {
+    /// Those that a device can run, whether they are good for it or not.
+    pub(crate) fn all(subgroup_size: u32) -> &'static [Self] {
+        if subgroup_size == 8 { &[Self::Threads, Self::Lanes, Self::Pairs] } else { &[Self::Threads] }
+    }
+
+    /// What is taken.
+    pub(crate) fn best(kind: &str, subgroup_size: u32, capacity: u32) -> Self {
         match (kind, subgroup_size) {
             ("cpu", 8) if capacity <= Self::MOST_KEPT => Self::Pairs,
             ("cpu", 8) => Self::Lanes,
@@ -478,7 +484,7 @@ impl Attention {
         Self::with_form(gpu, capacity, Form::best(info.kind, info.subgroup_size, capacity))
     }
 
-    fn with_form(gpu: &Gpu, capacity: u32, form: Form) -> Result<Self, Error> {
+    pub(crate) fn with_form(gpu: &Gpu, capacity: u32, form: Form) -> Result<Self, Error> {
         let side = |names| Side::new(gpu, names, capacity as usize);
         Ok(Self {
             capacity,
@@ -727,7 +733,7 @@ mod tests {
 
     /// The forms to test: those of lanes need subgroups of 8.
     fn forms(gpu: &Gpu) -> &'static [Form] {
-        if gpu.info().subgroup_size == 8 { &[Form::Threads, Form::Lanes, Form::Pairs] } else { &[Form::Threads] }
+        Form::all(gpu.info().subgroup_size)
     }
 
     struct Run {

@@ -8,6 +8,7 @@
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, HashMap};
 use std::rc::Rc;
+use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
@@ -16,7 +17,7 @@ use super::stages::{self, GRADIENTS, OUTPUTS, Rows, Stage, WANTED};
 use super::statistics::Spread;
 use super::variants::Variant;
 use super::{Error, Omitted};
-use crate::gpu::{self, Buffer, Difference, Gpu, Recorder, Submission, Timing};
+use crate::gpu::{self, Buffer, Difference, Gpu, Recorder, Schedule, Submission, Timing};
 use crate::model::files;
 use crate::scene::{Reference, Scene};
 use crate::train::photographs::{self, Photograph};
@@ -286,7 +287,7 @@ fn mark_dominated(figures: &mut [VariantFigures], times: &[Times]) {
 }
 
 /// The reference view first, then others evenly over the rest.
-fn choose_views(scene: &Scene, views: usize) -> Scene {
+pub(crate) fn choose_views(scene: &Scene, views: usize) -> Scene {
     let first = scene.reference.as_ref().map(|r| r.view);
     let others: Vec<usize> = (0..scene.train.len()).filter(|i| Some(*i) != first).collect();
     let wanted = views.max(1).min(scene.train.len()) - usize::from(first.is_some());
@@ -301,24 +302,30 @@ fn choose_views(scene: &Scene, views: usize) -> Scene {
 }
 
 /// The model that all choices start from.
-struct Warm {
-    anchors: files::Anchors,
-    weights: files::Weights,
+pub(crate) struct Warm {
+    pub(crate) anchors: files::Anchors,
+    pub(crate) weights: files::Weights,
     /// Value and moments of what is learnt, without the attention, which may not have begun.
-    tensors: Vec<[Vec<f32>; 3]>,
+    pub(crate) tensors: Vec<[Vec<f32>; 3]>,
     /// Values by their buffers' names.
-    values: BTreeMap<&'static str, Vec<f32>>,
-    capacity: crate::render::view::Capacity,
+    pub(crate) values: BTreeMap<&'static str, Vec<f32>>,
+    pub(crate) capacity: crate::render::view::Capacity,
 }
 
 /// Anchors' features, offsets and scalings, and the decoders: what is learnt from the first step on.
 const LEARNT: usize = 4;
 
 impl Warm {
-    fn train(gpu: &Gpu, scene: &Scene, settings: &crate::config::Settings, steps: u32) -> Result<Self, Error> {
+    pub(crate) fn train(
+        gpu: &Gpu,
+        scene: &Scene,
+        settings: &crate::config::Settings,
+        steps: u32,
+    ) -> Result<Self, Error> {
         let mut run = Run::new(gpu, scene, settings)?;
         for step in 1..=steps {
             run.run_one(step)?;
+            run.change_anchors(step)?;
         }
         let step = run.step();
         let (anchors, weights) = step.model()?;
@@ -335,9 +342,9 @@ impl Warm {
 }
 
 /// One choice on the device.
-struct Bench {
-    step: Step,
-    number: u32,
+pub(crate) struct Bench {
+    pub(crate) step: Step,
+    pub(crate) number: u32,
     rates: Rates,
     photographs: Rc<Vec<Photograph>>,
     /// Value and moments to go back to before every step.
@@ -345,7 +352,7 @@ struct Bench {
 }
 
 impl Bench {
-    fn new(
+    pub(crate) fn new(
         gpu: &Gpu,
         scene: &Scene,
         variant: &Variant,
@@ -393,13 +400,16 @@ impl Bench {
         gpu: &'g Gpu,
         view: usize,
         recorder: impl Fn(&'g Gpu) -> Result<Recorder<'g>, gpu::Error>,
-        take: impl Fn(Submission<'g>) -> Result<T, gpu::Error>,
+        take: impl Fn(Submission<'g>, [Instant; 3]) -> Result<T, gpu::Error>,
     ) -> Result<T, gpu::Error> {
         loop {
             self.restore(gpu)?;
+            let begun = Instant::now();
             let mut rec = recorder(gpu)?;
             self.step.record(&mut rec, &self.photographs[view], self.number, self.rates);
-            let taken = take(rec.submit()?)?;
+            let recorded = Instant::now();
+            let submission = rec.submit()?;
+            let taken = take(submission, [begun, recorded, Instant::now()])?;
             if gpu.read(self.step.limits.overflow())?[0] == 0 {
                 return Ok(taken);
             }
@@ -413,23 +423,49 @@ impl Bench {
 
     /// The passes' times.
     fn time(&mut self, gpu: &Gpu, view: usize) -> Result<Vec<Timing>, gpu::Error> {
-        self.run(gpu, view, Gpu::recorder, Submission::wait)
+        Ok(self.clock(gpu, view)?.passes)
+    }
+
+    /// The passes' times, what was recorded, and the host's own times.
+    pub(crate) fn clock(&mut self, gpu: &Gpu, view: usize) -> Result<Clocked, gpu::Error> {
+        self.run(gpu, view, Gpu::recorder, |mut submission, [begun, recorded, submitted]| {
+            let schedule = std::mem::take(&mut submission.schedule);
+            let passes = submission.wait()?;
+            let host = [recorded - begun, submitted - recorded, submitted.elapsed()];
+            Ok(Clocked { passes, schedule, host })
+        })
+    }
+
+    /// The views' names.
+    pub(crate) fn views(&self) -> Vec<String> {
+        self.photographs.iter().map(|photograph| photograph.name.clone()).collect()
+    }
+
+    /// Width and height of a view's picture.
+    pub(crate) fn size(&self, view: usize) -> [u32; 2] {
+        self.photographs[view].camera.size
+    }
+
+    /// The words that the step leaves in the buffers of these names.
+    pub(crate) fn trace(
+        &mut self,
+        gpu: &Gpu,
+        view: usize,
+        wanted: &'static [&'static str],
+    ) -> Result<BTreeMap<&'static str, Vec<u32>>, gpu::Error> {
+        self.run(gpu, view, |gpu| Gpu::traced(gpu, wanted), take_trace)
     }
 
     /// What the step leaves in the buffers that are compared, by the kernels or by their twins.
     fn capture(&mut self, gpu: &Gpu, view: usize, twins: bool) -> Result<Capture, gpu::Error> {
         let recorder = |gpu| if twins { Gpu::reference(gpu, &WANTED) } else { Gpu::traced(gpu, &WANTED) };
-        let words = self.run(gpu, view, recorder, |mut submission| {
-            let words = std::mem::take(&mut submission.trace);
-            submission.wait()?;
-            Ok(words)
-        })?;
+        let words = self.run(gpu, view, recorder, take_trace)?;
         Ok(Capture { words, offsets: self.step.anchors.offsets as usize })
     }
 
     /// The worst of every stage's own passes against their twins on the same inputs.
     fn differences(&mut self, gpu: &Gpu, view: usize) -> Result<BTreeMap<Stage, OwnError>, gpu::Error> {
-        let differences = self.run(gpu, view, Gpu::checked, |mut submission| {
+        let differences = self.run(gpu, view, Gpu::checked, |mut submission, _| {
             let differences = std::mem::take(&mut submission.differences);
             submission.wait()?;
             Ok(differences)
@@ -453,6 +489,22 @@ impl Bench {
         }
         Ok(worst)
     }
+}
+
+/// A step as its clocks saw it.
+pub(crate) struct Clocked {
+    /// The passes' times.
+    pub(crate) passes: Vec<Timing>,
+    /// Passes and barriers as recorded.
+    pub(crate) schedule: Schedule,
+    /// How long the host recorded, submitted and waited.
+    pub(crate) host: [Duration; 3],
+}
+
+fn take_trace(mut submission: Submission<'_>, _: [Instant; 3]) -> Result<BTreeMap<&'static str, Vec<u32>>, gpu::Error> {
+    let words = std::mem::take(&mut submission.trace);
+    submission.wait()?;
+    Ok(words)
 }
 
 /// The words of the compared buffers behind one step.

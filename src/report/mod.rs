@@ -19,7 +19,7 @@ pub mod variants;
 
 use std::path::PathBuf;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::gpu::{self, DeviceInfo};
 use crate::train::run;
@@ -84,7 +84,7 @@ pub struct Report {
 }
 
 /// What a scene is.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SceneFacts {
     /// Its folder's name, or `synthetic`.
     pub name: String,

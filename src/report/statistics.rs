@@ -1,9 +1,9 @@
 //! What repetitions say: the median and how far they spread.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// Order statistics of repeated measurements.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Spread {
     /// Middle value.
     pub median: f64,

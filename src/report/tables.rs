@@ -27,7 +27,7 @@ pub fn json(report: &Report) -> String {
     serde_json::to_string_pretty(report).expect("plain numbers and strings") + "\n"
 }
 
-fn rows<const N: usize>(header: [&str; N], rows: impl IntoIterator<Item = [String; N]>) -> Vec<u8> {
+pub(crate) fn rows<const N: usize>(header: [&str; N], rows: impl IntoIterator<Item = [String; N]>) -> Vec<u8> {
     let mut writer = csv::Writer::from_writer(vec![]);
     writer.write_record(header).expect("memory takes everything");
     for row in rows {
@@ -37,11 +37,11 @@ fn rows<const N: usize>(header: [&str; N], rows: impl IntoIterator<Item = [Strin
 }
 
 /// What is not finite stays empty.
-fn number(value: f64) -> String {
+pub(crate) fn number(value: f64) -> String {
     if value.is_finite() { format!("{value:e}") } else { String::new() }
 }
 
-fn optional(value: Option<f64>) -> String {
+pub(crate) fn optional(value: Option<f64>) -> String {
     value.map_or(String::new(), number)
 }
 

@@ -479,6 +479,17 @@ impl<'a> Run<'a> {
         }
     }
 
+    /// Grows and prunes anchors where the settings have a round behind this step. Nothing may be in flight.
+    ///
+    /// # Errors
+    /// When the device has no room.
+    pub fn change_anchors(&mut self, step: u32) -> Result<(), Error> {
+        if self.step.changes_anchors(step) {
+            self.step.change_anchors(step)?;
+        }
+        Ok(())
+    }
+
     /// Makes what begins with this step and lets go of what is over: stages, and pictures of another size. Nothing may be
     /// in flight where the pictures change.
     fn prepare(&mut self, step: u32) -> Result<(), Error> {

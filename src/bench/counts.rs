@@ -1,0 +1,271 @@
+//! What there was to do in a step: read back from a traced one.
+
+use std::collections::BTreeMap;
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::gpu::{Entry, Schedule};
+use crate::render::bin::Tiling;
+use crate::render::method::Method;
+
+/// The step's numbers; means over its views where there are several.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Counts {
+    /// Anchors.
+    pub anchors: f64,
+    /// Gaussians per anchor.
+    pub offsets: f64,
+    /// Anchors in view.
+    pub visible: f64,
+    /// Gaussians of these that exist.
+    pub gaussians: f64,
+    /// Gaussians that touch a tile.
+    pub drawn: f64,
+    /// (Gaussian, tile) pairs.
+    pub pairs: f64,
+    /// Pairs up to where their tile ends: behind the last Gaussian that any of its pixels still sees.
+    pub evaluated: f64,
+    /// These times the pixels of their tile.
+    pub samples: f64,
+    /// Samples that changed a pixel.
+    pub blended: f64,
+    /// Pixels.
+    pub pixels: f64,
+    /// Tiles.
+    pub tiles: f64,
+    /// Side of a tile, pixels.
+    pub tile_side: f64,
+    /// Tokens of each side of the attention.
+    pub tokens: f64,
+    /// Scales of the depth gradient.
+    pub gradient_scales: f64,
+}
+
+impl Counts {
+    fn fields(&mut self) -> [&mut f64; 14] {
+        let Self {
+            anchors,
+            offsets,
+            visible,
+            gaussians,
+            drawn,
+            pairs,
+            evaluated,
+            samples,
+            blended,
+            pixels,
+            tiles,
+            tile_side,
+            tokens,
+            gradient_scales,
+        } = self;
+        [
+            anchors,
+            offsets,
+            visible,
+            gaussians,
+            drawn,
+            pairs,
+            evaluated,
+            samples,
+            blended,
+            pixels,
+            tiles,
+            tile_side,
+            tokens,
+            gradient_scales,
+        ]
+    }
+
+    /// The mean of some.
+    pub fn mean(mut all: Vec<Self>) -> Self {
+        let (mut sum, number) = (Self::default(), all.len().max(1) as f64);
+        for counts in &mut all {
+            for (sum, value) in sum.fields().into_iter().zip(counts.fields()) {
+                *sum += *value / number;
+            }
+        }
+        sum
+    }
+}
+
+/// The buffers that are read back.
+pub const WANTED: [&str; 12] = [
+    "visible_count",
+    "drawn_count",
+    "pair_count",
+    "tokens",
+    "depth",
+    "ranges",
+    "sort_values",
+    "pair_index",
+    "pair_slot",
+    "mean",
+    "conic",
+    "opacity",
+];
+
+/// What does not come from the device.
+#[derive(Clone, Copy, Debug)]
+pub struct Known {
+    /// Anchors.
+    pub anchors: u32,
+    /// Gaussians per anchor.
+    pub offsets: u32,
+    /// Width and height of the picture.
+    pub size: [u32; 2],
+    /// Scales of the depth gradient.
+    pub gradient_scales: u32,
+}
+
+/// Counts a traced step. The schedule says in which of the sort's two arrays the tiles' lists ended up.
+pub fn count(words: &BTreeMap<&'static str, Vec<u32>>, schedule: &Schedule, method: Method, known: Known) -> Counts {
+    let of = |name: &str| words.get(name).map_or(&[][..], Vec::as_slice);
+    let first = |name: &str| of(name).first().copied().unwrap_or(0);
+    let visible = first("visible_count");
+    let slots = ((visible * known.offsets) as usize).min(of("depth").len());
+    let gaussians = of("depth")[..slots].iter().filter(|bits| f32::from_bits(**bits) > 0.0).count();
+    let tiling = method.tiling;
+    let [columns, rows] = tiling.grid(known.size);
+    let sorted = sorted_list(schedule).unwrap_or("sort_values");
+    let floats = |name: &str| bytemuck::cast_slice::<u32, f32>(of(name));
+    let lists = Lists {
+        ranges: bytemuck::cast_slice(of("ranges")),
+        sorted: of(sorted),
+        pair_slot: of("pair_slot"),
+        mean: bytemuck::cast_slice(floats("mean")),
+        conic: bytemuck::cast_slice(floats("conic")),
+        opacity: floats("opacity"),
+    };
+    let tiles = (columns * rows) as usize;
+    let walked = lists.walk(tiling, known.size, method);
+    Counts {
+        anchors: known.anchors.into(),
+        offsets: known.offsets.into(),
+        visible: visible.into(),
+        gaussians: gaussians as f64,
+        drawn: first("drawn_count").into(),
+        pairs: first("pair_count").into(),
+        evaluated: walked[0],
+        samples: walked[1],
+        blended: walked[2],
+        pixels: f64::from(known.size[0]) * f64::from(known.size[1]),
+        tiles: tiles as f64,
+        tile_side: tiling.side().into(),
+        tokens: first("tokens").into(),
+        gradient_scales: known.gradient_scales.into(),
+    }
+}
+
+/// The buffer that the rasteriser takes the tiles' lists from: its second binding.
+fn sorted_list(schedule: &Schedule) -> Option<&'static str> {
+    schedule.entries.iter().find_map(|entry| match entry {
+        Entry::Pass { name, accesses, .. } if name.starts_with("render/rasterize") => Some(accesses.get(1)?.0),
+        _ => None,
+    })
+}
+
+struct Lists<'a> {
+    ranges: &'a [[u32; 2]],
+    sorted: &'a [u32],
+    pair_slot: &'a [u32],
+    mean: &'a [[f32; 2]],
+    conic: &'a [[f32; 3]],
+    opacity: &'a [f32],
+}
+
+/// Samples at most that are walked on the host; of more, tiles spread evenly over the picture stand for all.
+const MOST_SAMPLES: u64 = 1 << 29;
+
+impl Lists<'_> {
+    /// Pairs and samples up to where the tiles end, and samples that changed a pixel.
+    fn walk(&self, tiling: Tiling, size: [u32; 2], method: Method) -> [f64; 3] {
+        let [columns, rows] = tiling.grid(size);
+        let tiles = columns * rows;
+        let pairs: u64 = self.ranges.iter().take(tiles as usize).map(|[first, end]| u64::from(end - first)).sum();
+        let every = (pairs * u64::from(tiling.side()).pow(2)).div_ceil(MOST_SAMPLES).max(1) as usize;
+        let chosen: Vec<u32> = (0..tiles).step_by(every).collect();
+        let sums = chosen
+            .par_iter()
+            .map(|&tile| self.tile([tile % columns, tile / columns], tile, tiling.side(), size, method))
+            .reduce(|| [0; 3], |a, b| std::array::from_fn(|i| a[i] + b[i]));
+        // By pairs, not by tiles: a tile stands for others as full as it is.
+        let walked: u64 =
+            chosen.iter().map(|&t| self.ranges.get(t as usize).map_or(0, |[a, b]| u64::from(b - a))).sum();
+        let scale = if walked > 0 { pairs as f64 / walked as f64 } else { 0.0 };
+        sums.map(|sum| sum as f64 * scale)
+    }
+
+    /// The rasteriser's decisions, in its own float32.
+    fn tile(&self, [column, row]: [u32; 2], tile: u32, side: u32, size: [u32; 2], method: Method) -> [u64; 3] {
+        let Some(&[first, end]) = self.ranges.get(tile as usize) else { return [0; 3] };
+        let mut pixels = vec![];
+        for y in row * side..((row + 1) * side).min(size[1]) {
+            for x in column * side..((column + 1) * side).min(size[0]) {
+                pixels.push(([x as f32 + 0.5, y as f32 + 0.5], 1f32));
+            }
+        }
+        let all = pixels.len() as u64;
+        let (mut evaluated, mut blended) = (0, 0);
+        for &pair in &self.sorted[first as usize..end as usize] {
+            if pixels.is_empty() {
+                break;
+            }
+            evaluated += 1;
+            let slot = self.pair_slot[pair as usize] as usize;
+            let (mean, conic, opacity) = (self.mean[slot], self.conic[slot], self.opacity[slot]);
+            pixels.retain_mut(|(at, transmittance)| {
+                let (dx, dy) = (at[0] - mean[0], at[1] - mean[1]);
+                let across = dx - conic[1] * dy;
+                let power = -0.5 * (conic[0] * across * across + conic[2] * dy * dy);
+                let alpha = (opacity * power.exp()).min(0.99);
+                if alpha < method.alpha_min {
+                    return true;
+                }
+                let after = *transmittance * (1.0 - alpha);
+                if after < method.transmittance_min {
+                    return false;
+                }
+                blended += 1;
+                *transmittance = after;
+                true
+            });
+        }
+        [evaluated, evaluated * all, blended]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Two tiles of 8 x 8, the second one pixel wide; three Gaussians that fill them, of which two end the first.
+    #[test]
+    fn tiles_end_where_no_pixel_sees() {
+        let method = Method { transmittance_min: 0.2, ..Method::from(Tiling::Narrow) };
+        let lists = Lists {
+            ranges: &[[0, 3], [3, 4], [4, 4]],
+            sorted: &[0, 1, 2, 3],
+            pair_slot: &[0, 1, 2, 2],
+            mean: &[[4.0, 4.0]; 3],
+            conic: &[[1e-9, 0.0, 1e-9]; 3],
+            opacity: &[0.7, 0.9, 0.5],
+        };
+        // First tile: 0.7 leaves 0.3; 0.9 would leave 0.03, below 0.2: every pixel ends there.
+        let [evaluated, samples, blended] = lists.walk(Tiling::Narrow, [9, 8], method);
+        assert_eq!((evaluated, samples, blended), (2.0 + 1.0, 128.0 + 8.0, 64.0 + 8.0));
+        let never = Method { transmittance_min: 0.0, ..method };
+        let [evaluated, samples, blended] = lists.walk(Tiling::Narrow, [9, 8], never);
+        assert_eq!((evaluated, samples, blended), (4.0, 200.0, 200.0));
+        // Below the alpha threshold nothing is blended, and nothing ends.
+        let faint = Lists { opacity: &[1e-3; 3], ..lists };
+        assert_eq!(faint.walk(Tiling::Narrow, [9, 8], method), [4.0, 200.0, 0.0]);
+    }
+
+    #[test]
+    fn means() {
+        let of = |pairs, tokens| Counts { pairs, tokens, ..Counts::default() };
+        assert_eq!(Counts::mean(vec![of(1.0, 8.0), of(3.0, 0.0)]), of(2.0, 4.0));
+    }
+}

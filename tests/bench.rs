@@ -1,0 +1,179 @@
+//! `bench` as its user meets it: a step pass by pass, a record, and a comparison with an older one.
+
+#[allow(dead_code)]
+mod common;
+
+use std::fs;
+use std::path::Path;
+use std::process::Output;
+
+use assert_cmd::cargo::cargo_bin_cmd;
+use serde_json::Value;
+
+const FEW: &str = "--set model.voxel=0 --set model.attention.start=2 --set model.attention.patch=24 \
+                   --set model.attention.tokens=32 --set model.attention.min_tokens=1 --set densify.statistics_from=1 \
+                   --set densify.from=2 --set densify.every=2 --set densify.until=9 --iterations 20";
+
+fn bench(folder: &Path, arguments: &str) -> Output {
+    let mut command = cargo_bin_cmd!("gscream-vk");
+    command.current_dir(folder).env("XDG_CACHE_HOME", folder.join("cache")).env_remove("RUST_LOG");
+    let arguments = arguments.split_whitespace();
+    command.arg("bench").args(arguments).args(FEW.split_whitespace()).output().expect("the program starts")
+}
+
+fn succeeds(folder: &Path, arguments: &str) -> String {
+    let output = bench(folder, arguments);
+    assert!(output.status.success(), "{arguments}: {}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).expect("UTF-8")
+}
+
+fn fails(folder: &Path, arguments: &str) -> String {
+    let output = bench(folder, arguments);
+    assert!(!output.status.success() && output.stdout.is_empty(), "{arguments} went well");
+    let stderr = String::from_utf8(output.stderr).expect("UTF-8");
+    stderr.lines().find(|line| line.starts_with("error: ")).expect("an error in one line").to_owned()
+}
+
+fn json(path: &Path) -> Value {
+    let text = fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    serde_json::from_str(&text).expect("JSON")
+}
+
+fn number(value: &Value) -> f64 {
+    value.as_f64().unwrap_or_else(|| panic!("{value} is no number"))
+}
+
+#[test]
+fn a_step_is_measured_and_compared() {
+    let scene = common::folder();
+    let folder = scene.path();
+    let measured = "scene --warm-up 5 --views 2 --repetitions 3 --validate";
+    let stdout = succeeds(folder, &format!("{measured} --out first"));
+    let record = json(&folder.join("first/bench.json"));
+
+    let ceilings = record["ceilings"].as_object().expect("ceilings");
+    assert_eq!(ceilings.len(), 8);
+    assert!(ceilings.values().all(|c| number(&c["median"]) >= 0.0 && c["repetitions"] == 3));
+
+    // With everything on there is no pass without a formula, and nothing of a step is missing.
+    let step = &record["step"];
+    assert_eq!((number(&step["step"]), step["views"].as_array().map(Vec::len)), (6.0, Some(2)));
+    let passes = step["passes"].as_array().expect("passes");
+    for pass in passes {
+        let name = pass["pass"].as_str().expect("a name");
+        assert!(pass["work"].is_object(), "{name} has no formula in src/bench/cost.rs");
+        let (floor, ratio) = (number(&pass["floor"]), number(&pass["ratio"]));
+        let ms = number(&pass["milliseconds"]["median"]);
+        assert!(floor > 0.0 && (ratio - ms / floor).abs() < 1e-9 * ratio, "{pass}");
+        // A pass of one view in two is half a dispatch.
+        assert!(number(&pass["dispatches"]) >= 0.5 && stdout.contains(name), "{name}");
+    }
+    let has = |name: &str| passes.iter().any(|pass| pass["pass"].as_str().is_some_and(|p| p.starts_with(name)));
+    for name in [
+        "fill",
+        "render/cull",
+        "render/decode",
+        "render/rasterize_backward",
+        "primitives/sort_scatter",
+        "model/attention_backward",
+        "losses/photometric_gradient_weighted",
+        "losses/depth_gradient",
+        "primitives/finite",
+        "densify/statistics",
+        "optimizer/adam",
+    ] {
+        assert!(has(name), "{name} is missing");
+    }
+    let medians: Vec<f64> = passes.iter().map(|pass| -number(&pass["milliseconds"]["median"])).collect();
+    assert!(medians.is_sorted(), "the longest first");
+    let floors: f64 = passes.iter().map(|pass| number(&pass["floor"])).sum();
+    let total = number(&step["total_floor"]) - number(&step["between_floor"]);
+    assert!((floors - total).abs() < 1e-9 * total, "{floors} {total}");
+    for part in ["recording", "submission", "waiting"] {
+        assert!(number(&step["host"][part]["median"]) > 0.0, "{part}");
+    }
+
+    // What there was: the numbers are those of one another.
+    let count = |name: &str| number(&step["counts"][name]);
+    assert_eq!((count("pixels"), count("offsets")), (48.0 * 36.0, 10.0));
+    assert!(count("visible") <= count("anchors") && count("drawn") <= count("gaussians"));
+    assert!(count("gaussians") <= count("visible") * 10.0 && count("pairs") >= count("drawn"));
+    assert!(count("drawn") > 0.0 && count("evaluated") <= count("pairs") && count("evaluated") > 0.0);
+    assert!(
+        count("samples") <= count("evaluated") * count("tile_side").powi(2) && count("blended") <= count("samples")
+    );
+    assert!(count("tokens") > 1.0, "the measured step has attention");
+    assert!(count("anchors") != 300.0, "anchors have grown or been pruned in the warm-up");
+
+    for name in ["passes.svg", "passes.csv"] {
+        assert!(folder.join("first").join(name).exists(), "{name}");
+    }
+
+    // The table says the same.
+    let mut reader = csv::Reader::from_path(folder.join("first/passes.csv")).expect("a table");
+    let rows: Vec<csv::StringRecord> = reader.records().map(|row| row.expect("a row")).collect();
+    assert_eq!(rows.len(), passes.len() + 2);
+    for (row, pass) in rows.iter().zip(passes) {
+        let (cell, ms) = (row[2].parse::<f64>().expect("a number"), number(&pass["milliseconds"]["median"]));
+        assert!(row[0] == *pass["pass"].as_str().expect("a name") && (cell - ms).abs() <= 1e-12 * ms);
+    }
+
+    let stdout = succeeds(folder, &format!("{measured} --against first/bench.json"));
+    let compared = stdout.split("against the older record").nth(1).expect("a comparison");
+    assert!(compared.contains("render/rasterize_backward") && compared.contains("\ntotal "), "{compared}");
+
+    let error = fails(folder, &format!("{measured} --out first"));
+    assert_eq!(error, "error: first: holds a record already: choose another --out, or --overwrite");
+    let error = fails(folder, &format!("{measured} --against first/bench.json --set render.near=0.1"));
+    assert!(
+        error.starts_with(
+            "error: first/bench.json: was measured with render.near = 0.2, this run is with render.near = 0.1"
+        ),
+        "{error}"
+    );
+    let error = fails(folder, "scene --against scene/sparse/0/cameras.txt");
+    assert!(error.starts_with("error: scene/sparse/0/cameras.txt: "), "{error}");
+}
+
+#[test]
+fn loads_are_generated_and_what_does_not_fit_is_named() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = folder.path();
+    let stdout = succeeds(folder, "--loads --seconds 0.001 --repetitions 1 --validate --out loads");
+    let loads = &json(&folder.join("loads/bench.json"))["loads"];
+    let (runs, left) = (loads["runs"].as_array().expect("runs"), loads["left_out"].as_array().expect("a list"));
+    // Seven of anchors, five of pairs, seven of pixels; the first is begun whatever it takes.
+    assert_eq!((runs.len() + left.len(), runs.len()), (19, 1));
+    assert!(left.iter().all(|l| l["why"] == "nothing is left of the 0.001 s"), "{left:?}");
+    assert_eq!((number(&runs[0]["step"]["counts"]["anchors"]), &runs[0]["sweep"]), (1000.0, &Value::from("anchors")));
+    assert!(
+        stdout.contains("left out, pairs varied: 40000 anchors, 3e7 pairs, 1280 x 720: nothing is left"),
+        "{stdout}"
+    );
+    let memory = loads["memory"].as_object().expect("memory");
+    assert!(memory.len() == 4 && memory.values().all(|bytes| number(bytes) > 10.0), "{memory:?}");
+    for name in ["loads.csv", "loads.svg", "exponents.csv"] {
+        assert!(folder.join("loads").join(name).exists(), "{name}");
+    }
+    let error = fails(folder, "synthetic --against loads/bench.json");
+    assert!(error.contains("was measured on generated loads, this run is on synthetic (160 x 120, "), "{error}");
+}
+
+#[test]
+fn shapes_are_tuned() {
+    let scene = common::folder();
+    let folder = scene.path();
+    let stdout = succeeds(folder, "scene --tune --warm-up 1 --views 1 --repetitions 1 --out tuned");
+    let record = json(&folder.join("tuned/bench.json"));
+    let choices = record["tune"].as_array().expect("choices");
+    for choice in choices {
+        let (name, best) = (choice["choice"].as_str().expect("a name"), choice["best"].as_str().expect("an option"));
+        let options = choice["options"].as_array().expect("options");
+        assert!(options.iter().any(|o| o["option"] == best), "{choice}");
+        assert_eq!(options.iter().filter(|o| o["shipped"] == true && number(&o["ratio"]["median"]) == 1.0).count(), 1);
+        assert!(stdout.contains(&format!("\"{name}\", \"{best}\"), // ")), "{stdout}");
+    }
+    assert!(
+        choices.iter().any(|c| c["choice"] == "sort") && choices.iter().any(|c| c["choice"] == "attention kernels")
+    );
+}
