@@ -25,25 +25,27 @@ layout(push_constant, scalar) uniform Push {
 const uint VECTORS = 4u; // per thread, a group apart so that neighbours stay neighbours
 void main() {
   if (overflow[0] != 0u) return;
-  uint end = push.offset + push.n;
-  uint i = push.offset / 4u + group_index() * (gl_WorkGroupSize.x * VECTORS) + gl_LocalInvocationID.x;
+  // CPU drivers load a push constant again for every lane wherever it is read in a loop.
+  uint offset = push.offset, end = offset + push.n;
+  float rate = push.rate, epsilon = push.epsilon, complement1 = push.complement1, root_decay = push.root_decay, root_complement = push.root_complement, correction = push.correction, root_correction = push.root_correction;
+  uint i = offset / 4u + group_index() * (gl_WorkGroupSize.x * VECTORS) + gl_LocalInvocationID.x;
   for (uint k = 0u; k < VECTORS; k++, i += gl_WorkGroupSize.x) {
     if (4u * i >= end) return;
     vec4 g = gradient[i], old_value = value[i], old_first = first[i], old_root = root[i];
     // beta1 m + (1 - beta1) g by one constant: rounded apart, the two do not sum to one, and the moment of a steady gradient
     // strays by up to 2^-25 / (1 - beta1) of itself. So it stays within a unit in the last place.
-    vec4 m = old_first - push.complement1 * old_first + push.complement1 * g;
-    vec4 a = old_root - push.root_decay * old_root; // sqrt(beta2) r: the small constant carries more digits of beta2
-    vec4 b = push.root_complement * abs(g);
+    vec4 m = old_first - complement1 * old_first + complement1 * g;
+    vec4 a = old_root - root_decay * old_root; // sqrt(beta2) r: the small constant carries more digits of beta2
+    vec4 b = root_complement * abs(g);
     vec4 large = max(a, b), ratio = min(a, b) / max(large, vec4(1e-37)); // both 0: 0; below 1e-37 epsilon decides alone
     vec4 r = large * sqrt(1.0 + ratio * ratio);
     // Largest and smallest pass over what is not a number: a lost moment or gradient must not look whole again.
     vec4 sum = a + b;
     r = mix(r, sum, equal(floatBitsToUint(sum) & 0x7f800000u, uvec4(0x7f800000u)));
-    vec4 v = old_value - push.rate * ((push.correction * m) / (push.root_correction * r + push.epsilon));
-    if (4u * i < push.offset || 4u * i + 4u > end) { // the ends of a range that starts or stops within a vector
+    vec4 v = old_value - rate * ((correction * m) / (root_correction * r + epsilon));
+    if (4u * i < offset || 4u * i + 4u > end) { // the ends of a range that starts or stops within a vector
       uvec4 element = 4u * i + uvec4(0, 1, 2, 3);
-      bvec4 inside = bvec4(uvec4(greaterThanEqual(element, uvec4(push.offset))) & uvec4(lessThan(element, uvec4(end))));
+      bvec4 inside = bvec4(uvec4(greaterThanEqual(element, uvec4(offset))) & uvec4(lessThan(element, uvec4(end))));
       v = mix(old_value, v, inside);
       m = mix(old_first, m, inside);
       r = mix(old_root, r, inside);

@@ -23,10 +23,10 @@ void main() {
   uint t = gl_LocalInvocationID.x;
   uint block = group_index();
   uint first = (block * 64u + t) * ITEMS;
-  uint last = min(first + ITEMS, n);
+  uint last = min(first + ITEMS, n), shift = push.shift, mask = push.mask;
   for (uint p = 0u; p < PAIRS; ++p) counters[p * 65u + t] = 0u;
   for (uint i = first; i < last; i += 4u) {
-    uvec4 digit = (keys[i / 4u] >> push.shift) & push.mask;
+    uvec4 digit = (keys[i / 4u] >> shift) & mask;
     for (uint c = 0u; c < 4u; ++c) {
       if (i + c < last) counters[(digit[c] >> 1u) * 65u + t] += 1u << ((digit[c] & 1u) * 16u);
     }

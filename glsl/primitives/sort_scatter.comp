@@ -32,10 +32,10 @@ void main() {
   uint t = scan_thread();
   uint block = group_index();
   uint first = (block * 64u + t) * ITEMS;
-  uint last = min(first + ITEMS, n);
+  uint last = min(first + ITEMS, n), shift = push.shift, mask = push.mask;
   for (uint p = 0u; p < PAIRS; ++p) counters[p * 65u + t] = 0u;
   for (uint i = first; i < last; i += 4u) {
-    uvec4 digit = (keys[i / 4u] >> push.shift) & push.mask;
+    uvec4 digit = (keys[i / 4u] >> shift) & mask;
     for (uint c = 0u; c < 4u; ++c) {
       if (i + c < last) counters[(digit[c] >> 1u) * 65u + t] += 1u << ((digit[c] & 1u) * 16u);
     }
@@ -57,7 +57,7 @@ void main() {
   barrier();
   for (uint i = first; i < last; i += 4u) {
     uvec4 key = keys[i / 4u];
-    uvec4 digit = (key >> push.shift) & push.mask;
+    uvec4 digit = (key >> shift) & mask;
 #ifdef INDEX
     uvec4 value = i + uvec4(0, 1, 2, 3);
 #else

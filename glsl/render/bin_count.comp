@@ -29,9 +29,12 @@ void main() {
   if (depth[s] > 0.0) {
     // Both variances are at least 0.3 and at most 2^120: so are their reciprocals normal numbers.
     q = vec3(1.0 / c.x, c.y, 1.0 / c.z);
-    Support support = support_of(mean[s], c, o, ALPHA_MIN, int(push.tile), ivec2(push.grid));
+    int tile = int(push.tile);
+    ivec2 grid = ivec2(push.grid);
+    vec2 m = mean[s];
+    Support support = support_of(m, c, o, ALPHA_MIN, tile, grid);
     for (int row = support.row0; row <= support.row1; row++) {
-      ivec2 columns = support_columns(support, mean[s], row, int(push.tile), ivec2(push.grid));
+      ivec2 columns = support_columns(support, m, row, tile, grid);
       n += uint(max(columns.y - columns.x + 1, 0));
     }
   }

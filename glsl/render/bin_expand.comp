@@ -29,18 +29,22 @@ void main() {
   uint p = rank_first[r];
   uint end = p + tiles[s];
   first_pair[s] = p;
-  Support support = support_of(mean[s], covariance[s], opacity[s], ALPHA_MIN, int(push.tile), ivec2(push.grid));
+  // CPU drivers load what is read in a loop again for every lane: not the push constants, not the mean.
+  int tile = int(push.tile);
+  ivec2 grid = ivec2(push.grid);
+  vec2 m = mean[s];
+  Support support = support_of(m, covariance[s], opacity[s], ALPHA_MIN, tile, grid);
   for (int row = support.row0; row <= support.row1; row++) {
-    ivec2 columns = support_columns(support, mean[s], row, int(push.tile), ivec2(push.grid));
+    ivec2 columns = support_columns(support, m, row, tile, grid);
     for (int column = columns.x; column <= columns.y && p < end; column++, p++) {
-      pair_tile[p] = uint(row) * push.grid.x + uint(column);
+      pair_tile[p] = uint(row * grid.x + column);
       pair_slot[p] = s;
     }
   }
   // Counting and this pass are two kernels; should a driver round them differently, a pair too many is dropped above
   // and one too few goes to the tile behind the last, which nobody draws and whose gradients are 0.
   for (; p < end; p++) {
-    pair_tile[p] = push.grid.x * push.grid.y;
+    pair_tile[p] = uint(grid.x * grid.y);
     pair_slot[p] = s;
   }
 }

@@ -12,11 +12,11 @@ layout(push_constant, scalar) uniform Push {
   uint runs;
 } push;
 void main() {
-  uint run = thread_index(), n = pair_count[0];
-  if (run >= push.runs) return;
-  uint length = (n + push.runs - 1u) / push.runs, end = min(run * length + length, n);
+  uint run = thread_index(), n = pair_count[0], runs = push.runs;
+  if (run >= runs) return;
+  uint length = (n + runs - 1u) / runs, end = min(run * length + length, n);
   for (uint p = run * length; p < end; p++) {
-    uint at = pair_tile[p] * push.runs + run;
+    uint at = pair_tile[p] * runs + run;
     uint place = run_first[at];
     run_first[at] = place + 1u;
     sorted[place] = p;

@@ -13,8 +13,8 @@ layout(push_constant, scalar) uniform Push {
   uint runs;
 } push;
 void main() {
-  uint run = thread_index(), n = pair_count[0];
-  if (run >= push.runs) return;
-  uint length = (n + push.runs - 1u) / push.runs, end = min(run * length + length, n);
-  for (uint p = run * length; p < end; p++) run_pairs[pair_tile[p] * push.runs + run] += 1u;
+  uint run = thread_index(), n = pair_count[0], runs = push.runs;
+  if (run >= runs) return;
+  uint length = (n + runs - 1u) / runs, end = min(run * length + length, n);
+  for (uint p = run * length; p < end; p++) run_pairs[pair_tile[p] * runs + run] += 1u;
 }
