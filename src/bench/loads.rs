@@ -93,7 +93,7 @@ pub fn sweep(which: Sweep, offsets: u32) -> Vec<Load> {
             .map(|anchors| Load { anchors, pairs: 2.0 * gaussians(anchors), size: [640, 360] })
             .into(),
         Sweep::Pairs => {
-            [3e5, 1e6, 3e6, 1e7, 3e7].map(|pairs| Load { anchors: 40_000, pairs, size: [1920, 1080] }).into()
+            [3e5, 1e6, 3e6, 1e7, 3e7].map(|pairs| Load { anchors: 40_000, pairs, size: [1280, 720] }).into()
         }
         Sweep::Pixels => [[160, 90], [320, 180], [640, 360], [1280, 720], [1920, 1080], [2560, 1440], [3840, 2160]]
             .map(|size| Load { anchors: 4_000, pairs: 1e5, size })
