@@ -27,7 +27,9 @@ void main() {
   if (overflow[0] != 0u) return;
   // CPU drivers load a push constant again for every lane wherever it is read in a loop.
   uint offset = push.offset, end = offset + push.n;
-  float rate = push.rate, epsilon = push.epsilon, complement1 = push.complement1, root_decay = push.root_decay, root_complement = push.root_complement, correction = push.correction, root_correction = push.root_correction;
+  float rate = push.rate, epsilon = push.epsilon, complement1 = push.complement1;
+  float root_decay = push.root_decay, root_complement = push.root_complement;
+  float correction = push.correction, root_correction = push.root_correction;
   uint i = offset / 4u + group_index() * (gl_WorkGroupSize.x * VECTORS) + gl_LocalInvocationID.x;
   for (uint k = 0u; k < VECTORS; k++, i += gl_WorkGroupSize.x) {
     if (4u * i >= end) return;

@@ -222,8 +222,8 @@ pub const TABLE: &[Formula] = &[
     Formula {
         pass: "primitives/sort_scan",
         variants: &[],
-        derivation: "a counter per 64 keys (128 digits over blocks of 8192; others have more), read and written: 8 B, 2 operations",
-        work: |c, d| work(d.items(c) * 8.0 / 64.0, d.items(c) * 2.0 / 64.0, 0.0),
+        derivation: "a counter per 128 keys (128 digits over blocks of 16384; others have more), read and written: 8 B, 2 operations",
+        work: |c, d| work(d.items(c) * 8.0 / 128.0, d.items(c) * 2.0 / 128.0, 0.0),
     },
     Formula {
         pass: "primitives/sort_scatter",

@@ -162,7 +162,7 @@ fn sorting(gpu: &Gpu, keys: u32, bits: u32, repetitions: usize) -> Result<Choice
         of(32, 7),
         of(64, 6),
         of(64, 7),
-        of(256, 7),
+        of(128, 7),
     ];
     let mut rng = Pcg64::new(0, 5);
     let words: Vec<u32> = (0..keys).map(|_| rng.random_range(0..1u32 << bits)).collect();

@@ -25,7 +25,7 @@ pub(crate) struct Tuning {
 
 /// On a CPU shared memory costs as much as any other: long runs and wide digits spread the cost of the counters. On a
 /// GPU neighbouring threads should read neighbouring cache lines: short runs.
-pub(crate) const CPU: Tuning = Tuning { items: 128, digit_bits: 7 };
+pub(crate) const CPU: Tuning = Tuning { items: 256, digit_bits: 7 };
 pub(crate) const GPU: Tuning = Tuning { items: 16, digit_bits: 6 };
 
 fn digit(key: u32, shift: u32, mask: u32) -> usize {
