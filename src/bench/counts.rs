@@ -99,7 +99,7 @@ pub const WANTED: [&str; 12] = [
     "depth",
     "ranges",
     "sort_values",
-    "pair_index",
+    "sorted",
     "pair_slot",
     "mean",
     "conic",
