@@ -1,7 +1,7 @@
 //! What the device gives at most: the ceilings under which every pass is judged.
 //!
 //! Each is a kernel that does one thing only, timed by timestamp queries in rounds in which every one has its turn, and
-//! what is measured beside them too. Work grows until one run takes [`LONG_ENOUGH`], so that neither a fast nor a slow
+//! what is measured beside them too. Work grows until one run takes `LONG_ENOUGH`, so that neither a fast nor a slow
 //! device is measured by its clock's ticks. Whatever else the machine does only takes away: floors are of the best round.
 
 use serde::{Deserialize, Serialize};

@@ -2,7 +2,7 @@
 //!
 //! [`ceilings`] measures what the device gives at most; [`cost`] says what every pass has to do, from the numbers that
 //! [`counts`] reads back from a traced step; [`step`] times the step beside it. [`loads`] generates scenes of chosen sizes
-//! and fits how every pass grows; [`tune`] runs the choices that exist as data. [`compare`] sets one record against
+//! and fits how every pass grows; [`tune()`] runs the choices that exist as data. [`compare`] sets one record against
 //! another, [`text`], [`tables`] and [`figures`] write them down.
 
 pub mod ceilings;
