@@ -62,7 +62,7 @@ impl Dispatch<'_> {
     fn items(&self, c: &Counts) -> f64 {
         match self.buffer(0) {
             "visible_count" => c.visible,
-            "slot_count" | "flagged" => c.slots(),
+            "slot_count" | "decoded_flags" => c.slots(),
             "drawn_count" => c.drawn,
             "pair_count" => c.pairs,
             // The host's own counts: counters of each tile and run, and the flags of the culling.
@@ -207,7 +207,7 @@ pub const TABLE: &[Formula] = &[
         work: |c, d| {
             let set = match d.buffer(0) {
                 "count" => c.visible,
-                "flagged" => c.gaussians,
+                "decoded_flags" => c.gaussians,
                 _ => c.drawn,
             };
             work(4.0 * d.items(c) + 4.0 * set, 2.0 * d.items(c) + 2.0 * set, 0.0)
