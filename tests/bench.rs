@@ -75,7 +75,7 @@ fn a_step_is_measured_and_compared() {
         "render/decode",
         "render/rasterize_backward",
         "primitives/sort_scatter",
-        "model/attention_backward",
+        "model/attention_blend_gather",
         "losses/photometric_gradient_weighted",
         "losses/depth_gradient",
         "primitives/finite",
