@@ -38,9 +38,12 @@ void main() {
   uint stride = push.stride, to = h * push.capacity * stride + first / 4u;
   vec4 q[4][16], v[4][16], g[4][16];
   vec3 row[4];
-  [[unroll]] for (uint i = 0u; i < 4u; i++) {
+  // Loops whose length the compiler does not know: llvmpipe makes a loop of every load, and its compiler's time grows with
+  // the square of their number.
+  uint four = min(4u, n.x * HEADS), sixteen = 4u * four;
+  for (uint i = 0u; i < four; i++) {
     uint token = min(first + i, n.x - 1u), at = token * INNER + head;
-    [[unroll]] for (uint d = 0u; d < 16u; d++) {
+    for (uint d = 0u; d < sixteen; d++) {
       q[i][d] = 0.125 * qk[at + d];
       v[i][d] = value[at + d];
       g[i][d] = grad_mixed[at + d];

@@ -32,6 +32,7 @@ layout(local_size_x = 64) in;
 #endif
 layout(constant_id = 0) const float ALPHA_MIN = 0.00392156862745098; // samples below are skipped
 layout(constant_id = 1) const float TRANSMITTANCE_MIN = 1e-4; // a pixel is finished before it falls below
+layout(constant_id = 2) const uint SUBGROUPS = 16u; // subgroups of a wide tile's 64 threads; those of four are the most
 layout(binding = 0, scalar) readonly buffer Ranges { uvec2 ranges[]; };         // [tile + 1] first, one past last in the sorted list
 layout(binding = 1, scalar) readonly buffer Sorted { uint sorted[]; };          // [pair] pair numbers by tile, nearest first
 layout(binding = 2, scalar) readonly buffer PairSlot { uint pair_slot[]; };     // [pair] slot of the Gaussian
@@ -130,20 +131,9 @@ void write(uint p, vec3 q, Sums s) {
 #endif
 }
 
-Sums over_subgroup(Sums s) {
-  s.first = subgroupAdd(s.first);
-  s.second = subgroupAdd(s.second);
-  s.opacity = subgroupAdd(s.opacity);
-  s.color = subgroupAdd(s.color);
-#ifdef WITH_DEPTH
-  s.z = subgroupAdd(s.z);
-#endif
-  return s;
-}
-
-#ifdef NARROW
-// Half of a step of eight sums over eight lanes at once: lanes with the bit keep the second's, the others the first's,
-// and both add what their partner holds of it. After bits 1, 2 and 4 lane k holds the k-th Gaussian's sums.
+// Half of a step of many sums over the lanes at once: lanes with the bit keep the second's, the others the first's, and
+// both add what their partner holds of it. After bits 1 and 2 lane k of four holds the k-th Gaussian's sums over the four
+// lanes, after bits 1, 2 and 4 lane k of eight the k-th's of eight: a fifth of the shuffles that a sum each would take.
 Sums meet(Sums a, Sums b, uint bit) {
   bool upper = (gl_SubgroupInvocationID & bit) != 0u;
 #define MEET(f) s.f = (upper ? b.f : a.f) + subgroupShuffleXor(upper ? a.f : b.f, bit)
@@ -158,11 +148,10 @@ Sums meet(Sums a, Sums b, uint bit) {
 #endif
   return s;
 }
-#endif
 
 #ifndef NARROW
 const uint BATCH = 32u;
-const uint SUBGROUPS = 16u; // most there can be: 64 threads in subgroups of at least 4
+const uint GROUP = 4u; // Gaussians whose sums meet: the fewest lanes a subgroup has
 shared uint s_live;
 shared vec2 s_mean[BATCH];
 shared vec3 s_conic[BATCH];
@@ -235,11 +224,13 @@ void main() {
     if (t == 0u) s_live = 0u;
     barrier();
     if (any_live()) atomicOr(s_live, 1u);
-    if (t < n) {
-      uint g = pair_slot[sorted[base + t]];
+    if (t < BATCH) {
+      // An entry beyond the end has opacity 0, which no pixel blends.
+      bool some = t < n;
+      uint g = pair_slot[sorted[some ? base + t : base]];
       s_mean[t] = mean[g];
       s_conic[t] = conic[g];
-      s_opacity[t] = opacity[g];
+      s_opacity[t] = some ? opacity[g] : 0.0;
       s_color[t] = color[g];
 #ifdef WITH_DEPTH
       s_depth[t] = depth[g];
@@ -247,15 +238,31 @@ void main() {
     }
     barrier();
     if (s_live == 0u) break;
-    for (uint k = 0u; k < n; k++) {
+    for (uint k = 0u; k < n; k += GROUP) {
 #ifdef WITH_DEPTH
-      float z = s_depth[k];
+#define SHARED_SUMS(k) sums_of(s_mean[k], s_conic[k], s_opacity[k], s_color[k], s_depth[k])
 #else
-      float z = 0.0;
+#define SHARED_SUMS(k) sums_of(s_mean[k], s_conic[k], s_opacity[k], s_color[k], 0.0)
 #endif
-      Sums s = over_subgroup(sums_of(s_mean[k], s_conic[k], s_opacity[k], s_color[k], z));
-      if (subgroupElect()) {
-        uint at = k * SUBGROUPS + gl_SubgroupID;
+      Sums s = NO_SUMS;
+      if (subgroupAny(any_live())) {
+        s = SHARED_SUMS(k);
+        s = meet(s, SHARED_SUMS(k + 1u), 1u);
+        Sums b = SHARED_SUMS(k + 2u);
+        b = meet(b, SHARED_SUMS(k + 3u), 1u);
+        s = meet(s, b, 2u);
+        for (uint bit = GROUP; bit < min(gl_SubgroupSize, THREADS); bit *= 2u) {
+          s.first += subgroupShuffleXor(s.first, bit);
+          s.second += subgroupShuffleXor(s.second, bit);
+          s.opacity += subgroupShuffleXor(s.opacity, bit);
+          s.color += subgroupShuffleXor(s.color, bit);
+#ifdef WITH_DEPTH
+          s.z += subgroupShuffleXor(s.z, bit);
+#endif
+        }
+      }
+      if (gl_SubgroupInvocationID < GROUP) {
+        uint at = (k + gl_SubgroupInvocationID) * SUBGROUPS + gl_SubgroupID;
         s_first[at] = s.first;
         s_second[at] = s.second;
         s_color_sum[at] = s.color;

@@ -66,7 +66,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             settings.losses.depth.enabled &= depth;
             settings.model.attention.enabled &= attention;
             settings.model.attention.write_back = write_back;
-            let Trained { summary, report, .. } = train(gpu, &scene, &settings, &name, &out.join(variant))?;
+            let Trained { summary, report, .. } = train(gpu, &scene, &settings, &name, &out.join(variant), None)?;
             let mean = report.and_then(|r| r.mean).expect("there are test views");
             rows.push(Row {
                 variant,

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, bail};
 
 use super::report::{command_line, last_part};
-use super::shared::{DeviceArgs, SceneArgs, load_scene, with_gpu};
+use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, load_scene, with_gpu};
 use crate::bench::ceilings::Prober;
 use crate::bench::compare::{self, Subject};
 use crate::bench::{self, Device, Record, Trained, figures, loads, tables, text};
@@ -58,18 +58,8 @@ pub(super) struct Args {
     /// An earlier bench.json of the same device, scene and settings to compare with
     #[arg(long, value_name = "FILE")]
     against: Option<PathBuf>,
-    /// Steps trained before the measured one
-    #[arg(long, value_name = "N", default_value_t = 50)]
-    warm_up: u32,
-    /// Number that the measured step counts as [default: the first with attention, or the one after the warm-up]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
-    step: Option<u32>,
-    /// Views on which the step is measured, the reference view first
-    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..))]
-    views: u32,
-    /// Timed rounds
-    #[arg(long, value_name = "N", default_value_t = 9, value_parser = clap::value_parser!(u32).range(1..))]
-    repetitions: u32,
+    #[command(flatten)]
+    measure: MeasureArgs,
     #[command(flatten)]
     device: DeviceArgs,
 }
@@ -97,16 +87,16 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         .transpose()?;
     let (scene, facts) = loaded.map_or((None, None), |(scene, facts)| (Some(scene), Some(facts)));
     let json = serde_json::to_value(&settings).context("the settings as JSON")?;
-    let number =
-        |scene| args.step.unwrap_or_else(|| bench::usual_step(&Plan::new(scene, &settings), &settings, args.warm_up));
+    let MeasureArgs { warm_up, step, views, repetitions } = args.measure;
+    let (views, repetitions) = (views as usize, repetitions as usize);
+    let number = |scene| step.unwrap_or_else(|| bench::usual_step(&Plan::new(scene, &settings), &settings, warm_up));
     let step = scene.as_ref().map(number);
-    let repetitions = args.repetitions as usize;
     let mut say = |line: &str| eprintln!("{line}");
     let options = Options { timestamps: true, ..args.device.options() };
     let (record, notes) = with_gpu(&options, |gpu| {
         bench::ensure_timestamps(gpu)?;
         let device = Device::from(gpu.info());
-        let subject = Subject { device: &device, scene: facts.as_ref(), settings: &json, warm_up: args.warm_up, step };
+        let subject = Subject { device: &device, scene: facts.as_ref(), settings: &json, warm_up, step };
         let notes = old
             .as_ref()
             .map(|(path, old)| compare::ensure_comparable(path, old, subject))
@@ -120,9 +110,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         let trained = scene
             .as_ref()
             .zip(step)
-            .map(|(scene, step)| {
-                Trained::new(gpu, scene, &settings, args.warm_up, (step, args.views as usize), &mut say)
-            })
+            .map(|(scene, step)| Trained::new(gpu, scene, &settings, warm_up, (step, views), &mut say))
             .transpose()?;
         let figures = match &trained {
             Some(trained) => Some(trained.measure(gpu, &settings, &mut prober, repetitions, &mut say)?),
@@ -145,7 +133,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             device,
             settings: json.clone(),
             scene: facts.clone(),
-            warm_up: args.warm_up,
+            warm_up,
             ceilings,
             step: figures,
             loads,

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::{Context as _, bail};
 
-use super::shared::{DeviceArgs, SceneArgs, load_scene, with_gpu};
+use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, load_scene, with_gpu};
 use super::train::default_folder;
 use crate::config::Settings;
 use crate::gpu::Options;
@@ -52,18 +52,8 @@ pub(super) struct Args {
     /// KEY=VALUE as for --set, or KEY*=FACTOR to multiply what the settings say; the name may be left out.
     #[arg(long, value_name = "NAME:KEY=VALUE,...")]
     variant: Vec<String>,
-    /// Steps trained before the measured one
-    #[arg(long, value_name = "N", default_value_t = 50)]
-    warm_up: u32,
-    /// Number that the measured step counts as [default: the first with attention, or the one after the warm-up]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
-    step: Option<u32>,
-    /// Views on which the step is measured
-    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..))]
-    views: u32,
-    /// Timed rounds over all choices
-    #[arg(long, value_name = "N", default_value_t = 9, value_parser = clap::value_parser!(u32).range(1..))]
-    repetitions: u32,
+    #[command(flatten)]
+    measure: MeasureArgs,
     /// Times at which figures are taken in a training run
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]
     samples: u32,
@@ -116,10 +106,10 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         Some(with_gpu(&options, |gpu| {
             device = Some(gpu.info().clone());
             let options = kernels::Options {
-                warm_up: args.warm_up,
-                step: args.step,
-                views: args.views as usize,
-                repetitions: args.repetitions as usize,
+                warm_up: args.measure.warm_up,
+                step: args.measure.step,
+                views: args.measure.views as usize,
+                repetitions: args.measure.repetitions as usize,
             };
             Ok(kernels::measure(gpu, &scene, steps, options, &mut say)?)
         })?)

@@ -104,6 +104,23 @@ impl SceneArgs {
     }
 }
 
+/// A step that is measured, and how often.
+#[derive(Debug, Clone, Copy, clap::Args)]
+pub struct MeasureArgs {
+    /// Steps trained before the measured one
+    #[arg(long, value_name = "N", default_value_t = 50)]
+    pub warm_up: u32,
+    /// Number that the measured step counts as [default: the first with attention, or the one after the warm-up]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub step: Option<u32>,
+    /// Views on which the step is measured, the reference view first
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..))]
+    pub views: u32,
+    /// Timed rounds over all there is to measure
+    #[arg(long, value_name = "N", default_value_t = 9, value_parser = clap::value_parser!(u32).range(1..))]
+    pub repetitions: u32,
+}
+
 /// Reads a scene and prints its notes to stderr. `synthetic` writes the built-in scene of seed `train.seed` into a
 /// temporary folder and reads it like any other.
 ///

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
 
 use anyhow::{Context as _, bail, ensure};
 use atomic_write_file::AtomicWriteFile;
@@ -61,6 +62,7 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
+    let began = Some(Instant::now());
     let given = |scene: &PathBuf| SceneArgs { scene: scene.clone(), settings: args.settings.clone() };
     let given = args.scene.as_ref().map(given);
     let (scene, settings, name, folder) = if let Some(folder) = &args.resume {
@@ -91,9 +93,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     with_gpu(&options, |gpu| {
         eprintln!("device: {} ({})", gpu.info().name, gpu.info().driver);
         let Trained { summary, report, mut written } = if args.resume.is_some() {
-            resume(gpu, &scene, &settings, &name, &folder)?
+            resume(gpu, &scene, &settings, &name, &folder, began)?
         } else {
-            train(gpu, &scene, &settings, &name, &folder)?
+            train(gpu, &scene, &settings, &name, &folder, began)?
         };
         if let Some(report) = report {
             println!("{}", report.table());
@@ -125,13 +127,15 @@ pub(super) struct Trained {
     pub written: Vec<&'static str>,
 }
 
-/// Trains into `folder`, in place of any run that is there, and evaluates, with a progress bar on stderr.
+/// Trains into `folder`, in place of any run that is there, and evaluates, with a progress bar on stderr. How long the
+/// first step was in coming is said when it is known when all `began`.
 pub(super) fn train(
     gpu: &Gpu,
     scene: &Scene,
     settings: &Settings,
     name: &str,
     folder: &Path,
+    began: Option<Instant>,
 ) -> anyhow::Result<Trained> {
     std::fs::create_dir_all(folder).with_context(|| format!("{}: cannot be made", folder.display()))?;
     let run = start(gpu, scene, settings)?;
@@ -143,7 +147,7 @@ pub(super) fn train(
     for left in &run.step().plan.left_out {
         eprintln!("left out: {} ({})", left.what, left.why);
     }
-    finish(run, settings, record, folder)
+    finish(run, settings, record, folder, began)
 }
 
 /// A run from its first step, with room for what it is expected to take; refused where the device has not that much.
@@ -163,7 +167,14 @@ fn start<'a>(gpu: &'a Gpu, scene: &'a Scene, settings: &'a Settings) -> anyhow::
 }
 
 /// Goes on with the run in `folder`.
-fn resume(gpu: &Gpu, scene: &Scene, settings: &Settings, name: &str, folder: &Path) -> anyhow::Result<Trained> {
+fn resume(
+    gpu: &Gpu,
+    scene: &Scene,
+    settings: &Settings,
+    name: &str,
+    folder: &Path,
+    began: Option<Instant>,
+) -> anyhow::Result<Trained> {
     sweep(folder);
     let mut record = Record::read(folder)?;
     let owner = Owner::new(scene, settings);
@@ -192,15 +203,21 @@ fn resume(gpu: &Gpu, scene: &Scene, settings: &Settings, name: &str, folder: &Pa
         name.clone_into(&mut record.scene);
         record.write(folder)?;
     }
-    finish(run, settings, record, folder)
+    finish(run, settings, record, folder, began)
 }
 
 /// Trains to the end, evaluates, and marks the run as complete.
-fn finish(mut run: Run<'_>, settings: &Settings, record: Record, folder: &Path) -> anyhow::Result<Trained> {
+fn finish(
+    mut run: Run<'_>,
+    settings: &Settings,
+    record: Record,
+    folder: &Path,
+    began: Option<Instant>,
+) -> anyhow::Result<Trained> {
     eprintln!("anchors: {}", run.step().anchors.count);
     let signals = Signals::listen()?;
     let bar = bar(settings.train.iterations, run.done());
-    let mut watch = Watch { bar, pictures: folder.join(TEST), failed: None, signals };
+    let mut watch = Watch { bar, pictures: folder.join(TEST), failed: None, signals, began };
     let mut summary = run.train(folder, &mut watch)?;
     watch.bar.finish_and_clear();
     if let Some(error) = watch.failed {
@@ -298,6 +315,8 @@ struct Watch {
     pictures: PathBuf,
     failed: Option<pictures::Error>,
     signals: Signals,
+    /// Until the first step has ended.
+    began: Option<Instant>,
 }
 
 /// SIGINT and SIGTERM, remembered; a second one of a kind ends the program at once.
@@ -333,6 +352,9 @@ impl Drop for Signals {
 
 impl Observer for Watch {
     fn step(&mut self, progress: &Progress) {
+        if let Some(began) = self.began.take() {
+            self.say(&format!("first step done {:.2} s after the start", began.elapsed().as_secs_f64()));
+        }
         self.bar.set_position(progress.step.into());
         self.bar.set_message(format!("loss {:.4}  {} anchors", progress.loss, progress.anchors));
     }

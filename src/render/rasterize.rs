@@ -203,7 +203,7 @@ macro_rules! backward_twin {
     ($module:ident, $tile:expr $(, depth: $depth:ident)? $(, transmittance: $transmittance:ident)?) => {
         impl Reference for $module::Kernel {
             fn reference(host: $module::Host<'_>, push: $module::Push, constants: $module::Constants) {
-                let $module::Constants { alpha_min, transmittance_min } = constants;
+                let $module::Constants { alpha_min, transmittance_min, .. } = constants;
                 let $module::Host { ranges, sorted, pair_slot, mean, conic, opacity, color, .. } = host;
                 let splats = Splats { ranges, sorted, pair_slot, mean, conic, opacity, color, alpha_min, transmittance_min };
                 let mut _depth: Option<&[f32]> = None;
@@ -408,6 +408,11 @@ pub struct Backward {
     pub grad_depth: Option<Buffer<f32>>,
 }
 
+/// Subgroups of a wide tile's workgroup: its shared memory has room for the sums of each.
+fn subgroups(gpu: &Gpu) -> u32 {
+    (Tiling::Wide.threads() / gpu.info().subgroup_size).max(1)
+}
+
 impl Backward {
     /// Buffers for so many slots and pairs.
     ///
@@ -456,6 +461,7 @@ impl Backward {
         let size = picture.size;
         let grid = tiling.grid(size);
         let threads = [grid[0] * tiling.threads(), grid[1], 1];
+        let subgroups = subgroups(rec.gpu());
         let (rgb, grad_rgb) = (&picture.rgb, gradient.rgb);
         // Most slots draw nothing and are not looked at again.
         rec.zero(grad_mean);
@@ -468,7 +474,7 @@ impl Backward {
                     ranges, sorted, pair_slot, mean, conic, opacity, color, rgb, grad_rgb, pair_mean, pair_conic,
                     pair_opacity, pair_color $(, $field)*
                 };
-                let constants = $module::Constants { alpha_min, transmittance_min };
+                let constants = $module::Constants { alpha_min, transmittance_min, subgroups };
             rec.run_with($module::Kernel, constants, buffers, $module::Push { size, tiles_x: grid[0] }, threads);
             }};
         }
@@ -709,7 +715,7 @@ mod tests {
                             $($field: extra.$field,)*
                         };
                         let push = $module::Push { size, tiles_x: grid[0] };
-                        let constants = $module::Constants { alpha_min, transmittance_min };
+                        let constants = $module::Constants { alpha_min, transmittance_min, subgroups: subgroups(&gpu) };
                         testing::assert_twin_with($module::Kernel, &gpu, constants, case, push, threads);
                     }};
                 }

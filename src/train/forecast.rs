@@ -68,7 +68,7 @@ pub fn initial(scene: &Scene, settings: &Settings) -> Result<Initial, init::Erro
 
 /// Most cameras that a survey looks through: it comes before the first step, and what they miss the margin of
 /// [`Survey::capacity`] covers.
-const SURVEYED: usize = 24;
+const SURVEYED: usize = 12;
 
 /// Counts what the untrained model shows to these cameras, or where there are many to every n-th.
 ///
