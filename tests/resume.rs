@@ -129,7 +129,10 @@ fn succeeds(command: Command) -> Output {
 
 /// Fails with this code and exactly one error, which it returns.
 fn fails(command: Command, code: i32) -> String {
-    let output = output(command);
+    failed(output(command), code)
+}
+
+fn failed(output: Output, code: i32) -> String {
     let stderr = text(&output.stderr);
     assert_eq!(output.status.code(), Some(code), "{stderr}");
     assert_eq!(stderr.matches("error:").count(), 1, "{stderr}");
@@ -443,7 +446,13 @@ fn without_room_for_a_checkpoint_the_last_one_stays() {
     let mut limited = Command::new("sh");
     limited.args(["-c", "trap '' XFSZ; ulimit -f 64; exec \"$0\" train --resume run"]).arg(cargo_bin!("gscream-vk"));
     limited.current_dir(place.path()).env("XDG_CACHE_HOME", env!("CARGO_TARGET_TMPDIR"));
-    let stderr = fails(limited, 1);
+    let output = output(limited);
+    // Mesa's newer software drivers keep device memory in files without a name: what lies beyond the limit is not there.
+    if output.status.signal() == Some(signal_hook::consts::SIGBUS) {
+        println!("skipped: to this driver a limit of files is one of device memory, and ends the program");
+        return;
+    }
+    let stderr = failed(output, 1);
     assert!(stderr.contains("the checkpoint cannot be written: File too large"), "{stderr}");
     assert!(stderr.contains(&format!("`gscream-vk train --resume run` goes on behind step {}", before[0])), "{stderr}");
     assert_eq!(place.checkpoints("run"), before);
