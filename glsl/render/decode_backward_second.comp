@@ -11,7 +11,7 @@ layout(constant_id = 1) const uint HEAD = 2u;     // 0 opacity, 1 color, 2 cov
 #include "model.glsl"
 #include "decoder.glsl"
 layout(binding = 0, scalar) readonly buffer Segments { uint segments[]; };  // [K+2] of decode_lists
-layout(binding = 1, scalar) readonly buffer Listed { uint listed[]; };           // [list] k V + v, ascending
+layout(binding = 1, scalar) readonly buffer Listed { uint listed[]; };           // [list] slots k V + v, ascending
 layout(binding = 2, scalar) readonly buffer Hidden { vec4 hidden[]; };           // [V*24] of decode_hidden
 layout(binding = 3, scalar) readonly buffer GradOutput { float grad_output[]; }; // [V*D] of decode_backward
 layout(binding = 4, scalar) writeonly buffer Partial { vec4 partial[]; };        // [chunk*91] 11 outputs by 32 units, 11 biases

@@ -1,8 +1,9 @@
 //! Visible anchors into neural Gaussians (Scaffold-GS, section 3.2), and the gradients back to the model.
 //!
 //! Two in three Gaussians do not exist: their opacity is not positive. Opacities come first; the Gaussians that exist are
-//! listed by their number k, then by anchor, and the other heads and the second layer's weight gradients are computed for
-//! those alone. What is not listed is not written.
+//! listed by their number k, then by anchor ([`Slots`]), and the other heads and the second layer's weight gradients are
+//! computed for those alone. What is not listed is not written. On the way back few of these have a gradient: those that
+//! touch a tile.
 //!
 //! Both layers and all their gradients are matrix products in which a thread holds a tile of the result in registers
 //! (16 units of 8 anchors, of 16 on a CPU, whose loads cost more than what does not fit its registers), so that a load
@@ -15,6 +16,7 @@
 //! chunks, then over the runs. With n anchors or Gaussians the rounding error is at most
 //! `(n / 1024 + 64 + 32 + 32) 2^-24` of the sum of the terms' magnitudes.
 
+use super::slots::Slots;
 use crate::gpu::kernels::render::{
     decode, decode_backward, decode_backward_feature, decode_backward_first, decode_backward_fixed,
     decode_backward_fixed_offset, decode_backward_fixed_scaling, decode_backward_hidden, decode_backward_second,
@@ -24,7 +26,7 @@ use crate::gpu::kernels::render::{
 use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
 use crate::math::camera::{from_center, split};
 use crate::math::decoder::{
-    ActivationGradient, FEATURE, Gaussian, HEADS, HIDDEN, INPUT, Layout, activate, activate_backward, input, outputs_of,
+    FEATURE, Gaussian, HEADS, HIDDEN, INPUT, Layout, activate, activate_backward, input, outputs_of,
 };
 use crate::primitives::{Compact, Count, dispatch};
 
@@ -150,8 +152,9 @@ impl Reference for decode_opacity::Kernel {
         for v in 0..n {
             for k in 0..layout.offsets {
                 let opacity = second_layer(layout, packed, hidden, v, (0, k)).tanh() as f32;
-                host.opacity[v * layout.offsets + k] = opacity;
-                host.flags[k * n + v] = (opacity > push.above).into();
+                let slot = k * n + v;
+                host.opacity[slot] = opacity;
+                host.flags[slot] = (opacity > push.above).into();
             }
         }
     }
@@ -195,6 +198,7 @@ impl Reference for decode::Kernel {
     fn reference(host: decode::Host<'_>, push: decode::Push, constants: decode::Constants) {
         let layout = Layout { offsets: constants.offsets as usize };
         let (packed, hidden) = (host.packed.as_flattened(), host.hidden.as_flattened());
+        let n = host.segments[layout.offsets + 1] as usize;
         for (k, anchors) in lists(host.segments, host.listed, layout.offsets) {
             for v in anchors {
                 let anchor = host.visible[v] as usize;
@@ -203,7 +207,7 @@ impl Reference for decode::Kernel {
                 for (raw, of) in raw.iter_mut().zip(outputs_of(k)) {
                     *raw = second_layer(layout, packed, hidden, v, of);
                 }
-                let slot = v * layout.offsets + k;
+                let slot = k * n + v;
                 let offset = wide(host.offset[anchor * layout.offsets + k]);
                 let g = activate(raw, wide(seen), offset, six(host.log_scaling, anchor));
                 host.position[slot] = narrow(g.position);
@@ -225,16 +229,16 @@ impl Reference for decode::Kernel {
 macro_rules! backward_twin {
     ($module:ident $(, position: $position:ident)? $(, offset: $offset:ident)? $(, scaling: $scaling:ident)?) => {
         impl Reference for $module::Kernel {
-            fn reference(host: $module::Host<'_>, push: $module::Push, constants: $module::Constants) {
+            fn reference(host: $module::Host<'_>, (): (), constants: $module::Constants) {
                 let layout = Layout { offsets: constants.offsets as usize };
                 let grad_output = host.grad_output.as_flattened_mut();
-                for v in 0..host.groups[3] as usize {
+                let n = host.groups[3] as usize;
+                for v in 0..n {
                     let anchor = host.visible[v] as usize;
                     let log_scaling = six(host.log_scaling, anchor);
                     let mut sum = [0.0; 6];
-                    grad_output[v * layout.rows()..][..layout.rows()].fill(0.0);
-                    for k in 0..layout.offsets {
-                        let (slot, at) = (v * layout.offsets + k, anchor * layout.offsets + k);
+                    for k in (0..layout.offsets).filter(|k| host.drawn[k * n + v] != 0) {
+                        let (slot, at) = (k * n + v, anchor * layout.offsets + k);
                         let of = Gaussian {
                             position: [0.0; 3],
                             opacity: host.opacity[slot].into(),
@@ -257,11 +261,7 @@ macro_rules! backward_twin {
                             rotation: wide(host.grad_rotation[slot]),
                             norm: 0.0,
                         };
-                        let g = if host.opacity[slot] > push.above {
-                            activate_backward(&of, _offset, log_scaling, &grad)
-                        } else {
-                            ActivationGradient::default()
-                        };
+                        let g = activate_backward(&of, _offset, log_scaling, &grad);
                         let _ = at;
                         $(host.$offset[at] = narrow(g.offset);)?
                         sum.iter_mut().zip(g.log_scaling).for_each(|(s, g)| *s += g);
@@ -453,6 +453,8 @@ pub struct Anchors<'a> {
 /// Gradients of [`Decode`]'s outputs, \[slot\].
 #[derive(Clone, Copy)]
 pub struct GaussianGradients<'a> {
+    /// Not 0 where a Gaussian has a gradient: the tiles that it touches. Elsewhere nothing else is read.
+    pub drawn: &'a Buffer<u32>,
     /// World.
     pub position: &'a Buffer<[f32; 3]>,
     /// Of the opacity.
@@ -470,9 +472,9 @@ pub struct GaussianGradients<'a> {
 pub struct AnchorGradients<'a> {
     /// \[N*32\]; rows of visible anchors are written, the others left alone.
     pub feature: &'a Buffer<f32>,
-    /// \[N*K\], likewise.
+    /// \[N*K\]; those of Gaussians that have a gradient are written, the others left alone.
     pub offset: &'a Buffer<[f32; 3]>,
-    /// \[N*6\], likewise.
+    /// \[N*6\], as the features'.
     pub log_scaling: &'a Buffer<f32>,
     /// \[W\], every one is written.
     pub weights: &'a Buffer<f32>,
@@ -497,8 +499,7 @@ impl<'a> From<AnchorGradients<'a>> for WantedGradients<'a> {
     }
 }
 
-/// The forward stage. Slot `s = v K + k` is Gaussian `k` of visible anchor `v`; its opacity says whether it was decoded,
-/// and where it was not, nothing else was written.
+/// The forward stage. Every slot of a visible anchor has an opacity; the rest is there for Gaussians that exist.
 #[derive(Debug)]
 pub struct Decode {
     /// Seen from the camera's centre, world axes, \[slot\].
@@ -518,9 +519,8 @@ pub struct Decode {
     /// `[K*V]` which are decoded, and how many flags there are.
     flags: Buffer<u32>,
     flagged: Buffer<u32>,
-    /// `[list]` k V + v of those that are, and how many.
-    listed: Buffer<u32>,
-    listed_count: Buffer<u32>,
+    /// Those that are: they exist.
+    pub existing: Slots,
     /// `[K+2]` of `decode_lists`.
     segments: Buffer<u32>,
     bound: Buffer<u32>,
@@ -569,8 +569,7 @@ impl Decode {
             hidden: gpu.buffer("hidden", anchors * HIDDEN_VEC4)?,
             flags: gpu.buffer("decoded", slots)?,
             flagged: gpu.buffer("decoded_flags", 1)?,
-            listed: gpu.buffer("listed", slots)?,
-            listed_count: gpu.buffer("listed_count", 1)?,
+            existing: Slots::new(gpu, ["listed", "listed_count", "listed_groups"], slots as u32)?,
             segments: gpu.buffer("segments", layout.offsets + 2)?,
             bound: gpu.buffer("listed_bound", 1)?,
             compact: Compact::new(gpu, slots as u32)?,
@@ -583,6 +582,16 @@ impl Decode {
             above,
             tile: tile(gpu),
         })
+    }
+
+    /// `[1]` slots in use: those of all visible anchors.
+    pub fn slots(&self) -> &Buffer<u32> {
+        &self.flagged
+    }
+
+    /// `[slot]` whether a Gaussian was decoded.
+    pub fn decoded(&self) -> &Buffer<u32> {
+        &self.flags
     }
 
     /// Most entries of the lists if each k's were padded to chunks.
@@ -601,7 +610,8 @@ impl Decode {
         dispatch::record_tiles(rec, visible_count, &self.per_opacity, capacity, tile, offsets.div_ceil(OPACITIES));
         let pack = decode_pack::Buffers { weights: anchors.weights, packed: &self.packed };
         rec.run_with(decode_pack::Kernel, decode_pack::Constants { offsets }, pack, (), self.layout.packed());
-        let Self { packed, inputs, hidden, opacity, flags, flagged, listed, listed_count, segments, bound, .. } = self;
+        let Self { packed, inputs, hidden, opacity, flags, flagged, existing, segments, bound, .. } = self;
+        let Slots { list: listed, count: listed_count, .. } = existing;
         let groups = &self.per_anchor.buffer;
         let buffers = decode_input::Buffers {
             groups,
@@ -618,6 +628,7 @@ impl Decode {
         let constants = decode_opacity::Constants { offsets, tile };
         rec.run_with(decode_opacity::Kernel, constants, buffers, push, &self.per_opacity);
         self.compact.record(rec, flags, listed, listed_count, Count::Device(flagged));
+        existing.dispatch(rec);
         let buffers = decode_lists::Buffers { groups, listed, listed_count, segments, bound };
         rec.run_with(decode_lists::Kernel, decode_lists::Constants { offsets }, buffers, (), offsets + 1);
         dispatch::record_tiles(rec, bound, &self.per_listed, self.most_bound(), tile, 1);
@@ -711,18 +722,18 @@ impl DecodeBackward {
         let (offset, log_scaling) = (anchors.offset, anchors.log_scaling);
         let (visible, grad_output) = (anchors.visible, &self.grad_output);
         let Decode { opacity, color, scale, rotation, rotation_norm, .. } = forward;
-        let GaussianGradients { opacity: grad_opacity, color: grad_color, scale: grad_scale, .. } = grad;
+        let GaussianGradients { drawn, opacity: grad_opacity, color: grad_color, scale: grad_scale, .. } = grad;
         let (grad_position, grad_rotation) = (grad.position, grad.rotation);
         macro_rules! back {
             ($module:ident $(, $field:ident)*) => {{
                 let buffers = $module::Buffers {
-                    groups: count, visible, log_scaling, opacity, color, scale, rotation, rotation_norm,
+                    groups: count, visible, log_scaling, drawn, opacity, color, scale, rotation, rotation_norm,
                     grad_opacity, grad_color, grad_scale, grad_rotation, grad_output $(, $field)*
                 };
-                let push = $module::Push { above: forward.above };
-                rec.run_with($module::Kernel, $module::Constants { offsets }, buffers, push, groups);
+                rec.run_with($module::Kernel, $module::Constants { offsets }, buffers, (), groups);
             }};
         }
+        rec.zero(grad_output);
         match (to.offset, to.log_scaling) {
             (Some(grad_offset), Some(grad_log_scaling)) => {
                 back!(decode_backward, offset, grad_position, grad_offset, grad_log_scaling);
@@ -737,7 +748,8 @@ impl DecodeBackward {
             return;
         }
         let grad_hidden = self.grad_hidden.as_ref().expect("made with features or weights");
-        let Decode { packed, inputs, hidden, flagged, segments, listed, tile, .. } = forward;
+        let Decode { packed, inputs, hidden, flagged, segments, existing, tile, .. } = forward;
+        let listed = &existing.list;
         // Flags are counted, K of them per anchor.
         let slots = forward.capacity * offsets;
         let buffers = decode_backward_hidden::Buffers { groups: count, packed, hidden, grad_output, grad_hidden };
@@ -930,11 +942,17 @@ mod tests {
             let push = decode::Push { center, center_low };
             let forward = twin(decode::Kernel, &gpu, constants, case, push, tiles(found) + offsets);
 
+            // Every other of those that exist touches a tile; no row of the others' is left as it was.
+            let mut touched = vec![0; slots + 3];
+            for &slot in &listed[..found] {
+                touched[slot as usize] = (slot + slot / k) % 2 * 3;
+            }
             let case = decode_backward::Arrays {
                 groups: m.counted(),
                 visible: m.visible.clone(),
                 offset: m.offset.clone(),
                 log_scaling: m.log_scaling.clone(),
+                drawn: touched,
                 opacity: flagged.opacity,
                 color: forward.color,
                 scale: forward.scale,
@@ -947,26 +965,25 @@ mod tests {
                 grad_rotation: random(&mut rng, slots, -1.0, 1.0),
                 grad_offset: unwritten(m.offset.len()),
                 grad_log_scaling: vec![testing::UNWRITTEN; m.log_scaling.len()],
-                grad_output: unwritten(count * layout.rows() / 4 + 3),
+                grad_output: vec![[0.0; 4]; count * layout.rows() / 4 + 3],
             };
             macro_rules! fixed {
                 ($module:ident $(, $field:ident)*) => {{
                     let c = case.clone();
                     let case = $module::Arrays {
-                        groups: c.groups, visible: c.visible, log_scaling: c.log_scaling, opacity: c.opacity,
-                        color: c.color, scale: c.scale, rotation: c.rotation, rotation_norm: c.rotation_norm,
+                        groups: c.groups, visible: c.visible, log_scaling: c.log_scaling, drawn: c.drawn,
+                        opacity: c.opacity, color: c.color, scale: c.scale, rotation: c.rotation, rotation_norm: c.rotation_norm,
                         grad_opacity: c.grad_opacity, grad_color: c.grad_color, grad_scale: c.grad_scale,
                         grad_rotation: c.grad_rotation, grad_output: c.grad_output $(, $field: c.$field)*
                     };
-                    twin($module::Kernel, &gpu, $module::Constants { offsets: k }, case, $module::Push { above }, count);
+                    twin($module::Kernel, &gpu, $module::Constants { offsets: k }, case, (), count);
                 }};
             }
             fixed!(decode_backward_fixed_offset, offset, grad_position, grad_log_scaling);
             fixed!(decode_backward_fixed_scaling, grad_position, grad_offset);
             fixed!(decode_backward_fixed);
             let constants = decode_backward::Constants { offsets: k };
-            let push = decode_backward::Push { above };
-            let grad_output = twin(decode_backward::Kernel, &gpu, constants, case, push, count).grad_output;
+            let grad_output = twin(decode_backward::Kernel, &gpu, constants, case, (), count).grad_output;
             let case = decode_backward_hidden::Arrays {
                 groups: m.counted(),
                 packed: packed.clone(),
@@ -1118,7 +1135,8 @@ mod tests {
             weights: &weights,
             visible: &visible,
         };
-        let grad = GaussianGradients { position: &gp, opacity: &go, color: &gc, scale: &gs, rotation: &gr };
+        let drawn = forward.decoded();
+        let grad = GaussianGradients { drawn, position: &gp, opacity: &go, color: &gc, scale: &gs, rotation: &gr };
         let to = AnchorGradients {
             feature: &to_feature,
             offset: &to_offset,
@@ -1180,7 +1198,7 @@ mod tests {
             let mut grad_weights = vec![0.0; weights.len()];
             let (mut offset, mut scaling, mut feature) =
                 (before(3 * m.offset.len()), before(m.log_scaling.len()), before(m.feature.len()));
-            let mut outputs: [Vec<f64>; 5] = Default::default();
+            let mut outputs = [3, 1, 3, 3, 4].map(|width| vec![0.0; width * count * offsets]);
             for (v, &anchor) in m.visible.iter().enumerate() {
                 let a = anchor as usize;
                 let row: [f64; FEATURE] = std::array::from_fn(|i| m.feature[FEATURE * a + i].into());
@@ -1188,21 +1206,24 @@ mod tests {
                 let ls = six(&m.log_scaling, a);
                 let x = input(row, at);
                 let o: Vec<[f64; 3]> = m.offset[a * offsets..][..offsets].iter().map(|o| wide(*o)).collect();
-                for (k, mut g) in decoder::decode(layout, &weights, &x, at, &o, ls).into_iter().enumerate() {
+                let gaussians = decoder::decode(layout, &weights, &x, at, &o, ls);
+                for (k, g) in gaussians.iter().enumerate() {
+                    let slot = k * count + v;
+                    outputs[1][slot] = g.opacity;
                     // What is not decoded is not written, and its gradient is not read.
                     if g.opacity <= f64::from(above) {
-                        g = Gaussian { opacity: g.opacity, ..Gaussian::default() };
-                        got.forget(v * offsets + k);
+                        got.forget(slot);
+                        continue;
                     }
-                    outputs[0].extend(g.position);
-                    outputs[1].push(g.opacity);
-                    outputs[2].extend(g.color);
-                    outputs[3].extend(g.scale);
-                    outputs[4].extend(g.rotation);
+                    for (which, values) in [(0, &g.position[..]), (2, &g.color), (3, &g.scale), (4, &g.rotation)] {
+                        outputs[which][values.len() * slot..][..values.len()].copy_from_slice(values);
+                    }
                 }
-                let upstream = &got.upstream[v * offsets..][..offsets];
-                let g = decoder::decode_backward(layout, &weights, &x, at, &o, ls, upstream, &mut grad_weights);
-                offset[3 * a * offsets..][..3 * offsets].copy_from_slice(g.offset.as_flattened());
+                let upstream: Vec<Gaussian> = (0..offsets).map(|k| got.upstream[k * count + v]).collect();
+                let g = decoder::decode_backward(layout, &weights, &x, at, &o, ls, &upstream, &mut grad_weights);
+                for (k, _) in gaussians.iter().enumerate().filter(|(_, g)| g.opacity > f64::from(above)) {
+                    offset[3 * (a * offsets + k)..][..3].copy_from_slice(&g.offset[k]);
+                }
                 scaling[6 * a..][..6].copy_from_slice(&g.log_scaling);
                 feature[FEATURE * a..][..FEATURE].copy_from_slice(&g.feature);
             }
@@ -1230,7 +1251,10 @@ mod tests {
         let full = run(&gpu, &m, &mut Pcg64::seed_from_u64(4), 70, 0.0, None);
         let room = run(&gpu, &m, &mut Pcg64::seed_from_u64(4), 100, 0.0, None);
         for ((_, a), (_, b)) in full.outputs.iter().zip(&room.outputs) {
-            assert_eq!(a[..], b[..a.len()]);
+            let width = b.len() / 1000;
+            for (k, (a, b)) in a.chunks(70 * width).zip(b.chunks(100 * width)).enumerate() {
+                assert_eq!(a, &b[..a.len()], "Gaussians {k}");
+            }
         }
     }
 

@@ -47,6 +47,7 @@ fn decode() {
             visible: &visible,
         };
         let upstream = GaussianGradients {
+            drawn: forward.decoded(),
             position: &grad.0,
             opacity: &grad.1,
             color: &grad.2,
