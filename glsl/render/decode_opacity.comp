@@ -14,14 +14,12 @@ layout(binding = 1, scalar) readonly buffer Packed { vec4 packed[]; };     // of
 layout(binding = 2, scalar) readonly buffer Hidden { vec4 hidden[]; };     // [V*24] of decode_hidden
 layout(binding = 3, scalar) writeonly buffer Opacity { float opacity[]; }; // [K*V] -1 to 1; the Gaussian exists where > 0
 layout(binding = 4, scalar) writeonly buffer Flags { uint flags[]; };      // [K*V] 1 where the Gaussian is decoded, 0 elsewhere
-layout(binding = 5, scalar) writeonly buffer Flagged { uint flagged[]; };  // [1] flags written
 layout(push_constant, scalar) uniform Push {
   float above; // Gaussians with an opacity above this are decoded
 } push;
 void main() {
   const uint PARTS = (OFFSETS + OPACITIES - 1u) / OPACITIES;
   uint t = thread_index(), n = groups[3];
-  if (t == 0u) flagged[0] = n * OFFSETS;
   uint first = OPACITIES * (t % PARTS), v = TILE * (t / PARTS);
   if (v >= n) return;
   float sum[OPACITIES * TILE];

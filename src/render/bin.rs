@@ -16,7 +16,8 @@ use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
 use crate::math::tiles::Support;
 use crate::primitives::compact::Compact;
 use crate::primitives::limit::{Counter, Limits};
-use crate::primitives::scan::Scan;
+use crate::primitives::dispatch::Shape;
+use crate::primitives::scan::{self, Scan};
 use crate::primitives::sort::{Pairs, Sort};
 use crate::primitives::{Count, dispatch};
 
@@ -200,6 +201,8 @@ pub struct Bin {
     tiles: Buffer<u32>,
     first_pair: Buffer<u32>,
     drawn: Slots,
+    per_sorted: Groups,
+    per_scanned: Groups,
     depth_keys: Buffer<u32>,
     depth_values: Buffer<u32>,
     rank_tiles: Buffer<u32>,
@@ -264,13 +267,20 @@ impl Bin {
         let grid = method.tiling.grid(size);
         // One more, for pairs that touch none.
         let tiles = grid[0] * grid[1] + 1;
+        let [per_drawn, per_sorted, per_scanned] = dispatch::several(gpu, "drawn_groups", [64; 3])?;
         Ok(Self {
             method,
             pairs,
             conic: gpu.buffer("conic", n)?,
             tiles: gpu.buffer("tiles", n)?,
             first_pair: gpu.buffer("first_pair", n)?,
-            drawn: Slots::new(gpu, ["drawn", "drawn_count", "drawn_groups"], slots)?,
+            drawn: Slots {
+                list: gpu.buffer("drawn", n)?,
+                count: gpu.buffer("drawn_count", 1)?,
+                groups: per_drawn,
+            },
+            per_sorted,
+            per_scanned,
             depth_keys: gpu.buffer("depth_keys", n)?,
             depth_values: gpu.buffer("depth_values", n)?,
             rank_tiles: gpu.buffer("rank_tiles", n)?,
@@ -311,6 +321,8 @@ impl Bin {
             conic,
             tiles,
             drawn,
+            per_sorted,
+            per_scanned,
             depth_keys,
             depth_values,
             rank_tiles,
@@ -327,19 +339,21 @@ impl Bin {
         let constants = bin_count::Constants { alpha_min };
         rec.run_with(bin_count::Kernel, constants, buffers, bin_count::Push { grid, tile }, groups);
 
-        self.compact.record(rec, tiles, &drawn.list, &drawn.count, Count::Device(slots));
+        self.compact.record(rec, tiles, &drawn.list, &drawn.count, slots);
         limits.note(rec, &drawn.count, Counter::Drawn);
-        drawn.dispatch(rec);
         let (drawn_count, drawn_groups) = (&drawn.count, &drawn.groups);
+        let shapes =
+            [(drawn_groups, Shape::EACH), (per_sorted, self.depth_sort.shape()), (per_scanned, scan::SHAPE)];
+        dispatch::record_several(rec, drawn_count, drawn.list.len() as u32, shapes);
         let buffers =
             bin_depth_keys::Buffers { drawn_count, drawn: &drawn.list, depth, keys: depth_keys, values: depth_values };
         let push = bin_depth_keys::Push { base: depth_key.base, last: depth_key.last() };
         rec.run(bin_depth_keys::Kernel, buffers, push, drawn_groups);
         let pairs = Pairs { keys: depth_keys, values: depth_values };
-        let order = self.depth_sort.record(rec, pairs, Count::Device(drawn_count), 0..depth_key.bits).values;
+        let order = self.depth_sort.record(rec, pairs, Count::Counted(drawn_count, per_sorted), 0..depth_key.bits).values;
 
         rec.run(bin_rank::Kernel, bin_rank::Buffers { drawn_count, order, tiles, rank_tiles }, (), drawn_groups);
-        self.scan.record(rec, rank_tiles, rank_first, pair_total, Count::Device(drawn_count));
+        self.scan.record(rec, rank_tiles, rank_first, pair_total, Count::Counted(drawn_count, per_scanned));
         limits.record(rec, pair_total, pair_count, self.pairs, Counter::Pairs);
         let buffers = bin_expand::Buffers {
             drawn_count,
@@ -422,7 +436,7 @@ mod tests {
         let covariances = gpu.upload("covariance", &covariance).expect(fine);
         let colors = gpu.buffer("color", n).expect(fine);
         let projected = Projected {
-            slots: &count,
+            slots: Count::Device(&count),
             existing: &existing,
             mean: &means,
             covariance: &covariances,

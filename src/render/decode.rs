@@ -7,7 +7,8 @@
 //!
 //! Both layers and all their gradients are matrix products in which a thread holds a tile of the result in registers
 //! (16 units of 8 anchors, of 16 on a CPU, whose loads cost more than what does not fit its registers), so that a load
-//! serves several products; Gaussians of one thread have the same k and so the same weights. Activations are kept from
+//! serves several products; Gaussians of one thread have the same k and so the same weights. In the forms of lanes, for
+//! CPU drivers with subgroups of 8, the lanes also share what they load: the sums are the same. Activations are kept from
 //! the forward pass: 40 + 96 values per visible anchor, 11 K padded to heads of 8 more for the backward pass; at K = 10
 //! each of these buffers stays below 128 MiB up to 240,000 visible anchors.
 //!
@@ -18,17 +19,19 @@
 
 use super::slots::Slots;
 use crate::gpu::kernels::render::{
-    decode, decode_backward, decode_backward_feature, decode_backward_first, decode_backward_fixed,
-    decode_backward_fixed_offset, decode_backward_fixed_scaling, decode_backward_hidden, decode_backward_second,
-    decode_backward_weights, decode_backward_weights_second, decode_hidden, decode_input, decode_lists, decode_opacity,
+    decode, decode_backward, decode_backward_feature, decode_backward_feature_lanes, decode_backward_first,
+    decode_backward_first_lanes, decode_backward_fixed, decode_backward_fixed_offset, decode_backward_fixed_scaling,
+    decode_backward_hidden, decode_backward_hidden_lanes, decode_backward_second, decode_backward_weights,
+    decode_backward_weights_second, decode_hidden, decode_hidden_lanes, decode_input, decode_lists, decode_opacity,
     decode_pack,
 };
-use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
+use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Kernel, Recorder, Reference};
 use crate::math::camera::{from_center, split};
 use crate::math::decoder::{
     FEATURE, Gaussian, HEADS, HIDDEN, INPUT, Layout, activate, activate_backward, input, outputs_of,
 };
-use crate::primitives::{Compact, Count, dispatch};
+use crate::primitives::dispatch::{self, Shape};
+use crate::primitives::{Compact, Count, scan};
 
 /// Threads of a workgroup of all kernels here.
 const GROUP: u32 = 64;
@@ -38,6 +41,10 @@ const UNITS: u32 = 16;
 const OPACITIES: u32 = 5;
 /// Threads that sum one chunk of the first layer's weight gradients.
 const FIRST_PARTS: u32 = 24;
+/// In the forms of lanes: threads of a workgroup, its anchors, and parts of the hidden units.
+const LANES: u32 = 8;
+const LANES_ANCHORS: u32 = 64;
+const LANES_PARTS: u32 = 2;
 /// vec4s of one Gaussian's second layer: 11 rows and 11 biases.
 const SECOND_VEC4: usize = 91;
 /// vec4s of a padded input, of the hidden units.
@@ -65,6 +72,11 @@ fn tile(gpu: &Gpu) -> u32 {
     if gpu.info().kind == "cpu" { 16 } else { 8 }
 }
 
+/// Whether the forms of lanes are taken.
+fn lanes(gpu: &Gpu) -> bool {
+    gpu.info().kind == "cpu" && gpu.info().subgroup_size == LANES
+}
+
 fn wide<const C: usize>(v: [f32; C]) -> [f64; C] {
     v.map(f64::from)
 }
@@ -87,6 +99,7 @@ fn sums(terms: usize) -> Check {
 impl Reference for decode_pack::Kernel {
     fn reference(host: decode_pack::Host<'_>, (): (), constants: decode_pack::Constants) {
         let layout = Layout { offsets: constants.offsets as usize };
+        host.slot_count[0] = host.groups[3] * constants.offsets;
         let packed = host.packed.as_flattened_mut();
         packed[..4 * layout.packed()].fill(0.0);
         for unit in 0..HEADS * HIDDEN {
@@ -124,31 +137,36 @@ impl Reference for decode_input::Kernel {
     }
 }
 
-impl Reference for decode_hidden::Kernel {
-    fn reference(host: decode_hidden::Host<'_>, (): (), _: decode_hidden::Constants) {
-        let (packed, inputs) = (host.packed.as_flattened(), host.inputs.as_flattened());
-        let hidden = host.hidden.as_flattened_mut();
-        for v in 0..host.groups[3] as usize {
-            for unit in 0..HEADS * HIDDEN {
-                let product = |i: usize| {
-                    f64::from(packed[unit * Layout::PADDED_INPUT + i]) * f64::from(inputs[v * Layout::PADDED_INPUT + i])
-                };
-                let sum: f64 = (0..Layout::PADDED_INPUT).map(product).sum();
-                hidden[v * HEADS * HIDDEN + unit] = sum.max(0.0) as f32;
+macro_rules! hidden_twin {
+    ($module:ident) => {
+        impl Reference for $module::Kernel {
+            fn reference(host: $module::Host<'_>, (): (), _: <Self as Kernel>::Constants) {
+                let (packed, inputs) = (host.packed.as_flattened(), host.inputs.as_flattened());
+                let hidden = host.hidden.as_flattened_mut();
+                for v in 0..host.groups[3] as usize {
+                    for unit in 0..HEADS * HIDDEN {
+                        let product = |i: usize| {
+                            f64::from(packed[unit * Layout::PADDED_INPUT + i]) * f64::from(inputs[v * Layout::PADDED_INPUT + i])
+                        };
+                        let sum: f64 = (0..Layout::PADDED_INPUT).map(product).sum();
+                        hidden[v * HEADS * HIDDEN + unit] = sum.max(0.0) as f32;
+                    }
+                }
+            }
+            fn check(_: &'static str) -> Check {
+                sums(Layout::PADDED_INPUT)
             }
         }
-    }
-    fn check(_: &'static str) -> Check {
-        sums(Layout::PADDED_INPUT)
-    }
+    };
 }
+hidden_twin!(decode_hidden);
+hidden_twin!(decode_hidden_lanes);
 
 impl Reference for decode_opacity::Kernel {
     fn reference(host: decode_opacity::Host<'_>, push: decode_opacity::Push, constants: decode_opacity::Constants) {
         let layout = Layout { offsets: constants.offsets as usize };
         let (packed, hidden) = (host.packed.as_flattened(), host.hidden.as_flattened());
         let n = host.groups[3] as usize;
-        host.flagged[0] = (n * layout.offsets) as u32;
         for v in 0..n {
             for k in 0..layout.offsets {
                 let opacity = second_layer(layout, packed, hidden, v, (0, k)).tanh() as f32;
@@ -287,47 +305,60 @@ backward_twin!(decode_backward_fixed_offset, position: grad_position, scaling: g
 backward_twin!(decode_backward_fixed_scaling, position: grad_position, offset: grad_offset);
 backward_twin!(decode_backward_fixed);
 
-impl Reference for decode_backward_hidden::Kernel {
-    fn reference(host: decode_backward_hidden::Host<'_>, (): (), constants: decode_backward_hidden::Constants) {
-        let layout = Layout { offsets: constants.offsets as usize };
-        let (packed, hidden) = (host.packed.as_flattened(), host.hidden.as_flattened());
-        let (grad_output, grad_hidden) = (host.grad_output.as_flattened(), host.grad_hidden.as_flattened_mut());
-        for v in 0..host.groups[3] as usize {
-            for unit in 0..HEADS * HIDDEN {
-                let head = unit / HIDDEN;
-                let product = |row: usize| {
-                    f64::from(packed[4 * FIRST_VEC4 + row * HIDDEN + unit % HIDDEN])
-                        * f64::from(grad_output[v * layout.rows() + row])
-                };
-                let at = v * HEADS * HIDDEN + unit;
-                let sum: f64 = (layout.row(head)..layout.row(head + 1)).map(product).sum();
-                grad_hidden[at] = if hidden[at] > 0.0 { sum as f32 } else { 0.0 };
+macro_rules! backward_hidden_twin {
+    ($module:ident) => {
+        impl Reference for $module::Kernel {
+            fn reference(host: $module::Host<'_>, (): (), constants: $module::Constants) {
+                let layout = Layout { offsets: constants.offsets as usize };
+                let (packed, hidden) = (host.packed.as_flattened(), host.hidden.as_flattened());
+                let (grad_output, grad_hidden) = (host.grad_output.as_flattened(), host.grad_hidden.as_flattened_mut());
+                for v in 0..host.groups[3] as usize {
+                    for unit in 0..HEADS * HIDDEN {
+                        let head = unit / HIDDEN;
+                        let product = |row: usize| {
+                            f64::from(packed[4 * FIRST_VEC4 + row * HIDDEN + unit % HIDDEN])
+                                * f64::from(grad_output[v * layout.rows() + row])
+                        };
+                        let at = v * HEADS * HIDDEN + unit;
+                        let sum: f64 = (layout.row(head)..layout.row(head + 1)).map(product).sum();
+                        grad_hidden[at] = if hidden[at] > 0.0 { sum as f32 } else { 0.0 };
+                    }
+                }
+            }
+            fn check(_: &'static str) -> Check {
+                sums(72)
             }
         }
-    }
-    fn check(_: &'static str) -> Check {
-        sums(72)
-    }
+    };
 }
+backward_hidden_twin!(decode_backward_hidden);
+backward_hidden_twin!(decode_backward_hidden_lanes);
 
-impl Reference for decode_backward_feature::Kernel {
-    fn reference(host: decode_backward_feature::Host<'_>, (): (), _: decode_backward_feature::Constants) {
-        let (packed, grad_hidden) = (host.packed.as_flattened(), host.grad_hidden.as_flattened());
-        for v in 0..host.groups[3] as usize {
-            for i in 0..FEATURE {
-                let product = |unit: usize| {
-                    f64::from(packed[unit * Layout::PADDED_INPUT + i])
-                        * f64::from(grad_hidden[v * HEADS * HIDDEN + unit])
-                };
-                let sum: f64 = (0..HEADS * HIDDEN).map(product).sum();
-                host.grad_feature[FEATURE * host.visible[v] as usize + i] = sum as f32;
+macro_rules! backward_feature_twin {
+    ($module:ident) => {
+        impl Reference for $module::Kernel {
+            fn reference(host: $module::Host<'_>, (): (), _: <Self as Kernel>::Constants) {
+                let (packed, grad_hidden) = (host.packed.as_flattened(), host.grad_hidden.as_flattened());
+                for v in 0..host.groups[3] as usize {
+                    for i in 0..FEATURE {
+                        let product = |unit: usize| {
+                            f64::from(packed[unit * Layout::PADDED_INPUT + i])
+                                * f64::from(grad_hidden[v * HEADS * HIDDEN + unit])
+                        };
+                        let sum: f64 = (0..HEADS * HIDDEN).map(product).sum();
+                        let grad_feature: &mut [f32] = bytemuck::cast_slice_mut(host.grad_feature);
+                    grad_feature[FEATURE * host.visible[v] as usize + i] = sum as f32;
+                    }
+                }
+            }
+            fn check(_: &'static str) -> Check {
+                sums(HEADS * HIDDEN)
             }
         }
-    }
-    fn check(_: &'static str) -> Check {
-        sums(HEADS * HIDDEN)
-    }
+    };
 }
+backward_feature_twin!(decode_backward_feature);
+backward_feature_twin!(decode_backward_feature_lanes);
 
 /// Chunks of a weight gradient: the anchors of each.
 fn chunks(anchors: usize) -> impl Iterator<Item = std::ops::Range<usize>> {
@@ -335,27 +366,33 @@ fn chunks(anchors: usize) -> impl Iterator<Item = std::ops::Range<usize>> {
     (0..anchors).step_by(chunk).map(move |from| from..(from + chunk).min(anchors))
 }
 
-impl Reference for decode_backward_first::Kernel {
-    fn reference(host: decode_backward_first::Host<'_>, (): (), (): ()) {
-        let (inputs, grad_hidden) = (host.inputs.as_flattened(), host.grad_hidden.as_flattened());
-        let partial = host.partial.as_flattened_mut();
-        for (part, anchors) in chunks(host.groups[3] as usize).enumerate() {
-            for unit in 0..HEADS * HIDDEN {
-                for i in 0..Layout::PADDED_INPUT {
-                    let product = |v: usize| {
-                        f64::from(grad_hidden[v * HEADS * HIDDEN + unit])
-                            * f64::from(inputs[v * Layout::PADDED_INPUT + i])
-                    };
-                    partial[4 * FIRST_VEC4 * part + unit * Layout::PADDED_INPUT + i] =
-                        anchors.clone().map(product).sum::<f64>() as f32;
+macro_rules! backward_first_twin {
+    ($module:ident) => {
+        impl Reference for $module::Kernel {
+            fn reference(host: $module::Host<'_>, (): (), (): ()) {
+                let (inputs, grad_hidden) = (host.inputs.as_flattened(), host.grad_hidden.as_flattened());
+                let partial = host.partial.as_flattened_mut();
+                for (part, anchors) in chunks(host.groups[3] as usize).enumerate() {
+                    for unit in 0..HEADS * HIDDEN {
+                        for i in 0..Layout::PADDED_INPUT {
+                            let product = |v: usize| {
+                                f64::from(grad_hidden[v * HEADS * HIDDEN + unit])
+                                    * f64::from(inputs[v * Layout::PADDED_INPUT + i])
+                            };
+                            partial[4 * FIRST_VEC4 * part + unit * Layout::PADDED_INPUT + i] =
+                                anchors.clone().map(product).sum::<f64>() as f32;
+                        }
+                    }
                 }
             }
+            fn check(_: &'static str) -> Check {
+                sums(2 * BLOCK)
+            }
         }
-    }
-    fn check(_: &'static str) -> Check {
-        sums(2 * BLOCK)
-    }
+    };
 }
+backward_first_twin!(decode_backward_first);
+backward_first_twin!(decode_backward_first_lanes);
 
 /// Chunks of the lists: k, and the visible anchors of each.
 fn listed_chunks(segments: &[u32], listed: &[u32], offsets: usize) -> Vec<(usize, Vec<usize>)> {
@@ -368,14 +405,13 @@ fn listed_chunks(segments: &[u32], listed: &[u32], offsets: usize) -> Vec<(usize
 impl Reference for decode_backward_second::Kernel {
     fn reference(host: decode_backward_second::Host<'_>, (): (), constants: decode_backward_second::Constants) {
         let layout = Layout { offsets: constants.offsets as usize };
-        let head = constants.head as usize;
         let (hidden, partial) = (host.hidden.as_flattened(), host.partial.as_flattened_mut());
         for (part, (k, anchors)) in listed_chunks(host.segments, host.listed, layout.offsets).into_iter().enumerate() {
             let partial = &mut partial[4 * SECOND_VEC4 * part..][..4 * SECOND_VEC4];
-            for (at, (of, output)) in outputs_of(k).enumerate().filter(|(_, (of, _))| *of == head) {
+            for (at, (of, output)) in outputs_of(k).enumerate() {
                 let grad = |v: usize| f64::from(host.grad_output[v * layout.rows() + layout.row(of) + output]);
                 for j in 0..HIDDEN {
-                    let product = |&v: &usize| grad(v) * f64::from(hidden[(v * HEADS + head) * HIDDEN + j]);
+                    let product = |&v: &usize| grad(v) * f64::from(hidden[(v * HEADS + of) * HIDDEN + j]);
                     partial[at * HIDDEN + j] = anchors.iter().map(product).sum::<f64>() as f32;
                 }
                 partial[11 * HIDDEN + at] = anchors.iter().map(|&v| grad(v)).sum::<f64>() as f32;
@@ -516,9 +552,9 @@ pub struct Decode {
     packed: Buffer<[f32; 4]>,
     inputs: Buffer<[f32; 4]>,
     hidden: Buffer<[f32; 4]>,
-    /// `[K*V]` which are decoded, and how many flags there are.
+    /// `[slot]` which are decoded, and how many slots there are.
     flags: Buffer<u32>,
-    flagged: Buffer<u32>,
+    slot_count: Buffer<u32>,
     /// Those that are: they exist.
     pub existing: Slots,
     /// `[K+2]` of `decode_lists`.
@@ -528,11 +564,17 @@ pub struct Decode {
     per_anchor: Groups,
     per_hidden: Groups,
     per_opacity: Groups,
+    per_flag: Groups,
+    per_hidden_backward: Groups,
+    per_feature: Groups,
+    per_first: Groups,
     per_listed: Groups,
+    per_second: Groups,
     layout: Layout,
     capacity: u32,
     above: f32,
     tile: u32,
+    lanes: bool,
 }
 
 impl Decode {
@@ -556,7 +598,12 @@ impl Decode {
     pub fn of(gpu: &Gpu, capacity: u32, offsets: u32, above: f32) -> Result<Self, Error> {
         let (anchors, layout) = (capacity as usize, Layout { offsets: offsets as usize });
         let slots = anchors * layout.offsets;
-        let groups = |name| dispatch::groups(gpu, name, GROUP);
+        let lanes = lanes(gpu);
+        let group = if lanes { LANES } else { GROUP };
+        let shapes = [GROUP, group, GROUP, GROUP, group, group, group];
+        let [per_anchor, per_hidden, per_opacity, per_flag, per_hidden_backward, per_feature, per_first] =
+            dispatch::several(gpu, "anchor groups", shapes)?;
+        let [per_existing, per_listed, per_second] = dispatch::several(gpu, "listed groups", [GROUP; 3])?;
         Ok(Self {
             position: gpu.buffer("position", slots)?,
             opacity: gpu.buffer("opacity", slots)?,
@@ -568,25 +615,35 @@ impl Decode {
             inputs: gpu.buffer("inputs", anchors * INPUT_VEC4)?,
             hidden: gpu.buffer("hidden", anchors * HIDDEN_VEC4)?,
             flags: gpu.buffer("decoded", slots)?,
-            flagged: gpu.buffer("decoded_flags", 1)?,
-            existing: Slots::new(gpu, ["listed", "listed_count", "listed_groups"], slots as u32)?,
+            slot_count: gpu.buffer("slot_count", 1)?,
+            existing: Slots {
+                list: gpu.buffer("listed", slots)?,
+                count: gpu.buffer("listed_count", 1)?,
+                groups: per_existing,
+            },
             segments: gpu.buffer("segments", layout.offsets + 2)?,
             bound: gpu.buffer("listed_bound", 1)?,
             compact: Compact::new(gpu, slots as u32)?,
-            per_anchor: groups("decode groups")?,
-            per_hidden: groups("decode hidden groups")?,
-            per_opacity: groups("decode opacity groups")?,
-            per_listed: groups("decode listed groups")?,
+            per_anchor,
+            per_hidden,
+            per_opacity,
+            per_flag,
+            per_hidden_backward,
+            per_feature,
+            per_first,
+            per_listed,
+            per_second,
             layout,
             capacity,
             above,
             tile: tile(gpu),
+            lanes,
         })
     }
 
-    /// `[1]` slots in use: those of all visible anchors.
-    pub fn slots(&self) -> &Buffer<u32> {
-        &self.flagged
+    /// Slots in use: those of all visible anchors.
+    pub fn slots(&self) -> Count<'_> {
+        Count::Counted(&self.slot_count, &self.per_flag)
     }
 
     /// `[slot]` whether a Gaussian was decoded.
@@ -594,25 +651,46 @@ impl Decode {
         &self.flags
     }
 
+    /// Threads for each chunk of the second layer's weight gradients: fewer load less, more hold less in registers.
+    fn second_parts(&self) -> u32 {
+        if self.tile == 16 { 2 } else { 4 }
+    }
+
     /// Most entries of the lists if each k's were padded to chunks.
     fn most_bound(&self) -> u32 {
         (self.capacity + BLOCK as u32) * self.layout.offsets as u32
+    }
+
+    /// How many threads the passes over visible anchors have, and those over their slots.
+    fn count(&self, rec: &mut Recorder<'_>, visible_count: &Buffer<u32>) {
+        let (offsets, tile, lanes) = (self.layout.offsets as u32, self.tile, self.lanes);
+        let units = (HEADS * HIDDEN) as u32 / UNITS;
+        let of = |tile: u32, factor: u32| Shape { tile, factor };
+        // The forms of lanes have LANES threads for each tile and part.
+        let shared = |parts: u32| of(LANES_ANCHORS, LANES * parts);
+        let shapes = [
+            (&self.per_anchor, Shape::EACH),
+            (&self.per_hidden, if lanes { shared(LANES_PARTS) } else { of(tile, units) }),
+            (&self.per_opacity, of(tile, offsets.div_ceil(OPACITIES))),
+            (&self.per_flag, of(scan::SHAPE.tile, offsets)),
+            (&self.per_hidden_backward, if lanes { shared(HEADS as u32) } else { of(tile, units) }),
+            (&self.per_feature, if lanes { shared(1) } else { of(tile, FEATURE as u32 / UNITS) }),
+            (&self.per_first, of(BLOCK as u32, if lanes { LANES } else { FIRST_PARTS })),
+        ];
+        dispatch::record_several(rec, visible_count, self.capacity, shapes);
     }
 
     /// Records the decoding of the first `visible_count` anchors of the visible list for a camera centre (world).
     /// More than the capacity are not decoded.
     pub fn record(&self, rec: &mut Recorder<'_>, anchors: Anchors<'_>, visible_count: &Buffer<u32>, center: [f64; 3]) {
         let [center, center_low] = split(center);
-        let (offsets, tile, capacity) = (self.layout.offsets as u32, self.tile, self.capacity);
-        dispatch::record(rec, visible_count, &self.per_anchor, capacity, 1);
-        let parts = (HEADS * HIDDEN) as u32 / UNITS;
-        dispatch::record_tiles(rec, visible_count, &self.per_hidden, capacity, tile, parts);
-        dispatch::record_tiles(rec, visible_count, &self.per_opacity, capacity, tile, offsets.div_ceil(OPACITIES));
-        let pack = decode_pack::Buffers { weights: anchors.weights, packed: &self.packed };
-        rec.run_with(decode_pack::Kernel, decode_pack::Constants { offsets }, pack, (), self.layout.packed());
-        let Self { packed, inputs, hidden, opacity, flags, flagged, existing, segments, bound, .. } = self;
+        let (offsets, tile) = (self.layout.offsets as u32, self.tile);
+        self.count(rec, visible_count);
+        let Self { packed, inputs, hidden, opacity, flags, slot_count, existing, segments, bound, .. } = self;
         let Slots { list: listed, count: listed_count, .. } = existing;
         let groups = &self.per_anchor.buffer;
+        let pack = decode_pack::Buffers { weights: anchors.weights, groups, packed, slot_count };
+        rec.run_with(decode_pack::Kernel, decode_pack::Constants { offsets }, pack, (), self.layout.packed());
         let buffers = decode_input::Buffers {
             groups,
             visible: anchors.visible,
@@ -621,17 +699,27 @@ impl Decode {
             inputs,
         };
         rec.run(decode_input::Kernel, buffers, decode_input::Push { center, center_low }, &self.per_anchor);
-        let buffers = decode_hidden::Buffers { groups, packed, inputs, hidden };
-        rec.run_with(decode_hidden::Kernel, decode_hidden::Constants { tile }, buffers, (), &self.per_hidden);
-        let buffers = decode_opacity::Buffers { groups, packed, hidden, opacity, flags, flagged };
+        if self.lanes {
+            let buffers = decode_hidden_lanes::Buffers { groups, packed, inputs, hidden };
+            rec.run(decode_hidden_lanes::Kernel, buffers, (), &self.per_hidden);
+        } else {
+            let buffers = decode_hidden::Buffers { groups, packed, inputs, hidden };
+            rec.run_with(decode_hidden::Kernel, decode_hidden::Constants { tile }, buffers, (), &self.per_hidden);
+        }
+        let buffers = decode_opacity::Buffers { groups, packed, hidden, opacity, flags };
         let push = decode_opacity::Push { above: self.above };
         let constants = decode_opacity::Constants { offsets, tile };
         rec.run_with(decode_opacity::Kernel, constants, buffers, push, &self.per_opacity);
-        self.compact.record(rec, flags, listed, listed_count, Count::Device(flagged));
-        existing.dispatch(rec);
+        self.compact.record(rec, flags, listed, listed_count, self.slots());
         let buffers = decode_lists::Buffers { groups, listed, listed_count, segments, bound };
         rec.run_with(decode_lists::Kernel, decode_lists::Constants { offsets }, buffers, (), offsets + 1);
-        dispatch::record_tiles(rec, bound, &self.per_listed, self.most_bound(), tile, 1);
+        let parts = self.second_parts();
+        let shapes = [
+            (&existing.groups, Shape::EACH),
+            (&self.per_listed, Shape { tile, factor: 1 }),
+            (&self.per_second, Shape { tile: BLOCK as u32, factor: parts }),
+        ];
+        dispatch::record_several(rec, bound, self.most_bound(), shapes);
         let buffers = decode::Buffers {
             segments,
             listed,
@@ -657,7 +745,6 @@ impl Decode {
 pub struct DecodeBackward {
     grad_output: Buffer<[f32; 4]>,
     grad_hidden: Option<Buffer<[f32; 4]>>,
-    per_feature: Option<Groups>,
     sums: Option<Sums>,
 }
 
@@ -666,8 +753,6 @@ pub struct DecodeBackward {
 struct Sums {
     first: Buffer<[f32; 4]>,
     second: Buffer<[f32; 4]>,
-    per_first: Groups,
-    per_second: Groups,
 }
 
 impl DecodeBackward {
@@ -691,15 +776,12 @@ impl DecodeBackward {
             Ok(Sums {
                 first: gpu.buffer("first", first * FIRST_VEC4)?,
                 second: gpu.buffer("second", second * SECOND_VEC4)?,
-                per_first: dispatch::groups(gpu, "first groups", GROUP)?,
-                per_second: dispatch::groups(gpu, "second groups", GROUP)?,
             })
         };
         let hidden = || gpu.buffer("grad_hidden", anchors * HIDDEN_VEC4);
         Ok(Self {
             grad_output: gpu.buffer("grad_output", anchors * rows / 4)?,
             grad_hidden: if feature || weights { Some(hidden()?) } else { None },
-            per_feature: if feature { Some(dispatch::groups(gpu, "feature groups", GROUP)?) } else { None },
             sums: if weights { Some(sums()?) } else { None },
         })
     }
@@ -748,35 +830,46 @@ impl DecodeBackward {
             return;
         }
         let grad_hidden = self.grad_hidden.as_ref().expect("made with features or weights");
-        let Decode { packed, inputs, hidden, flagged, segments, existing, tile, .. } = forward;
+        let Decode { packed, inputs, hidden, segments, existing, tile, lanes, .. } = forward;
         let listed = &existing.list;
-        // Flags are counted, K of them per anchor.
-        let slots = forward.capacity * offsets;
-        let buffers = decode_backward_hidden::Buffers { groups: count, packed, hidden, grad_output, grad_hidden };
-        let constants = decode_backward_hidden::Constants { offsets, tile: *tile };
-        rec.run_with(decode_backward_hidden::Kernel, constants, buffers, (), &forward.per_hidden);
-        if let Some(grad_feature) = to.feature {
-            let groups = self.per_feature.as_ref().expect("made with features");
-            dispatch::record_tiles(rec, flagged, groups, slots, tile * offsets, FEATURE as u32 / UNITS);
+        let groups = &forward.per_hidden_backward;
+        if *lanes {
             let buffers =
-                decode_backward_feature::Buffers { groups: count, visible, packed, grad_hidden, grad_feature };
-            let constants = decode_backward_feature::Constants { tile: *tile };
-            rec.run_with(decode_backward_feature::Kernel, constants, buffers, (), groups);
+                decode_backward_hidden_lanes::Buffers { groups: count, packed, hidden, grad_output, grad_hidden };
+            let constants = decode_backward_hidden_lanes::Constants { offsets };
+            rec.run_with(decode_backward_hidden_lanes::Kernel, constants, buffers, (), groups);
+        } else {
+            let buffers = decode_backward_hidden::Buffers { groups: count, packed, hidden, grad_output, grad_hidden };
+            let constants = decode_backward_hidden::Constants { offsets, tile: *tile };
+            rec.run_with(decode_backward_hidden::Kernel, constants, buffers, (), groups);
+        }
+        if let Some(grad_feature) = to.feature {
+            let groups = &forward.per_feature;
+            if *lanes {
+                let grad_feature = &grad_feature.view();
+                let buffers =
+                    decode_backward_feature_lanes::Buffers { groups: count, visible, packed, grad_hidden, grad_feature };
+                rec.run(decode_backward_feature_lanes::Kernel, buffers, (), groups);
+            } else {
+                let buffers =
+                    decode_backward_feature::Buffers { groups: count, visible, packed, grad_hidden, grad_feature };
+                let constants = decode_backward_feature::Constants { tile: *tile };
+                rec.run_with(decode_backward_feature::Kernel, constants, buffers, (), groups);
+            }
         }
         let Some(grad_weights) = to.weights else { return };
-        let Sums { first, second, per_first, per_second } = self.sums.as_ref().expect("made with weights");
-        dispatch::record_tiles(rec, flagged, per_first, slots, BLOCK as u32 * offsets, FIRST_PARTS);
-        let buffers = decode_backward_first::Buffers { groups: count, inputs, grad_hidden, partial: first };
-        rec.run(decode_backward_first::Kernel, buffers, (), per_first);
-        let parts = HIDDEN as u32 / UNITS;
-        dispatch::record_tiles(rec, &forward.bound, per_second, forward.most_bound(), BLOCK as u32, parts);
-        let rows = self.grad_output.view();
-        for head in 0..HEADS as u32 {
-            let buffers =
-                decode_backward_second::Buffers { segments, listed, hidden, grad_output: &rows, partial: second };
-            let constants = decode_backward_second::Constants { offsets, head };
-            rec.run_with(decode_backward_second::Kernel, constants, buffers, (), per_second);
+        let Sums { first, second } = self.sums.as_ref().expect("made with weights");
+        if *lanes {
+            let buffers = decode_backward_first_lanes::Buffers { groups: count, inputs, grad_hidden, partial: first };
+            rec.run(decode_backward_first_lanes::Kernel, buffers, (), &forward.per_first);
+        } else {
+            let buffers = decode_backward_first::Buffers { groups: count, inputs, grad_hidden, partial: first };
+            rec.run(decode_backward_first::Kernel, buffers, (), &forward.per_first);
         }
+        let rows = self.grad_output.view();
+        let buffers = decode_backward_second::Buffers { segments, listed, hidden, grad_output: &rows, partial: second };
+        let constants = decode_backward_second::Constants { offsets, parts: forward.second_parts() };
+        rec.run_with(decode_backward_second::Kernel, constants, buffers, (), &forward.per_second);
         let buffers = decode_backward_weights::Buffers { groups: count, partial: first, grad_weights };
         let constants = decode_backward_weights::Constants { offsets };
         rec.run_with(decode_backward_weights::Kernel, constants, buffers, (), FIRST_VEC4);
@@ -876,7 +969,12 @@ mod tests {
         {
             let m = model(&mut rng, count, offsets);
             let (layout, slots, k) = (m.layout(), count * offsets, offsets as u32);
-            let case = decode_pack::Arrays { weights: m.weights.clone(), packed: unwritten(layout.packed() + 3) };
+            let case = decode_pack::Arrays {
+                weights: m.weights.clone(),
+                groups: m.counted(),
+                packed: unwritten(layout.packed() + 3),
+                slot_count: vec![7],
+            };
             let constants = decode_pack::Constants { offsets: k };
             let packed = twin(decode_pack::Kernel, &gpu, constants, case, (), layout.packed()).packed;
             let case = decode_input::Arrays {
@@ -889,12 +987,22 @@ mod tests {
             let [center, center_low] = split(m.center);
             let push = decode_input::Push { center, center_low };
             let inputs = twin(decode_input::Kernel, &gpu, (), case, push, count).inputs;
-            let case = decode_hidden::Arrays {
-                groups: m.counted(),
-                packed: packed.clone(),
-                inputs: inputs.clone(),
-                hidden: unwritten(count * HIDDEN_VEC4 + 3),
-            };
+            let shared = gpu.info().subgroup_size == LANES;
+            let groups_of = |parts: usize| 8 * parts * count.div_ceil(64);
+            macro_rules! hidden {
+                ($module:ident) => {
+                    $module::Arrays {
+                        groups: m.counted(),
+                        packed: packed.clone(),
+                        inputs: inputs.clone(),
+                        hidden: unwritten(count * HIDDEN_VEC4 + 3),
+                    }
+                };
+            }
+            if shared {
+                twin(decode_hidden_lanes::Kernel, &gpu, (), hidden!(decode_hidden_lanes), (), groups_of(2));
+            }
+            let case = hidden!(decode_hidden);
             let tiles = |n: usize| n.div_ceil(tile as usize);
             let hidden =
                 twin(decode_hidden::Kernel, &gpu, decode_hidden::Constants { tile }, case, (), tiles(count) * 6).hidden;
@@ -904,7 +1012,6 @@ mod tests {
                 hidden: hidden.clone(),
                 opacity: vec![testing::UNWRITTEN; slots + 3],
                 flags: vec![7; slots + 3],
-                flagged: vec![7],
             };
             let constants = decode_opacity::Constants { offsets: k, tile };
             let push = decode_opacity::Push { above };
@@ -984,16 +1091,36 @@ mod tests {
             fixed!(decode_backward_fixed);
             let constants = decode_backward::Constants { offsets: k };
             let grad_output = twin(decode_backward::Kernel, &gpu, constants, case, (), count).grad_output;
-            let case = decode_backward_hidden::Arrays {
-                groups: m.counted(),
-                packed: packed.clone(),
-                hidden: hidden.clone(),
-                grad_output: grad_output.clone(),
-                grad_hidden: unwritten(count * HIDDEN_VEC4 + 3),
-            };
+            macro_rules! backward_hidden {
+                ($module:ident) => {
+                    $module::Arrays {
+                        groups: m.counted(),
+                        packed: packed.clone(),
+                        hidden: hidden.clone(),
+                        grad_output: grad_output.clone(),
+                        grad_hidden: unwritten(count * HIDDEN_VEC4 + 3),
+                    }
+                };
+            }
+            if shared {
+                let constants = decode_backward_hidden_lanes::Constants { offsets: k };
+                let case = backward_hidden!(decode_backward_hidden_lanes);
+                twin(decode_backward_hidden_lanes::Kernel, &gpu, constants, case, (), groups_of(3));
+            }
+            let case = backward_hidden!(decode_backward_hidden);
             let constants = decode_backward_hidden::Constants { offsets: k, tile };
             let threads = tiles(count) * 6;
             let grad_hidden = twin(decode_backward_hidden::Kernel, &gpu, constants, case, (), threads).grad_hidden;
+            if shared {
+                let case = decode_backward_feature_lanes::Arrays {
+                    groups: m.counted(),
+                    visible: m.visible.clone(),
+                    packed: packed.clone(),
+                    grad_hidden: grad_hidden.clone(),
+                    grad_feature: unwritten(m.feature.len() / 4),
+                };
+                twin(decode_backward_feature_lanes::Kernel, &gpu, (), case, (), groups_of(1));
+            }
             let case = decode_backward_feature::Arrays {
                 groups: m.counted(),
                 visible: m.visible.clone(),
@@ -1004,6 +1131,15 @@ mod tests {
             let constants = decode_backward_feature::Constants { tile };
             twin(decode_backward_feature::Kernel, &gpu, constants, case, (), tiles(count) * 2);
             let parts = count.div_ceil(BLOCK);
+            if shared {
+                let case = decode_backward_first_lanes::Arrays {
+                    groups: m.counted(),
+                    inputs: inputs.clone(),
+                    grad_hidden: grad_hidden.clone(),
+                    partial: unwritten(parts * FIRST_VEC4 + 3),
+                };
+                twin(decode_backward_first_lanes::Kernel, &gpu, (), case, (), parts * 8);
+            }
             let case = decode_backward_first::Arrays {
                 groups: m.counted(),
                 inputs: inputs.clone(),
@@ -1014,18 +1150,17 @@ mod tests {
             let grad_weights = vec![testing::UNWRITTEN; layout.weights() + 3];
             let chunks = listed_chunks(&segments, &listed, offsets).len();
             let rows = grad_output.into_flattened();
-            let mut second = unwritten(chunks * SECOND_VEC4 + 3);
-            for head in 0..3 {
-                let case = decode_backward_second::Arrays {
-                    segments: segments.clone(),
-                    listed: listed.clone(),
-                    hidden: hidden.clone(),
-                    grad_output: rows.clone(),
-                    partial: second,
-                };
-                let constants = decode_backward_second::Constants { offsets: k, head };
-                second = twin(decode_backward_second::Kernel, &gpu, constants, case, (), chunks * 2).partial;
-            }
+            let case = decode_backward_second::Arrays {
+                segments: segments.clone(),
+                listed: listed.clone(),
+                hidden: hidden.clone(),
+                grad_output: rows,
+                partial: unwritten(chunks * SECOND_VEC4 + 3),
+            };
+            let parts = if tile == 16 { 2 } else { 4 };
+            let constants = decode_backward_second::Constants { offsets: k, parts };
+            let threads = chunks * parts as usize;
+            let second = twin(decode_backward_second::Kernel, &gpu, constants, case, (), threads).partial;
             let case = decode_backward_weights::Arrays { groups: m.counted(), partial: first, grad_weights };
             let constants = decode_backward_weights::Constants { offsets: k };
             let grad_weights =
@@ -1070,8 +1205,8 @@ mod tests {
             grad_output: flat(&mut rng, count * layout.rows(), -1.0, 1.0),
             partial: vec![[0.0; 4]; chunks * SECOND_VEC4 + 3],
         };
-        let constants = decode_backward_second::Constants { offsets: 9, head: 0 };
-        let partial = twin(decode_backward_second::Kernel, &gpu, constants, case, (), chunks * 2).partial;
+        let constants = decode_backward_second::Constants { offsets: 9, parts: 4 };
+        let partial = twin(decode_backward_second::Kernel, &gpu, constants, case, (), chunks * 4).partial;
         let case = decode_backward_weights_second::Arrays { segments, partial, grad_weights };
         let constants = decode_backward_weights_second::Constants { offsets: 9 };
         twin(decode_backward_weights_second::Kernel, &gpu, constants, case, (), offsets * SECOND_VEC4);

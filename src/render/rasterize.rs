@@ -18,6 +18,7 @@ use crate::gpu::kernels::render::{
     rasterize_gather, rasterize_gather_color, rasterize_narrow, rasterize_narrow_color, rasterize_narrow_depth,
 };
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
+use crate::primitives::Count;
 
 /// Largest alpha of a sample.
 pub const ALPHA_MAX: f64 = 0.99;
@@ -283,8 +284,8 @@ gather_twin!(rasterize_gather_color);
 /// Gaussians in screen space, per slot.
 #[derive(Clone, Copy)]
 pub struct Projected<'a> {
-    /// `[1]` slots in use.
-    pub slots: &'a Buffer<u32>,
+    /// How many slots there are.
+    pub slots: Count<'a>,
     /// Those whose Gaussian exists; the others hold nothing.
     pub existing: &'a Slots,
     /// `[slot]` px.

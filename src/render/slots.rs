@@ -14,7 +14,7 @@ pub struct Slots {
     pub list: Buffer<u32>,
     /// `[1]` how many.
     pub count: Buffer<u32>,
-    /// A thread for each; the fourth word is their number.
+    /// A thread for each, and maybe some more.
     pub groups: Groups,
 }
 

@@ -14,6 +14,7 @@
 //! |S| and all |w_j v_j|.
 
 use gscream_vk::gpu::{Gpu, testing};
+use gscream_vk::primitives::Count;
 use gscream_vk::primitives::limit::Limits;
 use gscream_vk::render::bin::{Bin, Tiling};
 use gscream_vk::render::rasterize::{self, Backward, Outputs, Picture, PictureGradient, Projected};
@@ -164,7 +165,7 @@ fn draw(gpu: &Gpu, tiling: Tiling, size: [u32; 2], splats: &Splats, pairs: u32) 
     let grad_t = gpu.upload("grad_transmittance", &up.iter().map(|u| u.2).collect::<Vec<_>>()).expect(fine);
     let mut rec = gpu.recorder().expect(fine);
     let projected = Projected {
-        slots: &count,
+        slots: Count::Device(&count),
         existing: &existing,
         mean: &mean,
         covariance: &covariance,

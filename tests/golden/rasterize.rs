@@ -2,6 +2,7 @@
 
 use gscream_vk::gpu::{Check, testing};
 use gscream_vk::math::camera::{factors, factors_backward};
+use gscream_vk::primitives::Count;
 use gscream_vk::primitives::limit::Limits;
 use gscream_vk::render::bin::{Bin, Tiling};
 use gscream_vk::render::rasterize::{self, Backward, Outputs, Picture, PictureGradient, Projected};
@@ -104,7 +105,7 @@ fn rasterize() {
 
             let mut rec = gpu.recorder().unwrap();
             let projected = Projected {
-                slots: &count,
+                slots: Count::Device(&count),
                 existing: &existing,
                 mean: &mean,
                 covariance: &covariance,
