@@ -7,7 +7,7 @@ layout(local_size_x = 64) in;
 layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };         // [4] x, y, z of the dispatch; visible anchors
 layout(binding = 1, scalar) readonly buffer Overflow { uint overflow[]; };     // [1] sticky: not 0 skips the step
 layout(binding = 2, scalar) readonly buffer Visible { uint visible[]; };       // [visible] anchors in view
-layout(binding = 3, scalar) readonly buffer GradMean { vec2 grad_mean[]; };    // [slot] per px
+layout(binding = 3, scalar) readonly buffer GradMean { vec2 grad_mean[]; };    // [slot] per px; of Gaussians that touch a tile only
 layout(binding = 4, scalar) readonly buffer Tiles { uint tiles[]; };           // [slot] tiles touched; 0 where nothing is drawn
 layout(binding = 5, scalar) readonly buffer Opacity { float opacity[]; };      // [slot] the Gaussian exists where > 0
 layout(binding = 6, scalar) buffer Gradient { float gradient[]; };             // [anchor, offset] sum of gradient norms, per half picture
@@ -20,9 +20,10 @@ layout(push_constant, scalar) uniform Push {
 } push;
 void main() {
   uint s = thread_index();
-  if (overflow[0] != 0u || s >= groups[3] * push.offsets) return;
-  uint v = s / push.offsets;
-  uint k = s - v * push.offsets;
+  uint n = groups[3];
+  if (overflow[0] != 0u || s >= n * push.offsets) return;
+  uint k = s / n;
+  uint v = s - k * n;
   uint a = visible[v];
   if (tiles[s] > 0u) {
     uint at = a * push.offsets + k;
@@ -35,7 +36,7 @@ void main() {
   }
   if (k == 0u) {
     float sum = 0.0;
-    for (uint i = 0u; i < push.offsets; ++i) sum += max(opacity[s + i], 0.0);
+    for (uint i = 0u; i < push.offsets; ++i) sum += max(opacity[i * n + v], 0.0);
     opacity_sum[a] += sum;
     visits[a] += 1u;
   }

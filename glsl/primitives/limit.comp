@@ -11,11 +11,10 @@ layout(push_constant, scalar) uniform Push {
   uint capacity; // most that fits
   uint bit;      // which bit of the flag
   uint counter;  // where in the counters
-  uint factor;   // count = wanted * factor
 } push;
 void main() {
   bool fits = wanted[0] <= push.capacity;
-  count[0] = fits ? wanted[0] * push.factor : 0u;
+  count[0] = fits ? wanted[0] : 0u;
   if (!fits) overflow[0] |= 1u << push.bit;
   counters[push.counter] = wanted[0];
 }

@@ -12,18 +12,18 @@ layout(constant_id = 1) const uint TILE = 8u;     // Gaussians of a thread
 #include "decoder.glsl"
 #include "camera.glsl"
 layout(binding = 0, scalar) readonly buffer Segments { uint segments[]; };  // [K+2] of decode_lists
-layout(binding = 1, scalar) readonly buffer Listed { uint listed[]; };                   // [list] k V + v, ascending
+layout(binding = 1, scalar) readonly buffer Listed { uint listed[]; };                   // [list] slots k V + v, ascending
 layout(binding = 2, scalar) readonly buffer Visible { uint visible[]; };                 // [V] anchors
 layout(binding = 3, scalar) readonly buffer AnchorPosition { vec3 anchor_position[]; };  // [N] world
 layout(binding = 4, scalar) readonly buffer Offset { vec3 offset[]; };                   // [N*K] in units of the anchor's scaling
 layout(binding = 5, scalar) readonly buffer LogScaling { float log_scaling[]; };         // [N*6] of the offsets 3, of the Gaussians 3
 layout(binding = 6, scalar) readonly buffer Packed { vec4 packed[]; };                   // of decode_pack
 layout(binding = 7, scalar) readonly buffer Hidden { vec4 hidden[]; };                   // [V*24] of decode_hidden
-layout(binding = 8, scalar) writeonly buffer Position { vec3 position[]; };              // [V*K] seen from the camera's centre, world axes; listed ones only
-layout(binding = 9, scalar) writeonly buffer Color { vec3 color[]; };                    // [V*K] 0 to 1, likewise
-layout(binding = 10, scalar) writeonly buffer Scale { vec3 scale[]; };                   // [V*K] standard deviations, world, likewise
-layout(binding = 11, scalar) writeonly buffer Rotation { vec4 rotation[]; };             // [V*K] unit quaternion w x y z, likewise
-layout(binding = 12, scalar) writeonly buffer RotationNorm { float rotation_norm[]; };   // [V*K] length of the quaternion before, likewise
+layout(binding = 8, scalar) writeonly buffer Position { vec3 position[]; };              // [K*V] seen from the camera's centre, world axes; listed ones only
+layout(binding = 9, scalar) writeonly buffer Color { vec3 color[]; };                    // [K*V] 0 to 1, likewise
+layout(binding = 10, scalar) writeonly buffer Scale { vec3 scale[]; };                   // [K*V] standard deviations, world, likewise
+layout(binding = 11, scalar) writeonly buffer Rotation { vec4 rotation[]; };             // [K*V] unit quaternion w x y z, likewise
+layout(binding = 12, scalar) writeonly buffer RotationNorm { float rotation_norm[]; };   // [K*V] length of the quaternion before, likewise
 layout(push_constant, scalar) uniform Push {
   vec3 center;     // of the camera, world, rounded
   vec3 center_low; // the rest of it
@@ -66,7 +66,7 @@ void main() {
   }
   [[unroll]] for (uint a = 0u; a < TILE; ++a) {
     if (begin + a >= end) return;
-    uint slot = v[a] * OFFSETS + k, anchor = visible[v[a]], l = 6u * anchor;
+    uint slot = k * n + v[a], anchor = visible[v[a]], l = 6u * anchor;
     vec3 spread = exp_saturated(vec3(log_scaling[l], log_scaling[l + 1u], log_scaling[l + 2u]));
     vec3 size = exp_saturated(vec3(log_scaling[l + 3u], log_scaling[l + 4u], log_scaling[l + 5u]));
     // Added to the anchor as the camera sees it, an offset is not rounded to the grid of the world's coordinates.

@@ -6,7 +6,8 @@
 // variant fixed_scaling: FIXED_SCALING
 // variant fixed: FIXED_OFFSET FIXED_SCALING
 //
-// Back through the activations: gradients of offsets and log-scales, and of the second layer's outputs. One thread per visible anchor.
+// Back through the activations of the Gaussians that have a gradient: gradients of offsets and log-scales, and of the second
+// layer's outputs. One thread per visible anchor.
 // The variants leave out the gradients of offsets or of log-scales that are not trained.
 layout(local_size_x = 64) in;
 layout(constant_id = 0) const uint OFFSETS = 10u; // Gaussians per anchor
@@ -19,32 +20,30 @@ layout(binding = 1, scalar) readonly buffer Visible { uint visible[]; };        
 layout(binding = 2, scalar) readonly buffer Offset { vec3 offset[]; };                  // [N*K]
 #endif
 layout(binding = 3, scalar) readonly buffer LogScaling { float log_scaling[]; };        // [N*6]
-layout(binding = 4, scalar) readonly buffer Opacity { float opacity[]; };               // [V*K] of decode
-layout(binding = 5, scalar) readonly buffer Color { vec3 color[]; };                    // [V*K] of decode
-layout(binding = 6, scalar) readonly buffer Scale { vec3 scale[]; };                    // [V*K] of decode
-layout(binding = 7, scalar) readonly buffer Rotation { vec4 rotation[]; };              // [V*K] of decode
-layout(binding = 8, scalar) readonly buffer RotationNorm { float rotation_norm[]; };    // [V*K] of decode
+layout(binding = 4, scalar) readonly buffer Drawn { uint drawn[]; };                    // [K*V] 0 where the Gaussian has no gradient
+layout(binding = 5, scalar) readonly buffer Opacity { float opacity[]; };              // [K*V] of decode
+layout(binding = 6, scalar) readonly buffer Color { vec3 color[]; };                    // [K*V] of decode
+layout(binding = 7, scalar) readonly buffer Scale { vec3 scale[]; };                    // [K*V] of decode
+layout(binding = 8, scalar) readonly buffer Rotation { vec4 rotation[]; };              // [K*V] of decode
+layout(binding = 9, scalar) readonly buffer RotationNorm { float rotation_norm[]; };    // [K*V] of decode
 #if !defined(FIXED_OFFSET) || !defined(FIXED_SCALING)
-layout(binding = 9, scalar) readonly buffer GradPosition { vec3 grad_position[]; };     // [V*K]
+layout(binding = 10, scalar) readonly buffer GradPosition { vec3 grad_position[]; };     // [K*V]
 #endif
-layout(binding = 10, scalar) readonly buffer GradOpacity { float grad_opacity[]; };     // [V*K]
-layout(binding = 11, scalar) readonly buffer GradColor { vec3 grad_color[]; };          // [V*K]
-layout(binding = 12, scalar) readonly buffer GradScale { vec3 grad_scale[]; };          // [V*K]
-layout(binding = 13, scalar) readonly buffer GradRotation { vec4 grad_rotation[]; };    // [V*K]
+layout(binding = 11, scalar) readonly buffer GradOpacity { float grad_opacity[]; };     // [K*V]
+layout(binding = 12, scalar) readonly buffer GradColor { vec3 grad_color[]; };          // [K*V]
+layout(binding = 13, scalar) readonly buffer GradScale { vec3 grad_scale[]; };          // [K*V]
+layout(binding = 14, scalar) readonly buffer GradRotation { vec4 grad_rotation[]; };    // [K*V]
 #ifndef FIXED_OFFSET
-layout(binding = 14, scalar) writeonly buffer GradOffset { vec3 grad_offset[]; };       // [N*K] visible anchors only
+layout(binding = 15, scalar) writeonly buffer GradOffset { vec3 grad_offset[]; };       // [N*K] of Gaussians that have one only
 #endif
 #ifndef FIXED_SCALING
-layout(binding = 15, scalar) writeonly buffer GradLogScaling { float grad_log_scaling[]; }; // [N*6] visible anchors only
+layout(binding = 16, scalar) writeonly buffer GradLogScaling { float grad_log_scaling[]; }; // [N*6] visible anchors only
 #endif
-layout(binding = 16, scalar) writeonly buffer GradOutput { vec4 grad_output[]; };       // [V*D/4] before the activations, 0 of Gaussians not decoded and in padded rows
-layout(push_constant, scalar) uniform Push {
-  float above; // Gaussians with an opacity above this were decoded
-} push;
+layout(binding = 17, scalar) writeonly buffer GradOutput { vec4 grad_output[]; };       // [V*D/4] before the activations, of Gaussians that have one only
 void put(uint from, uint row, float value) { grad_output[from + row / 4u][row % 4u] = value; }
 void main() {
-  uint v = thread_index();
-  if (v >= groups[3]) return;
+  uint v = thread_index(), n = groups[3];
+  if (v >= n) return;
   uint anchor = visible[v], l = 6u * anchor, rows = head_row(3u, OFFSETS), to = v * (rows / 4u);
   uint color_row = head_row(1u, OFFSETS), cov_row = head_row(2u, OFFSETS);
 #if !defined(FIXED_OFFSET) || !defined(FIXED_SCALING)
@@ -55,12 +54,14 @@ void main() {
   vec3 grad_spread = vec3(0.0), grad_size = vec3(0.0);
 #endif
   for (uint k = 0u; k < OFFSETS; ++k) {
-    uint slot = v * OFFSETS + k;
-    // What was not decoded has no gradient, and no values.
+    // Each thread goes on to its own next one that has a gradient: of threads that run in step the loop then lasts as long
+    // as the most that any of them has, not K.
+    while (k < OFFSETS && drawn[k * n + v] == 0u) ++k;
+    if (k >= OFFSETS) break;
+    uint slot = k * n + v;
     float o = opacity[slot];
-    bool decoded = o > push.above;
 #if !defined(FIXED_OFFSET) || !defined(FIXED_SCALING)
-    vec3 gp = decoded ? grad_position[slot] : vec3(0.0);
+    vec3 gp = grad_position[slot];
 #endif
 #ifndef FIXED_OFFSET
     grad_offset[anchor * OFFSETS + k] = gp * spread;
@@ -69,20 +70,20 @@ void main() {
     // By the displacement, which is finite where there is a Gaussian: the gradient of an offset of 0 may overflow, this not.
     grad_spread += gp * (offset[anchor * OFFSETS + k] * spread);
 #endif
-    put(to, k, (decoded ? grad_opacity[slot] : 0.0) * ((1.0 - o) * (1.0 + o)));
-    vec3 c = color[slot], gc = decoded ? grad_color[slot] * c * (1.0 - c) : vec3(0.0);
+    put(to, k, grad_opacity[slot] * ((1.0 - o) * (1.0 + o)));
+    vec3 c = color[slot], gc = grad_color[slot] * c * (1.0 - c);
     put(to, color_row + 3u * k, gc.x);
     put(to, color_row + 3u * k + 1u, gc.y);
     put(to, color_row + 3u * k + 2u, gc.z);
-    vec3 s = scale[slot], gs = decoded ? grad_scale[slot] * s : vec3(0.0);
+    vec3 s = scale[slot], gs = grad_scale[slot] * s;
 #ifndef FIXED_SCALING
     grad_size += gs;
 #endif
     // The sigmoid is scale / size; of a size that underflowed to 0 the scale and its gradient are 0.
-    gs = decoded ? gs * (1.0 - s / max(size, vec3(1e-37))) : vec3(0.0);
+    gs *= 1.0 - s / max(size, vec3(1e-37));
     vec4 q = rotation[slot], gq = grad_rotation[slot];
     float norm = rotation_norm[slot];
-    gq = !decoded ? vec4(0.0) : norm < 1e-12 ? gq / 1e-12 : (gq - q * dot(q, gq)) / norm;
+    gq = norm < 1e-12 ? gq / 1e-12 : (gq - q * dot(q, gq)) / norm;
     uint row = cov_row + 7u * k;
     put(to, row, gs.x);
     put(to, row + 1u, gs.y);
@@ -98,7 +99,4 @@ void main() {
     grad_log_scaling[l + 3u + i] = grad_size[i];
   }
 #endif
-  for (uint row = OFFSETS; row < color_row; ++row) put(to, row, 0.0);
-  for (uint row = color_row + 3u * OFFSETS; row < cov_row; ++row) put(to, row, 0.0);
-  for (uint row = cov_row + 7u * OFFSETS; row < rows; ++row) put(to, row, 0.0);
 }

@@ -8,7 +8,7 @@ layout(constant_id = 0) const uint OFFSETS = 10u; // Gaussians per anchor
 #include "model.glsl"
 #include "decoder.glsl"
 layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };           // [4] x, y, z of the dispatch; visible anchors
-layout(binding = 1, scalar) readonly buffer Listed { uint listed[]; };           // [listed_count] k V + v of the decoded Gaussians, ascending
+layout(binding = 1, scalar) readonly buffer Listed { uint listed[]; };           // [listed_count] slots k V + v of the decoded Gaussians, ascending
 layout(binding = 2, scalar) readonly buffer ListedCount { uint listed_count[]; }; // [1]
 layout(binding = 3, scalar) writeonly buffer Segments { uint segments[]; };      // [K+2] where the list of each k begins; its end; visible anchors
 layout(binding = 4, scalar) writeonly buffer Bound { uint bound[]; };            // [1] list entries if each k's were padded to chunks

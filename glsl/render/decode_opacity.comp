@@ -12,16 +12,14 @@ layout(constant_id = 1) const uint TILE = 8u;     // anchors of a thread
 layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };  // [4] x, y, z of the dispatch; visible anchors
 layout(binding = 1, scalar) readonly buffer Packed { vec4 packed[]; };     // of decode_pack
 layout(binding = 2, scalar) readonly buffer Hidden { vec4 hidden[]; };     // [V*24] of decode_hidden
-layout(binding = 3, scalar) writeonly buffer Opacity { float opacity[]; }; // [V*K] -1 to 1; the Gaussian exists where > 0
+layout(binding = 3, scalar) writeonly buffer Opacity { float opacity[]; }; // [K*V] -1 to 1; the Gaussian exists where > 0
 layout(binding = 4, scalar) writeonly buffer Flags { uint flags[]; };      // [K*V] 1 where the Gaussian is decoded, 0 elsewhere
-layout(binding = 5, scalar) writeonly buffer Flagged { uint flagged[]; };  // [1] flags written
 layout(push_constant, scalar) uniform Push {
   float above; // Gaussians with an opacity above this are decoded
 } push;
 void main() {
   const uint PARTS = (OFFSETS + OPACITIES - 1u) / OPACITIES;
   uint t = thread_index(), n = groups[3];
-  if (t == 0u) flagged[0] = n * OFFSETS;
   uint first = OPACITIES * (t % PARTS), v = TILE * (t / PARTS);
   if (v >= n) return;
   float sum[OPACITIES * TILE];
@@ -45,8 +43,9 @@ void main() {
       uint k = first + i;
       if (v + a < n && k < OFFSETS) {
         float o = tanh_safe(sum[OPACITIES * a + i]);
-        opacity[(v + a) * OFFSETS + k] = o;
-        flags[k * n + v + a] = o > push.above ? 1u : 0u;
+        uint slot = k * n + v + a;
+        opacity[slot] = o;
+        flags[slot] = o > push.above ? 1u : 0u;
       }
     }
   }

@@ -3,18 +3,18 @@
 #extension GL_GOOGLE_include_directive : require
 // variant color: COLOR_ONLY
 //
-// Gradients of `project`; `color` for losses that do not look at depth. A coordinate at which the Jacobian's point was clamped has no gradient through the covariance.
+// Gradients of `project`, of the Gaussians that touch a tile; `color` for losses that do not look at depth. A coordinate at which the Jacobian's point was clamped has no gradient through the covariance.
 layout(local_size_x = 64) in;
 #include "thread.glsl"
 #include "camera.glsl"
-layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };                      // [4] x, y, z of the dispatch; visible anchors
-layout(binding = 1, scalar) readonly buffer Position { vec3 position[]; };                  // [slot] seen from the camera's centre, world axes
-layout(binding = 2, scalar) readonly buffer Scale { vec3 scale[]; };                        // [slot] standard deviations, world
-layout(binding = 3, scalar) readonly buffer Rotation { vec4 rotation[]; };                  // [slot] unit quaternion w x y z
-layout(binding = 4, scalar) readonly buffer Depth { float depth[]; };                       // [slot] of `project`: 0 where there is no Gaussian
+layout(binding = 0, scalar) readonly buffer Count { uint count[]; };                        // [1] Gaussians that touch a tile
+layout(binding = 1, scalar) readonly buffer List { uint list[]; };                          // [count] their slots
+layout(binding = 2, scalar) readonly buffer Position { vec3 position[]; };                  // [slot] seen from the camera's centre, world axes
+layout(binding = 3, scalar) readonly buffer Scale { vec3 scale[]; };                        // [slot] standard deviations, world
+layout(binding = 4, scalar) readonly buffer Rotation { vec4 rotation[]; };                  // [slot] unit quaternion w x y z
 layout(binding = 5, scalar) readonly buffer GradMean { vec2 grad_mean[]; };                 // [slot] per px
 layout(binding = 6, scalar) readonly buffer GradCovariance { vec3 grad_covariance[]; };     // [slot] of the factors: variance of x given y, slope, variance of y
-layout(binding = 7, scalar) writeonly buffer GradPosition { vec3 grad_position[]; };        // [slot] 0 where there is no Gaussian
+layout(binding = 7, scalar) writeonly buffer GradPosition { vec3 grad_position[]; };        // [slot] listed ones only
 layout(binding = 8, scalar) writeonly buffer GradScale { vec3 grad_scale[]; };              // [slot] likewise
 layout(binding = 9, scalar) writeonly buffer GradRotation { vec4 grad_rotation[]; };       // [slot] of the quaternion as given, likewise
 #ifndef COLOR_ONLY
@@ -29,17 +29,11 @@ layout(push_constant, scalar) uniform Push {
   vec4 limits;       // lowest x y, highest x y at which the Jacobian is taken, normalised coordinates
   float near;        // a Gaussian's depth is larger
   float max_radius2; // its squared normalised radius is at most this: there the lens polynomial folds back
-  uint offsets;      // slots per visible anchor
 } push;
 void main() {
-  uint slot = thread_index();
-  if (slot >= groups[3] * push.offsets) return;
-  if (!(depth[slot] > 0.0)) {
-    grad_position[slot] = vec3(0.0);
-    grad_scale[slot] = vec3(0.0);
-    grad_rotation[slot] = vec4(0.0);
-    return;
-  }
+  uint i = thread_index();
+  if (i >= count[0]) return;
+  uint slot = list[i];
   Camera camera = CAMERA(push);
   vec3 p = to_camera(camera, position[slot]);
   float inverse_z = 1.0 / p.z;

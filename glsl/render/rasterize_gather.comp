@@ -4,8 +4,8 @@
 // variant color: COLOR_ONLY
 //
 // Gradients of a Gaussian that touches a tile: the sum over its pairs, which lie one behind the other, and from the factors
-// of the conic (1/N, k, 1/V) to those of the covariance (N, k, V): dL/dN = -dL/d(1/N) / N^2. Others' gradients stay as they
-// were (zero).
+// of the conic (1/N, k, 1/V) to those of the covariance (N, k, V): dL/dN = -dL/d(1/N) / N^2. Where the pairs do not fit there
+// are none, and no gradient.
 layout(local_size_x = 64) in;
 #include "thread.glsl"
 layout(binding = 0, scalar) readonly buffer DrawnCount { uint drawn_count[]; }; // [1] Gaussians that touch a tile
@@ -28,8 +28,8 @@ layout(binding = 15, scalar) writeonly buffer GradDepth { float grad_depth[]; };
 #endif
 void main() {
   uint i = thread_index();
-  if (i >= drawn_count[0] || pair_count[0] == 0u) return;
-  uint s = drawn[i], p = first_pair[s], end = p + tiles[s];
+  if (i >= drawn_count[0]) return;
+  uint s = drawn[i], p = first_pair[s], end = pair_count[0] == 0u ? p : p + tiles[s];
   vec2 m = vec2(0.0);
   vec3 g = vec3(0.0), c = vec3(0.0);
   float o = 0.0, z = 0.0;

@@ -62,7 +62,7 @@ impl Dispatch<'_> {
     fn items(&self, c: &Counts) -> f64 {
         match self.buffer(0) {
             "visible_count" => c.visible,
-            "slot_count" | "decoded_flags" => c.slots(),
+            "slot_count" => c.slots(),
             "drawn_count" => c.drawn,
             "pair_count" => c.pairs,
             // The host's own counts: counters of each tile and run, and the flags of the culling.
@@ -173,8 +173,8 @@ pub const TABLE: &[Formula] = &[
     Formula {
         pass: "primitives/dispatch",
         variants: &[],
-        derivation: "a count 4, four words 16 B; 6 operations",
-        work: |_, _| work(20.0, 6.0, 0.0),
+        derivation: "a count 4 B; for each dispatch that it sets four words 16 B; 6 operations",
+        work: |_, d| work(4.0 + (d.bytes)(d.buffer(1)), 6.0 / 16.0 * (d.bytes)(d.buffer(1)), 0.0),
     },
     Formula {
         pass: "primitives/limit",
@@ -205,10 +205,10 @@ pub const TABLE: &[Formula] = &[
         variants: &[],
         derivation: "per flag 4 B, a comparison and a bit; per flag set its index 4 B and two operations: anchors in view, Gaussians that exist, or Gaussians drawn",
         work: |c, d| {
-            let set = match d.buffer(0) {
-                "count" => c.visible,
-                "decoded_flags" => c.gaussians,
-                _ => c.drawn,
+            let set = match d.buffer(1) {
+                "decoded" => c.gaussians,
+                "tiles" => c.drawn,
+                _ => c.visible,
             };
             work(4.0 * d.items(c) + 4.0 * set, 2.0 * d.items(c) + 2.0 * set, 0.0)
         },
@@ -259,7 +259,7 @@ pub const TABLE: &[Formula] = &[
     },
     Formula {
         pass: "render/decode_hidden",
-        variants: &[],
+        variants: &["lanes"],
         derivation: "the first layer; per visible anchor input 160 and hidden units 384 B; 96 units of 37 multiply-adds and a maximum",
         work: |c, _| work(c.first_bytes() + 544.0 * c.visible, 96.0 * 38.0 * c.visible, 0.0),
     },
@@ -287,17 +287,17 @@ pub const TABLE: &[Formula] = &[
     Formula {
         pass: "render/project",
         variants: &[],
-        derivation: "per slot position 12, opacity 4, mean 8, covariance 12, depth 4 B and 24 operations (to the camera, in \
-                     front); for a Gaussian that exists scale 12 and rotation 16 B and 193 operations: perspective 5, lens 18, \
-                     limits 12, Jacobian 24, rows 18, to the world 18, rotation matrix 27, axes 38, narrow variance 21, range 12",
-        work: |c, _| work(40.0 * c.slots() + 28.0 * c.gaussians, 24.0 * c.slots() + 193.0 * c.gaussians, 0.0),
+        derivation: "per Gaussian that exists its place in the list 4, position 12, scale 12, rotation 16, mean 8, covariance 12, \
+                     depth 4 B and 217 operations: to the camera and in front 24, perspective 5, lens 18, limits 12, Jacobian \
+                     24, rows 18, to the world 18, rotation matrix 27, axes 38, narrow variance 21, range 12",
+        work: |c, _| work(68.0 * c.gaussians, 217.0 * c.gaussians, 0.0),
     },
     Formula {
         pass: "render/bin_count",
         variants: &[],
-        derivation: "per slot covariance 12, opacity 4, depth 4, conic 12, tiles 4 B; for a Gaussian that exists mean 8 B, a \
-                     logarithm and 35 operations (support); per row of tiles 40 (the square root of Gaussians times pairs)",
-        work: |c, _| work(36.0 * c.slots() + 8.0 * c.gaussians, 35.0 * c.gaussians + 40.0 * c.tile_rows(), c.gaussians),
+        derivation: "per Gaussian that exists its place in the list 4, mean 8, covariance 12, opacity 4, depth 4, conic 12, tiles \
+                     4 B, a logarithm and 35 operations (support); per row of tiles 40 (the square root of Gaussians times pairs)",
+        work: |c, _| work(48.0 * c.gaussians, 35.0 * c.gaussians + 40.0 * c.tile_rows(), c.gaussians),
     },
     Formula {
         pass: "render/bin_depth_keys",
@@ -403,34 +403,33 @@ pub const TABLE: &[Formula] = &[
     Formula {
         pass: "render/project_backward",
         variants: &["color"],
-        derivation: "per slot depth 4 and gradients 40 B (position 12, scale 12, rotation 16); for a Gaussian that exists \
-                     position 12, scale 12, rotation 16, gradients of mean 8, covariance 12 and depth 4 B and 430 operations: \
+        derivation: "per Gaussian drawn its place in the list 4, position 12, scale 12, rotation 16 and their gradients 40, \
+                     gradients of mean 8, covariance 12 and depth 4 B and 430 operations: \
                      forward again 155, residual 23, gradients of u 17, of the scale 18, of the rotation 70, of the Jacobian's \
                      rows 51, of its point 38, of mean and position 58",
         work: |c, d| {
             let depth = if_so(!d.is("color"));
-            work(44.0 * c.slots() + (60.0 + 4.0 * depth) * c.gaussians, 430.0 * c.gaussians, 0.0)
+            work((104.0 + 4.0 * depth) * c.drawn, 430.0 * c.drawn, 0.0)
         },
     },
     Formula {
         pass: "render/decode_backward",
         variants: &["fixed_offset", "fixed_scaling", "fixed"],
-        derivation: "per visible anchor its number 4, log-scales 24 and their gradient 24 B, 6 exponentials, and per padded \
-                     output 4 B; per slot offset 12 and its gradient 12, Gaussian 48 and its gradients 44 B and 62 operations \
-                     (offset 9, opacity 3, colour 9, scale 15, rotation 26)",
+        derivation: "per visible anchor its number 4, log-scales 24 and their gradient 24 B, 6 exponentials; per slot tiles 4 B; \
+                     per Gaussian drawn offset 12 and its gradient 12, Gaussian 48, its gradients 56 and those of its outputs \
+                     44 B and 62 operations (offset 9, opacity 3, colour 9, scale 15, rotation 26)",
         work: |c, d| {
             let (offset, scaling) = (!d.is("fixed") || d.is("scaling"), !d.is("fixed") || d.is("offset"));
             work(
-                (28.0 + 24.0 * if_so(scaling) + 4.0 * c.rows()) * c.visible
-                    + (104.0 + 12.0 * if_so(offset)) * c.slots(),
-                62.0 * c.slots(),
+                (28.0 + 24.0 * if_so(scaling)) * c.visible + 4.0 * c.slots() + (160.0 + 12.0 * if_so(offset)) * c.drawn,
+                62.0 * c.drawn,
                 6.0 * c.visible,
             )
         },
     },
     Formula {
         pass: "render/decode_backward_hidden",
-        variants: &[],
+        variants: &["lanes"],
         derivation: "the second layer; per visible anchor 4 B per padded output, hidden units 384, their gradient 384 B; 11 K outputs times 32 multiply-adds, 192 for the ReLU",
         work: |c, _| {
             work(
@@ -442,14 +441,14 @@ pub const TABLE: &[Formula] = &[
     },
     Formula {
         pass: "render/decode_backward_feature",
-        variants: &[],
+        variants: &["lanes"],
         derivation: "the first layer; per visible anchor its number 4, gradients of hidden units 384 and feature 128 B; 96 units \
                      times 32 multiply-adds",
         work: |c, _| work(c.first_bytes() + 516.0 * c.visible, 96.0 * 32.0 * c.visible, 0.0),
     },
     Formula {
         pass: "render/decode_backward_first",
-        variants: &[],
+        variants: &["lanes"],
         derivation: "per visible anchor input 160 and gradients of hidden units 384 B; 96 units times 37 multiply-adds; per chunk \
                      of anchors a first layer written",
         work: |c, _| work(544.0 * c.visible + c.chunks() * c.first_bytes(), 96.0 * 37.0 * c.visible, 0.0),
@@ -457,10 +456,10 @@ pub const TABLE: &[Formula] = &[
     Formula {
         pass: "render/decode_backward_second",
         variants: &[],
-        derivation: "one of the three heads, a third of them all; per visible anchor hidden units 384 B; per Gaussian that exists its place in the list 4 B and 44 B of gradients of 11 outputs, times 33; per chunk of 64 a second layer's share of 1452 B written",
+        derivation: "per visible anchor hidden units 384 B; per Gaussian that exists its place in the list 4 B and 44 B of gradients of 11 outputs, times 33; per chunk of 64 a second layer's share of 1452 B written",
         work: |c, _| {
             let bytes = 384.0 * c.visible + (48.0 + 1452.0 / 64.0) * c.gaussians;
-            work(bytes / 3.0, 11.0 * 33.0 * c.gaussians / 3.0, 0.0)
+            work(bytes, 11.0 * 33.0 * c.gaussians, 0.0)
         },
     },
     Formula {

@@ -3,6 +3,7 @@
 use crate::gpu::kernels::densify::statistics;
 use crate::gpu::{Buffer, Error, Gpu, Groups, Recorder, Reference};
 use crate::model::anchors::lengthen;
+use crate::primitives::dispatch;
 
 impl Reference for statistics::Kernel {
     fn reference(host: statistics::Host<'_>, push: statistics::Push, (): ()) {
@@ -10,11 +11,12 @@ impl Reference for statistics::Kernel {
             return;
         }
         let offsets = push.offsets as usize;
-        for (v, &a) in host.visible.iter().take(host.groups[3] as usize).enumerate() {
+        let n = host.groups[3] as usize;
+        for (v, &a) in host.visible.iter().take(n).enumerate() {
             let a = a as usize;
             let mut sum = 0.0;
             for k in 0..offsets {
-                let (s, at) = (v * offsets + k, a * offsets + k);
+                let (s, at) = (k * n + v, a * offsets + k);
                 if host.tiles[s] > 0 {
                     let [x, y] =
                         std::array::from_fn(|i| f64::from(host.grad_mean[s][i]) * f64::from(push.half_size[i]));
@@ -41,18 +43,19 @@ pub struct Statistics {
     /// \[anchor\] steps in which it was in view.
     pub visits: Buffer<u32>,
     offsets: u32,
+    per_slot: Groups,
 }
 
 /// What a step has to say about the Gaussians it drew: one element per slot, or per visible anchor.
 #[derive(Clone, Copy)]
 pub struct Drawn<'a> {
-    /// One thread per slot; the fourth word is the number of visible anchors.
-    pub slots: &'a Groups,
+    /// `[1]` visible anchors.
+    pub visible_count: &'a Buffer<u32>,
     /// Sticky flag of a step that did not fit: such a step is not counted.
     pub overflow: &'a Buffer<u32>,
     /// \[visible\] anchors.
     pub visible: &'a Buffer<u32>,
-    /// \[slot\] per px.
+    /// \[slot\] per px, of Gaussians that touch a tile.
     pub grad_mean: &'a Buffer<[f32; 2]>,
     /// \[slot\] tiles touched, 0 where nothing is drawn.
     pub tiles: &'a Buffer<u32>,
@@ -72,6 +75,7 @@ impl Statistics {
             opacity_sum: gpu.buffer("opacity_sum", anchors)?,
             visits: gpu.buffer("visits", anchors)?,
             offsets,
+            per_slot: dispatch::groups(gpu, "slots", 64)?,
         })
     }
 
@@ -117,8 +121,9 @@ impl Statistics {
     /// norm of `(grad_x W/2, grad_y H/2)` and one sighting; for each visible anchor the sum of its positive opacities
     /// and one visit. Adam must not have zeroed the gradients yet; nothing happens if the overflow flag is up.
     pub fn record(&self, rec: &mut Recorder<'_>, drawn: Drawn<'_>) {
+        dispatch::record(rec, drawn.visible_count, &self.per_slot, drawn.visible.len() as u32, self.offsets);
         let buffers = statistics::Buffers {
-            groups: &drawn.slots.buffer,
+            groups: &self.per_slot.buffer,
             overflow: drawn.overflow,
             visible: drawn.visible,
             grad_mean: drawn.grad_mean,
@@ -130,7 +135,7 @@ impl Statistics {
             visits: &self.visits,
         };
         let half_size = drawn.size.map(|n| n as f32 / 2.0);
-        rec.run(statistics::Kernel, buffers, statistics::Push { half_size, offsets: self.offsets }, drawn.slots);
+        rec.run(statistics::Kernel, buffers, statistics::Push { half_size, offsets: self.offsets }, &self.per_slot);
     }
 }
 

@@ -58,8 +58,10 @@ impl<'a> From<&'a Groups> for Threads<'a> {
 /// Workgroup counts on the device (x, y, z, and the count they come from), written by `primitives/dispatch`.
 #[derive(Debug)]
 pub struct Groups {
-    /// x, y, z of the dispatch, then the clamped count.
+    /// x, y, z of the dispatch, then the clamped count; of each of several dispatches of one count.
     pub buffer: Buffer<u32>,
+    /// Which of them.
+    pub at: u32,
     /// Threads of the workgroups they are meant for.
     pub group: u32,
 }
@@ -463,7 +465,10 @@ impl<'g> Recorder<'g> {
                     device.cmd_push_constants(commands, pipeline.layout, vk::ShaderStageFlags::COMPUTE, 0, push);
                 }
                 match threads {
-                    Threads::Counted(counted) => device.cmd_dispatch_indirect(commands, counted.buffer.slot().raw, 0),
+                    Threads::Counted(counted) => {
+                        let at = 16 * u64::from(counted.at);
+                        device.cmd_dispatch_indirect(commands, counted.buffer.slot().raw, at);
+                    }
                     _ => device.cmd_dispatch(commands, groups[0], groups[1], groups[2]),
                 }
             }

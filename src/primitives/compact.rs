@@ -62,10 +62,10 @@ impl Compact {
         found: &Buffer<u32>,
         count: Count<'_>,
     ) {
-        // Never beyond a buffer, whatever the count on the device says.
-        let capacity = self.capacity.min(flags.len() as u32);
         let (sums, before) = (&self.sums, &self.before);
-        let (count, threads) = self.blocks.record(rec, count);
+        let (count, most, threads) = self.blocks.record(rec, count);
+        // Never beyond a buffer, whatever the count on the device says.
+        let capacity = most.min(flags.len() as u32);
         let counting = scan_sums_nonzero::Buffers { count, terms: flags, sums };
         rec.run(scan_sums_nonzero::Kernel, counting, scan_sums_nonzero::Push { capacity }, threads);
         let top = scan_totals::Buffers { count, terms: sums, prefix: before, total: found };

@@ -3,11 +3,22 @@
 use crate::gpu::kernels::primitives::dispatch;
 use crate::gpu::{Buffer, Error, Gpu, Groups, Recorder, Reference, Threads};
 
+/// Most dispatches of one count: the kernel's.
+const SHAPES: usize = 8;
+
+fn shapes(push: &dispatch::Push) -> [[u32; 3]; SHAPES] {
+    let dispatch::Push { shape0, shape1, shape2, shape3, shape4, shape5, shape6, shape7, .. } = *push;
+    [shape0, shape1, shape2, shape3, shape4, shape5, shape6, shape7]
+}
+
 impl Reference for dispatch::Kernel {
     fn reference(host: dispatch::Host<'_>, push: dispatch::Push, (): ()) {
         let n = host.count[0].min(push.capacity);
-        let groups = (n.div_ceil(push.tile) * push.factor).div_ceil(push.group);
-        host.groups.copy_from_slice(&[groups.min(push.limit), groups.div_ceil(push.limit), 1, n]);
+        let shapes = shapes(&push).into_iter().take(push.number as usize);
+        for (of, [tile, factor, group]) in host.groups.chunks_exact_mut(4).zip(shapes) {
+            let groups = (n.div_ceil(tile) * factor).div_ceil(group);
+            of.copy_from_slice(&[groups.min(push.limit), groups.div_ceil(push.limit), 1, n]);
+        }
     }
 }
 
@@ -16,26 +27,68 @@ impl Reference for dispatch::Kernel {
 /// # Errors
 /// As [`Gpu::buffer`].
 pub fn groups(gpu: &Gpu, name: &'static str, group: u32) -> Result<Groups, Error> {
-    Ok(Groups { buffer: gpu.buffer(name, 4)?, group })
+    let [groups] = several(gpu, name, [group])?;
+    Ok(groups)
+}
+
+/// Workgroup counts of several kinds of kernels, of so many threads each, for the items of one count on the device.
+///
+/// # Errors
+/// As [`Gpu::buffer`].
+pub fn several<const N: usize>(gpu: &Gpu, name: &'static str, group: [u32; N]) -> Result<[Groups; N], Error> {
+    const { assert!(N <= SHAPES) };
+    let buffer: Buffer<u32> = gpu.buffer(name, 4 * N)?;
+    let mut at = 0..;
+    Ok(group.map(|group| Groups { buffer: buffer.view(), at: at.next().unwrap_or_default(), group }))
+}
+
+/// Threads for items: `factor` for each tile of `tile` items begun.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Shape {
+    /// Items of a tile.
+    pub tile: u32,
+    /// Threads of a tile.
+    pub factor: u32,
+}
+
+impl Shape {
+    /// A thread for each item.
+    pub const EACH: Self = Self { tile: 1, factor: 1 };
 }
 
 /// Sets `groups` for `factor` threads per item, at most `capacity` items.
 pub fn record(rec: &mut Recorder<'_>, count: &Buffer<u32>, groups: &Groups, capacity: u32, factor: u32) {
-    record_tiles(rec, count, groups, capacity, 1, factor);
+    record_several(rec, count, capacity, [(groups, Shape { tile: 1, factor })]);
 }
 
-/// Sets `groups` for `factor` threads per tile of `tile` items begun, at most `capacity` items.
-pub fn record_tiles(
+/// Sets all dispatches of one count, made together by [`several`] and in that order, at most `capacity` items.
+pub fn record_several<const N: usize>(
     rec: &mut Recorder<'_>,
     count: &Buffer<u32>,
-    groups: &Groups,
     capacity: u32,
-    tile: u32,
-    factor: u32,
+    of: [(&Groups, Shape); N],
+) {
+    let mut shapes = [[1, 0, 1]; SHAPES];
+    for (i, (groups, Shape { tile, factor })) in of.into_iter().enumerate() {
+        assert_eq!(groups.at as usize, i, "dispatches in the order in which they were made");
+        shapes[i] = [tile, factor, groups.group];
+    }
+    run(rec, count, &of[0].0.buffer, capacity, N as u32, shapes);
+}
+
+fn run(
+    rec: &mut Recorder<'_>,
+    count: &Buffer<u32>,
+    groups: &Buffer<u32>,
+    capacity: u32,
+    number: u32,
+    shapes: [[u32; 3]; SHAPES],
 ) {
     let limit = rec.gpu().info().max_groups.min(65535);
-    let push = dispatch::Push { capacity, tile, factor, group: groups.group, limit };
-    rec.run(dispatch::Kernel, dispatch::Buffers { count, groups: &groups.buffer }, push, 1u32);
+    let [shape0, shape1, shape2, shape3, shape4, shape5, shape6, shape7] = shapes;
+    let push =
+        dispatch::Push { capacity, limit, number, shape0, shape1, shape2, shape3, shape4, shape5, shape6, shape7 };
+    rec.run(dispatch::Kernel, dispatch::Buffers { count, groups }, push, 1u32);
 }
 
 /// How many items a primitive works on.
@@ -45,11 +98,14 @@ pub enum Count<'a> {
     Host(u32),
     /// The first element, known to the device alone; clamped to the primitive's capacity.
     Device(&'a Buffer<u32>),
+    /// As `Device`, where a workgroup for each of the primitive's blocks is already set.
+    Counted(&'a Buffer<u32>, &'a Groups),
 }
 
 /// Dispatch of one workgroup per block of items.
 #[derive(Debug)]
 pub(super) struct Blocks {
+    /// In place of a count, where the host knows it: no limit.
     host: Buffer<u32>,
     groups: Groups,
     capacity: u32,
@@ -59,26 +115,31 @@ pub(super) struct Blocks {
 impl Blocks {
     /// Workgroups of `group` threads for blocks of `items`.
     pub(super) fn new(gpu: &Gpu, capacity: u32, group: u32, items: u32) -> Result<Self, Error> {
-        Ok(Self { host: gpu.buffer("count", 1)?, groups: groups(gpu, "groups", group)?, capacity, items })
+        Ok(Self { host: gpu.upload("count", &[u32::MAX])?, groups: groups(gpu, "groups", group)?, capacity, items })
     }
 
-    /// Where kernels read the count (unclamped), and the dispatch.
+    /// Where kernels read the count, what they clamp it to, and the dispatch.
     ///
     /// # Panics
     /// When a count of the host exceeds the capacity.
-    pub(super) fn record<'a>(&'a self, rec: &mut Recorder<'_>, count: Count<'a>) -> (&'a Buffer<u32>, Threads<'a>) {
+    pub(super) fn record<'a>(
+        &'a self,
+        rec: &mut Recorder<'_>,
+        count: Count<'a>,
+    ) -> (&'a Buffer<u32>, u32, Threads<'a>) {
         match count {
             Count::Host(n) => {
                 assert!(n <= self.capacity, "{n} items where there is room for {}", self.capacity);
-                rec.fill(&self.host, n);
-                (&self.host, Threads::Line(u64::from(n.div_ceil(self.items)) * u64::from(self.groups.group)))
+                let groups = u64::from(n.div_ceil(self.items));
+                (&self.host, n, Threads::Line(groups * u64::from(self.groups.group)))
             }
             Count::Device(count) => {
-                let limit = rec.gpu().info().max_groups.min(65535);
-                let push = dispatch::Push { capacity: self.capacity, tile: 1, factor: 1, group: self.items, limit };
-                rec.run(dispatch::Kernel, dispatch::Buffers { count, groups: &self.groups.buffer }, push, 1u32);
-                (count, Threads::Counted(&self.groups))
+                let mut shapes = [[1, 0, 1]; SHAPES];
+                shapes[0] = [1, 1, self.items];
+                run(rec, count, &self.groups.buffer, self.capacity, 1, shapes);
+                (count, self.capacity, Threads::Counted(&self.groups))
             }
+            Count::Counted(count, groups) => (count, self.capacity, Threads::Counted(groups)),
         }
     }
 }
@@ -92,9 +153,21 @@ mod tests {
     fn matches_its_twin() {
         let gpu = testing::gpu();
         for count in [0, 1, 63, 64, 65, 4096, 5_000_000, u32::MAX] {
-            for (group, tile) in [(1, 1), (64, 1), (256, 1), (64, 16)] {
-                let case = dispatch::Arrays { count: vec![count], groups: vec![u32::MAX; 4] };
-                let push = dispatch::Push { capacity: 10_000_000, tile, factor: 3, group, limit: 65535 };
+            for number in [1, 3, 8] {
+                let case = dispatch::Arrays { count: vec![count], groups: vec![u32::MAX; 4 * number as usize + 2] };
+                let push = dispatch::Push {
+                    capacity: 10_000_000,
+                    limit: 65535,
+                    number,
+                    shape0: [1, 3, 64],
+                    shape1: [1, 3, 1],
+                    shape2: [1, 3, 256],
+                    shape3: [16, 3, 64],
+                    shape4: [64, 24, 64],
+                    shape5: [1, 1, 1024],
+                    shape6: [7, 10, 8],
+                    shape7: [1, 1, 64],
+                };
                 testing::assert_twin(dispatch::Kernel, &gpu, case, push, 1u32);
             }
         }

@@ -7,7 +7,7 @@ impl Reference for limit::Kernel {
     fn reference(host: limit::Host<'_>, push: limit::Push, (): ()) {
         let wanted = host.wanted[0];
         let fits = wanted <= push.capacity;
-        host.count[0] = if fits { wanted * push.factor } else { 0 };
+        host.count[0] = if fits { wanted } else { 0 };
         if !fits {
             host.overflow[0] |= 1 << push.bit;
         }
@@ -33,7 +33,6 @@ pub const COUNTERS: usize = 3;
 pub struct Limits {
     overflow: Buffer<u32>,
     counters: Buffer<u32>,
-    slots: Buffer<u32>,
 }
 
 impl Limits {
@@ -45,7 +44,6 @@ impl Limits {
         Ok(Self {
             overflow: gpu.upload("overflow", &[0])?,
             counters: gpu.upload("counters", &[0; COUNTERS])?,
-            slots: gpu.upload("slot_count", &[0])?,
         })
     }
 
@@ -59,12 +57,7 @@ impl Limits {
         &self.counters
     }
 
-    /// `[1]` slots in use: visible anchors times Gaussians per anchor.
-    pub fn slots(&self) -> &Buffer<u32> {
-        &self.slots
-    }
-
-    /// `count = wanted * factor` if `wanted <= capacity`, otherwise 0 and the flag goes up.
+    /// `count = wanted` if `wanted <= capacity`, otherwise 0 and the flag goes up.
     pub fn record(
         &self,
         rec: &mut Recorder<'_>,
@@ -72,10 +65,9 @@ impl Limits {
         count: &Buffer<u32>,
         capacity: u32,
         counter: Counter,
-        factor: u32,
     ) {
         let buffers = limit::Buffers { wanted, count, overflow: &self.overflow, counters: &self.counters };
-        let push = limit::Push { capacity, bit: counter as u32, counter: counter as u32, factor };
+        let push = limit::Push { capacity, bit: counter as u32, counter: counter as u32 };
         rec.run(limit::Kernel, buffers, push, 1u32);
     }
 
@@ -100,7 +92,7 @@ mod tests {
         let gpu = testing::gpu();
         for wanted in [0, 1, 99, 100, 101, u32::MAX] {
             let case = limit::Arrays { wanted: vec![wanted], count: vec![7], overflow: vec![1], counters: vec![9; 4] };
-            let push = limit::Push { capacity: 100, bit: 3, counter: 2, factor: 10 };
+            let push = limit::Push { capacity: 100, bit: 3, counter: 2 };
             testing::assert_twin(limit::Kernel, &gpu, case, push, 1u32);
         }
     }

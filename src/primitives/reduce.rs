@@ -61,9 +61,9 @@ impl Reduce {
     /// When a count of the host exceeds the capacity.
     pub fn record(&self, rec: &mut Recorder<'_>, values: &Buffer<f32>, sums: &Buffer<f32>, count: Count<'_>) {
         let components = self.components;
+        let (count, most, threads) = self.blocks.record(rec, count);
         // Never beyond a buffer, whatever the count on the device says.
-        let capacity = self.capacity.min((values.len() / components as usize) as u32);
-        let (count, threads) = self.blocks.record(rec, count);
+        let capacity = most.min((values.len() / components as usize) as u32);
         let (mut from, mut items, mut rows) = (values, 1, self.capacity);
         for (level, to) in self.levels.iter().chain([sums]).enumerate() {
             // The last level runs even without rows: the sum of nothing is 0.

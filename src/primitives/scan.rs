@@ -6,10 +6,12 @@
 use crate::gpu::kernels::primitives::{scan_spread, scan_sums, scan_sums_nonzero, scan_totals};
 use crate::gpu::{Buffer, Error, Gpu, Recorder, Reference};
 
-use super::dispatch::{Blocks, Count};
+use super::dispatch::{Blocks, Count, Shape};
 
 /// Terms of a block, one workgroup's.
 pub(super) const BLOCK: u32 = 1024;
+/// Threads for the terms, in groups of 64: for [`Count::Counted`].
+pub const SHAPE: Shape = Shape { tile: BLOCK / 64, factor: 1 };
 /// Up to this capacity one workgroup does it alone.
 const ALONE: u32 = 4 * BLOCK;
 
@@ -110,17 +112,21 @@ impl Scan {
         count: Count<'_>,
     ) {
         // Never beyond a buffer, whatever the count on the device says.
-        let capacity = self.capacity.min(terms.len().min(prefix.len()) as u32);
+        let room = terms.len().min(prefix.len()) as u32;
         let Some(Levels { sums, before }) = &self.levels else {
-            let count = match count {
-                Count::Host(_) => self.blocks.record(rec, count).0,
-                Count::Device(count) => count,
+            let (count, capacity) = match count {
+                Count::Host(_) => {
+                    let (count, most, _) = self.blocks.record(rec, count);
+                    (count, most.min(room))
+                }
+                Count::Device(count) | Count::Counted(count, _) => (count, self.capacity.min(room)),
             };
             let buffers = scan_totals::Buffers { count, terms, prefix, total };
             rec.run(scan_totals::Kernel, buffers, scan_totals::Push { capacity, items: 1 }, 64u32);
             return;
         };
-        let (count, threads) = self.blocks.record(rec, count);
+        let (count, most, threads) = self.blocks.record(rec, count);
+        let capacity = most.min(room);
         rec.run(scan_sums::Kernel, scan_sums::Buffers { count, terms, sums }, scan_sums::Push { capacity }, threads);
         let top = scan_totals::Buffers { count, terms: sums, prefix: before, total };
         rec.run(scan_totals::Kernel, top, scan_totals::Push { capacity, items: BLOCK }, 64u32);

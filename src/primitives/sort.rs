@@ -9,7 +9,7 @@ use std::ops::Range;
 use crate::gpu::kernels::primitives::{sort_count, sort_scan, sort_scatter, sort_scatter_index};
 use crate::gpu::{Buffer, Error, Gpu, Recorder, Reference};
 
-use super::dispatch::{Blocks, Count};
+use super::dispatch::{Blocks, Count, Shape};
 
 /// Threads of a workgroup.
 const GROUP: u32 = 64;
@@ -199,6 +199,11 @@ impl Sort {
         self.sort(rec, pairs, count, bits, false)
     }
 
+    /// Threads for the pairs, in groups of 64: for [`Count::Counted`].
+    pub fn shape(&self) -> Shape {
+        Shape { tile: self.tuning.items, factor: 1 }
+    }
+
     /// As [`Sort::record`], where every pair's value is its own place: the given values are not read.
     ///
     /// # Panics
@@ -223,8 +228,7 @@ impl Sort {
         indices: bool,
     ) -> Pairs<'a> {
         assert!(bits.end <= 32, "keys have 32 bits");
-        // Never beyond a buffer, whatever the count on the device says.
-        let capacity = self.capacity.min(from.keys.len().min(from.values.len()) as u32);
+        let room = from.keys.len().min(from.values.len()) as u32;
         let (stride, items) = (self.stride, self.tuning.items);
         let (counts, totals) = (&self.counts, &self.totals);
         let mut to = Pairs { keys: &self.keys, values: &self.values };
@@ -232,7 +236,9 @@ impl Sort {
         if passes == 0 {
             return from;
         }
-        let (count, threads) = self.blocks.record(rec, count);
+        let (count, most, threads) = self.blocks.record(rec, count);
+        // Never beyond a buffer, whatever the count on the device says.
+        let capacity = most.min(room);
         for pass in 0..passes {
             let shift = bits.start + pass * digit_bits;
             let mask = (1 << digit_bits.min(bits.end - shift)) - 1;

@@ -6,7 +6,9 @@
 //! tile and run, and a pair is touched 9 times, not 30.
 
 use super::method::Method;
+use super::project::listed;
 use super::rasterize::Projected;
+use super::slots::Slots;
 use crate::gpu::kernels::render::{
     bin_count, bin_depth_keys, bin_expand, bin_place, bin_ranges, bin_rank, bin_tally, bin_tally_ranges,
 };
@@ -14,13 +16,14 @@ use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
 use crate::math::tiles::Support;
 use crate::primitives::compact::Compact;
 use crate::primitives::limit::{Counter, Limits};
-use crate::primitives::scan::Scan;
+use crate::primitives::dispatch::Shape;
+use crate::primitives::scan::{self, Scan};
 use crate::primitives::sort::{Pairs, Sort};
 use crate::primitives::{Count, dispatch};
 
 impl Reference for bin_count::Kernel {
     fn reference(host: bin_count::Host<'_>, push: bin_count::Push, constants: bin_count::Constants) {
-        for s in 0..(host.groups[3] * push.offsets) as usize {
+        for s in listed(host.count, host.list) {
             (host.conic[s], host.tiles[s]) = if host.depth[s] > 0.0 {
                 let (m, c) = (host.mean[s], host.covariance[s]);
                 let alpha = (host.opacity[s], constants.alpha_min);
@@ -176,12 +179,8 @@ pub struct Binned<'a> {
     pub conic: &'a Buffer<[f32; 3]>,
     /// `[slot]` tiles touched.
     pub tiles: &'a Buffer<u32>,
-    /// `[drawn]` slots that touch a tile, ascending.
-    pub drawn: &'a Buffer<u32>,
-    /// `[1]` how many.
-    pub drawn_count: &'a Buffer<u32>,
-    /// For kernels with a thread for each.
-    pub drawn_groups: &'a Groups,
+    /// Slots that touch a tile.
+    pub drawn: &'a Slots,
     /// `[1]` pairs.
     pub pair_count: &'a Buffer<u32>,
     /// `[slot]` first pair of each Gaussian that touches a tile.
@@ -201,9 +200,9 @@ pub struct Bin {
     conic: Buffer<[f32; 3]>,
     tiles: Buffer<u32>,
     first_pair: Buffer<u32>,
-    drawn: Buffer<u32>,
-    drawn_count: Buffer<u32>,
-    drawn_groups: Groups,
+    drawn: Slots,
+    per_sorted: Groups,
+    per_scanned: Groups,
     depth_keys: Buffer<u32>,
     depth_values: Buffer<u32>,
     rank_tiles: Buffer<u32>,
@@ -268,15 +267,20 @@ impl Bin {
         let grid = method.tiling.grid(size);
         // One more, for pairs that touch none.
         let tiles = grid[0] * grid[1] + 1;
+        let [per_drawn, per_sorted, per_scanned] = dispatch::several(gpu, "drawn_groups", [64; 3])?;
         Ok(Self {
             method,
             pairs,
             conic: gpu.buffer("conic", n)?,
             tiles: gpu.buffer("tiles", n)?,
             first_pair: gpu.buffer("first_pair", n)?,
-            drawn: gpu.buffer("drawn", n)?,
-            drawn_count: gpu.buffer("drawn_count", 1)?,
-            drawn_groups: dispatch::groups(gpu, "drawn_groups", 64)?,
+            drawn: Slots {
+                list: gpu.buffer("drawn", n)?,
+                count: gpu.buffer("drawn_count", 1)?,
+                groups: per_drawn,
+            },
+            per_sorted,
+            per_scanned,
             depth_keys: gpu.buffer("depth_keys", n)?,
             depth_values: gpu.buffer("depth_values", n)?,
             rank_tiles: gpu.buffer("rank_tiles", n)?,
@@ -299,7 +303,7 @@ impl Bin {
         })
     }
 
-    /// Tiles touched by each slot's Gaussian, for the growth statistics.
+    /// Tiles touched by each slot's Gaussian, 0 also where there is none: for the growth statistics and the way back.
     pub fn tiles(&self) -> &Buffer<u32> {
         &self.tiles
     }
@@ -312,13 +316,13 @@ impl Bin {
         size: [u32; 2],
         limits: &Limits,
     ) -> Binned<'a> {
-        let Projected { slots, offsets, mean, covariance, depth, opacity, .. } = gaussians;
+        let Projected { slots, existing, mean, covariance, depth, opacity, .. } = gaussians;
         let Self {
             conic,
             tiles,
             drawn,
-            drawn_count,
-            drawn_groups,
+            per_sorted,
+            per_scanned,
             depth_keys,
             depth_values,
             rank_tiles,
@@ -328,24 +332,29 @@ impl Bin {
         let Self { pair_total, pair_count, pair_tile, pair_slot, first_pair, ranges, sorted, .. } = self;
         let Method { tiling, alpha_min, depth_key, .. } = self.method;
         let (grid, tile) = (tiling.grid(size), tiling.side());
-        let groups = &slots.buffer;
-        let buffers = bin_count::Buffers { groups, mean, covariance, depth, opacity, conic, tiles };
+        // What does not exist touches none.
+        rec.zero(tiles);
+        let Slots { list, count, groups } = existing;
+        let buffers = bin_count::Buffers { count, list, mean, covariance, depth, opacity, conic, tiles };
         let constants = bin_count::Constants { alpha_min };
-        rec.run_with(bin_count::Kernel, constants, buffers, bin_count::Push { grid, tile, offsets }, slots);
+        rec.run_with(bin_count::Kernel, constants, buffers, bin_count::Push { grid, tile }, groups);
 
-        // Unused slots of the list's end must not count as touched: the flags' number is the slots in use.
-        self.compact.record(rec, tiles, drawn, drawn_count, Count::Device(limits.slots()));
-        limits.note(rec, drawn_count, Counter::Drawn);
-        dispatch::record(rec, drawn_count, drawn_groups, drawn.len() as u32, 1);
-        let buffers = bin_depth_keys::Buffers { drawn_count, drawn, depth, keys: depth_keys, values: depth_values };
+        self.compact.record(rec, tiles, &drawn.list, &drawn.count, slots);
+        limits.note(rec, &drawn.count, Counter::Drawn);
+        let (drawn_count, drawn_groups) = (&drawn.count, &drawn.groups);
+        let shapes =
+            [(drawn_groups, Shape::EACH), (per_sorted, self.depth_sort.shape()), (per_scanned, scan::SHAPE)];
+        dispatch::record_several(rec, drawn_count, drawn.list.len() as u32, shapes);
+        let buffers =
+            bin_depth_keys::Buffers { drawn_count, drawn: &drawn.list, depth, keys: depth_keys, values: depth_values };
         let push = bin_depth_keys::Push { base: depth_key.base, last: depth_key.last() };
         rec.run(bin_depth_keys::Kernel, buffers, push, drawn_groups);
         let pairs = Pairs { keys: depth_keys, values: depth_values };
-        let order = self.depth_sort.record(rec, pairs, Count::Device(drawn_count), 0..depth_key.bits).values;
+        let order = self.depth_sort.record(rec, pairs, Count::Counted(drawn_count, per_sorted), 0..depth_key.bits).values;
 
         rec.run(bin_rank::Kernel, bin_rank::Buffers { drawn_count, order, tiles, rank_tiles }, (), drawn_groups);
-        self.scan.record(rec, rank_tiles, rank_first, pair_total, Count::Device(drawn_count));
-        limits.record(rec, pair_total, pair_count, self.pairs, Counter::Pairs, 1);
+        self.scan.record(rec, rank_tiles, rank_first, pair_total, Count::Counted(drawn_count, per_scanned));
+        limits.record(rec, pair_total, pair_count, self.pairs, Counter::Pairs);
         let buffers = bin_expand::Buffers {
             drawn_count,
             pair_count,
@@ -386,7 +395,7 @@ impl Bin {
                 sorted
             }
         };
-        Binned { conic, tiles, drawn, drawn_count, drawn_groups, pair_count, first_pair, pair_slot, sorted, ranges }
+        Binned { conic, tiles, drawn, pair_count, first_pair, pair_slot, sorted, ranges }
     }
 }
 
@@ -420,16 +429,15 @@ mod tests {
         let fine = "the device has room";
         let upload = |name, values: &[f32]| gpu.upload(name, values).expect(fine);
         let limits = Limits::new(gpu).expect(fine);
-        gpu.write(limits.slots(), &[n as u32]).expect(fine);
         let count = gpu.upload("count", &[n as u32]).expect(fine);
-        let slots = dispatch::groups(gpu, "slots", 64).expect(fine);
+        let existing = Slots::all(gpu, n as u32).expect(fine);
         let [depths, opacities] = [upload("depth", &depth), upload("opacity", &opacity)];
         let means = gpu.upload("mean", &mean).expect(fine);
         let covariances = gpu.upload("covariance", &covariance).expect(fine);
         let colors = gpu.buffer("color", n).expect(fine);
         let projected = Projected {
-            slots: &slots,
-            offsets: 1,
+            slots: Count::Device(&count),
+            existing: &existing,
             mean: &means,
             covariance: &covariances,
             depth: &depths,
@@ -438,7 +446,6 @@ mod tests {
         };
         let bin = Bin::new(gpu, method, n as u32, 200 * n as u32, SIZE).expect(fine);
         let mut rec = gpu.checked().expect(fine);
-        dispatch::record(&mut rec, &count, &slots, n as u32, 1);
         let binned = bin.record(&mut rec, projected, SIZE, &limits);
         let submission = rec.submit().expect(fine);
         for difference in &submission.differences {

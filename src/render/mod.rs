@@ -7,6 +7,7 @@ pub mod decode;
 pub mod method;
 pub mod project;
 pub mod rasterize;
+pub mod slots;
 pub mod view;
 pub mod visible;
 

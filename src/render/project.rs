@@ -1,13 +1,14 @@
 //! Gaussians onto the picture: EWA splatting through a distorting lens, and its gradients.
 //!
-//! A Gaussian is absent (depth 0, everything else 0) where its opacity is not positive, where it is not beyond the
-//! near plane, where its centre lies beyond the radius at which the lens polynomial folds back
+//! Gaussians that exist are projected, the others' slots are not written. One is absent (depth 0, everything else 0) where
+//! it is not beyond the near plane, where its centre lies beyond the radius at which the lens polynomial folds back
 //! ([`Camera::max_radius2`]), or where the result is not a number or beyond [`MAX_DEVIATION`](crate::math::camera::MAX_DEVIATION).
 //!
 //! Positions are seen from the camera's centre, covariances are factored: see [`crate::math::camera`].
 
 use crate::gpu::kernels::render::{project, project_backward, project_backward_color};
-use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
+use super::slots::Slots;
+use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::math::camera::{Camera, Lens, Splat};
 use crate::math::camera::{project as project_one, project_backward as project_one_backward};
 
@@ -52,14 +53,14 @@ macro_rules! lens {
 }
 pub(crate) use {camera_push, lens};
 
-/// Push constants of `project` for a camera, a near plane and so many slots per visible anchor.
-pub fn push(camera: &Camera, near: f32, offsets: u32) -> project::Push {
-    camera_push!(project::Push, camera, near, offsets: offsets)
+/// Push constants of `project` for a camera and a near plane.
+pub fn push(camera: &Camera, near: f32) -> project::Push {
+    camera_push!(project::Push, camera, near)
 }
 
 /// Push constants of `project_backward`.
-pub fn push_backward(camera: &Camera, near: f32, offsets: u32) -> project_backward::Push {
-    camera_push!(project_backward::Push, camera, near, offsets: offsets)
+pub fn push_backward(camera: &Camera, near: f32) -> project_backward::Push {
+    camera_push!(project_backward::Push, camera, near)
 }
 
 /// Float32 roundings of a chain of eight operations, times `|p| / z`, which cancellation in z = (R p)_z costs: 32 covers
@@ -71,14 +72,19 @@ fn check(powers: f64) -> Check {
     Check { relative: powers * PER_POWER_OF_DEPTH, absolute: powers * PER_POWER_OF_DEPTH / 8.0, band: 0.0 }
 }
 
+/// The slots of a list.
+pub(super) fn listed(count: &[u32], list: &[u32]) -> impl Iterator<Item = usize> {
+    list[..count[0] as usize].iter().map(|&slot| slot as usize)
+}
+
 impl Reference for project::Kernel {
     fn reference(host: project::Host<'_>, push: project::Push, (): ()) {
         let lens: Lens = lens!(push);
-        for s in 0..(host.groups[3] * push.offsets) as usize {
+        for s in listed(host.count, host.list) {
             let position = host.position[s];
             let p = lens.to_camera_f32(position);
             let mut splat = Splat { covariance: [0.0; 3], ..Splat::default() };
-            if host.opacity[s] > 0.0 && lens.in_front(p) {
+            if lens.in_front(p) {
                 let [scale, at] = [host.scale[s], position].map(|v| v.map(f64::from));
                 splat = project_one(&lens, at, scale, host.rotation[s].map(f64::from), lens.bounds(p));
             }
@@ -101,20 +107,17 @@ macro_rules! backward_twin {
         impl Reference for $module::Kernel {
             fn reference(host: $module::Host<'_>, push: $module::Push, (): ()) {
                 let lens: Lens = lens!(push);
-                for s in 0..(host.groups[3] * push.offsets) as usize {
-                    let mut grad = crate::math::camera::GaussianGradient::default();
-                    if host.depth[s] > 0.0 {
-                        let bounds = lens.bounds(lens.to_camera_f32(host.position[s]));
-                        let [position, scale, covariance] =
-                            [host.position[s], host.scale[s], host.grad_covariance[s]].map(|v| v.map(f64::from));
-                        let upstream = Splat {
-                            mean: host.grad_mean[s].map(f64::from),
-                            covariance,
-                            depth: [$(host.$grad_depth[s].into())?].first().copied().unwrap_or(0.0),
-                        };
-                        let rotation = host.rotation[s].map(f64::from);
-                        grad = project_one_backward(&lens, position, scale, rotation, bounds, upstream);
-                    }
+                for s in listed(host.count, host.list) {
+                    let bounds = lens.bounds(lens.to_camera_f32(host.position[s]));
+                    let [position, scale, covariance] =
+                        [host.position[s], host.scale[s], host.grad_covariance[s]].map(|v| v.map(f64::from));
+                    let upstream = Splat {
+                        mean: host.grad_mean[s].map(f64::from),
+                        covariance,
+                        depth: [$(host.$grad_depth[s].into())?].first().copied().unwrap_or(0.0),
+                    };
+                    let rotation = host.rotation[s].map(f64::from);
+                    let grad = project_one_backward(&lens, position, scale, rotation, bounds, upstream);
                     host.grad_position[s] = grad.position.map(|v| v as f32);
                     host.grad_scale[s] = grad.scale.map(|v| v as f32);
                     host.grad_rotation[s] = grad.rotation.map(|v| v as f32);
@@ -139,8 +142,6 @@ pub struct Gaussians<'a> {
     pub scale: &'a Buffer<[f32; 3]>,
     /// Unit quaternions w x y z.
     pub rotation: &'a Buffer<[f32; 4]>,
-    /// The Gaussian exists where > 0.
-    pub opacity: &'a Buffer<f32>,
 }
 
 /// What [`ProjectBackward::record`] reads besides: one element per slot.
@@ -154,19 +155,18 @@ pub struct SplatGradients<'a> {
     pub depth: Option<&'a Buffer<f32>>,
 }
 
-/// The forward stage: its outputs.
+/// The forward stage: its outputs, of Gaussians that exist.
 #[derive(Debug)]
 pub struct Project {
     /// px, \[slot\].
     pub mean: Buffer<[f32; 2]>,
     /// Factored: variance of x given y in px^2, slope of x on y, variance of y in px^2, \[slot\].
     pub covariance: Buffer<[f32; 3]>,
-    /// Camera z; 0 where there is no Gaussian, \[slot\].
+    /// Camera z; 0 where nothing is seen of the Gaussian, \[slot\].
     pub depth: Buffer<f32>,
-    offsets: u32,
 }
 
-/// The backward stage: its outputs for as many slots.
+/// The backward stage: its outputs for as many slots, of Gaussians that touch a tile.
 #[derive(Debug)]
 pub struct ProjectBackward {
     /// \[slot\].
@@ -188,24 +188,22 @@ impl Project {
             mean: gpu.buffer("mean", slots)?,
             covariance: gpu.buffer("covariance", slots)?,
             depth: gpu.buffer("depth", slots)?,
-            offsets,
         })
     }
 
-    /// Records the projection. `groups` counts one thread per slot, its fourth word the visible anchors
-    /// (`dispatch::record` with factor `offsets`).
-    pub fn record(&self, rec: &mut Recorder<'_>, groups: &Groups, of: Gaussians<'_>, camera: &Camera, near: f32) {
+    /// Records the projection of the Gaussians that exist.
+    pub fn record(&self, rec: &mut Recorder<'_>, existing: &Slots, of: Gaussians<'_>, camera: &Camera, near: f32) {
         let buffers = project::Buffers {
-            groups: &groups.buffer,
+            count: &existing.count,
+            list: &existing.list,
             position: of.position,
             scale: of.scale,
             rotation: of.rotation,
-            opacity: of.opacity,
             mean: &self.mean,
             covariance: &self.covariance,
             depth: &self.depth,
         };
-        rec.run(project::Kernel, buffers, push(camera, near, self.offsets), groups);
+        rec.run(project::Kernel, buffers, push(camera, near), &existing.groups);
     }
 }
 
@@ -223,13 +221,12 @@ impl ProjectBackward {
         })
     }
 
-    /// Records the gradients, after [`Project::record`] with the same `groups`, Gaussians and camera.
-    #[allow(clippy::too_many_arguments, reason = "the forward call's arguments, its stage and the gradients")]
+    /// Records the gradients of the Gaussians that touch a tile, after [`Project::record`] with the same Gaussians and
+    /// camera.
     pub fn record(
         &self,
         rec: &mut Recorder<'_>,
-        forward: &Project,
-        groups: &Groups,
+        drawn: &Slots,
         of: Gaussians<'_>,
         grad: SplatGradients<'_>,
         camera: &Camera,
@@ -238,11 +235,11 @@ impl ProjectBackward {
         macro_rules! back {
             ($module:ident $(, $grad_depth:ident)?) => {{
                 let buffers = $module::Buffers {
-                    groups: &groups.buffer,
+                    count: &drawn.count,
+                    list: &drawn.list,
                     position: of.position,
                     scale: of.scale,
                     rotation: of.rotation,
-                    depth: &forward.depth,
                     grad_mean: grad.mean,
                     grad_covariance: grad.covariance,
                     grad_position: &self.grad_position,
@@ -250,8 +247,8 @@ impl ProjectBackward {
                     grad_rotation: &self.grad_rotation,
                     $($grad_depth,)?
                 };
-                let push = camera_push!($module::Push, camera, near, offsets: forward.offsets);
-                rec.run($module::Kernel, buffers, push, groups);
+                let push = camera_push!($module::Push, camera, near);
+                rec.run($module::Kernel, buffers, push, &drawn.groups);
             }};
         }
         match grad.depth {
@@ -268,7 +265,6 @@ mod tests {
 
     use super::*;
     use crate::gpu::{Kernel, testing};
-    use crate::primitives::dispatch;
 
     fn uniform(rng: &mut Pcg64, low: f32, high: f32) -> f32 {
         low + (high - low) * rng.random::<f32>()
@@ -286,9 +282,10 @@ mod tests {
         }
     }
 
-    /// Gaussians around the view, some behind the camera, some beyond the limits; every seventh without opacity.
+    /// Gaussians around the view, some behind the camera, some beyond the limits; every seventh does not exist.
     fn case(rng: &mut Pcg64, slots: usize, spare: usize) -> project::Arrays {
         let n = slots + spare;
+        let listed: Vec<u32> = (0..slots as u32).filter(|i| i % 7 != 3).collect();
         // World coordinates around the origin, as the camera sees them.
         let center = camera([0.0; 4]).center();
         let seen = |p: [f32; 3]| std::array::from_fn(|i| (f64::from(p[i]) - center[i]) as f32);
@@ -300,25 +297,27 @@ mod tests {
             q.map(|v| v / norm)
         };
         project::Arrays {
-            groups: vec![1, 1, 1, slots as u32],
+            count: vec![listed.len() as u32],
+            list: listed.iter().copied().chain([0; 3]).collect(),
             position: (0..n).map(|_| seen(vec3(rng, -3.0, 3.0))).collect(),
             scale: (0..n).map(|_| vec3(rng, -12.0, 1.5).map(f32::exp)).collect(),
             rotation: (0..n).map(|_| quaternion(rng)).collect(),
-            opacity: (0..n).map(|i| if i % 7 == 3 { -0.1 } else { 0.5 }).collect(),
             mean: vec![[testing::UNWRITTEN; 2]; n],
             covariance: vec![[testing::UNWRITTEN; 3]; n],
             depth: vec![testing::UNWRITTEN; n],
         }
     }
 
+    /// Of those that are seen.
     fn backward_case(rng: &mut Pcg64, forward: &project::Arrays) -> project_backward::Arrays {
         let n = forward.position.len();
+        let seen: Vec<u32> = (0..n as u32).filter(|&s| forward.depth[s as usize] > 0.0).collect();
         project_backward::Arrays {
-            groups: forward.groups.clone(),
+            count: vec![seen.len() as u32],
+            list: seen.into_iter().chain([0; 3]).collect(),
             position: forward.position.clone(),
             scale: forward.scale.clone(),
             rotation: forward.rotation.clone(),
-            depth: forward.depth.clone(),
             grad_mean: (0..n).map(|_| std::array::from_fn(|_| uniform(rng, -1.0, 1.0))).collect(),
             grad_covariance: (0..n).map(|_| std::array::from_fn(|_| uniform(rng, -1.0, 1.0))).collect(),
             grad_depth: (0..n).map(|_| uniform(rng, -1.0, 1.0)).collect(),
@@ -338,15 +337,16 @@ mod tests {
             let camera = camera(distortion);
             for slots in [0, 1, 63, 64, 65, 1000, 5001] {
                 let case = case(&mut rng, slots, 3);
-                testing::assert_twin(project::Kernel, &gpu, case.clone(), push(&camera, NEAR, 1), slots + 2);
-                let forward = testing::run_once::<project::Kernel>(&gpu, &case, push(&camera, NEAR, 1), slots);
-                assert!(forward.depth[slots..].iter().all(|d| d.is_nan()), "slots beyond the count are left alone");
+                testing::assert_twin(project::Kernel, &gpu, case.clone(), push(&camera, NEAR), slots + 2);
+                let forward = testing::run_once::<project::Kernel>(&gpu, &case, push(&camera, NEAR), slots);
+                let alone = |s: usize| s >= slots || s % 7 == 3;
+                assert!((0..slots + 3).all(|s| !alone(s) || forward.depth[s].is_nan()), "others are left alone");
                 if slots == 1000 {
                     let present = forward.depth[..slots].iter().filter(|&&d| d > 0.0).count();
                     assert!((100..900).contains(&present), "{present} of {slots} present: the case tests too little");
                 }
                 let case = backward_case(&mut rng, &forward);
-                testing::assert_twin(project_backward::Kernel, &gpu, case, push_backward(&camera, NEAR, 1), slots + 2);
+                testing::assert_twin(project_backward::Kernel, &gpu, case, push_backward(&camera, NEAR), slots + 2);
             }
         }
     }
@@ -358,15 +358,15 @@ mod tests {
         let mut rng = Pcg64::seed_from_u64(6);
         let camera = camera(LENSES[1]);
         let case = case(&mut rng, 4000, 0);
-        let got = testing::run_once::<project::Kernel>(&gpu, &case, push(&camera, NEAR, 1), 4000u32);
+        let got = testing::run_once::<project::Kernel>(&gpu, &case, push(&camera, NEAR), 4000u32);
         let upstream = backward_case(&mut rng, &got);
         let back =
-            testing::run_once::<project_backward::Kernel>(&gpu, &upstream, push_backward(&camera, NEAR, 1), 4000u32);
+            testing::run_once::<project_backward::Kernel>(&gpu, &upstream, push_backward(&camera, NEAR), 4000u32);
         let (mut want, mut want_back) =
             (project::Kernel::words(case), project_backward::Kernel::words(upstream.clone()));
-        project::Kernel::reference(project::Kernel::host(&mut want), push(&camera, NEAR, 1), ());
+        project::Kernel::reference(project::Kernel::host(&mut want), push(&camera, NEAR), ());
         let host = project_backward::Kernel::host(&mut want_back);
-        project_backward::Kernel::reference(host, push_backward(&camera, NEAR, 1), ());
+        project_backward::Kernel::reference(host, push_backward(&camera, NEAR), ());
         let (want, want_back) = (project::Kernel::arrays(&want), project_backward::Kernel::arrays(&want_back));
         // Relative to the terms before they cancel: |t|^2 s^2 with t = J R and the Gaussian's longest s. The camera's
         // focal lengths are at most 92, the rays' slopes lengthen a row of J by less than 1.6.
@@ -378,7 +378,8 @@ mod tests {
             })
             .collect();
         let assert_close = |name: &str, got: &[f32], want: &[f32], width: usize, powers: f64, sizes: Vec<f64>| {
-            for (s, (got, want)) in got.chunks_exact(width).zip(want.chunks_exact(width)).enumerate() {
+            let rows = got.chunks_exact(width).zip(want.chunks_exact(width)).enumerate();
+            for (s, (got, want)) in rows.filter(|(s, _)| slots[*s].2 > 0.0) {
                 for (g, w) in got.iter().zip(want) {
                     let error = (f64::from(*g) - f64::from(*w)).abs();
                     let limit = powers * PER_POWER_OF_DEPTH / 8.0 * sizes[s];
@@ -400,26 +401,17 @@ mod tests {
         assert_close("grad_position", a, b, 3, 4.0, size);
     }
 
-    #[test]
-    fn slots_are_anchors_times_offsets() {
-        let gpu = testing::gpu();
-        let mut rng = Pcg64::seed_from_u64(2);
-        let mut case = case(&mut rng, 70, 5);
-        case.groups[3] = 7;
-        testing::assert_twin(project::Kernel, &gpu, case, push(&camera(LENSES[1]), NEAR, 10), 70u32);
-    }
-
     /// Nothing that is not finite comes out: zero depth, overflow, not-a-number, points behind the camera.
     #[test]
     fn what_cannot_be_projected_is_absent() {
         let gpu = testing::gpu();
         let mut rng = Pcg64::seed_from_u64(3);
-        let mut case = case(&mut rng, 8, 0);
+        let mut case = case(&mut rng, 7, 0);
+        (case.count, case.list) = (vec![7], (0..7).collect());
         let mut camera = camera([0.0; 4]);
         camera.rotation = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
         camera.translation = [0.0; 3];
-        case.opacity = vec![0.5; 8];
-        case.scale = vec![[0.1; 3]; 8];
+        case.scale = vec![[0.1; 3]; 7];
         case.position = vec![
             [0.0, 0.0, 0.0],
             [0.0, 0.0, -1.0],
@@ -427,16 +419,14 @@ mod tests {
             [f32::NAN, 0.0, 1.0],
             [f32::INFINITY, 0.0, 1.0],
             [0.0, 0.0, 1.0],
-            [0.1, 0.0, 1.0],
             [0.0, 0.0, 2.0],
         ];
         case.scale[5] = [1e30, 0.1, 0.1];
-        case.opacity[6] = f32::NAN;
-        let got = testing::run_once::<project::Kernel>(&gpu, &case, push(&camera, NEAR, 1), 8u32);
-        assert_eq!(got.depth, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0]);
-        assert_eq!(got.mean[..7], [[0.0; 2]; 7]);
-        assert_eq!(got.covariance[..7], [[0.0; 3]; 7]);
-        testing::assert_twin(project::Kernel, &gpu, case, push(&camera, NEAR, 1), 8u32);
+        let got = testing::run_once::<project::Kernel>(&gpu, &case, push(&camera, NEAR), 7u32);
+        assert_eq!(got.depth, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0]);
+        assert_eq!(got.mean[..6], [[0.0; 2]; 6]);
+        assert_eq!(got.covariance[..6], [[0.0; 3]; 6]);
+        testing::assert_twin(project::Kernel, &gpu, case, push(&camera, NEAR), 7u32);
     }
 
     #[test]
@@ -512,41 +502,47 @@ mod tests {
     fn stages_run_on_a_count_on_the_device() {
         let gpu = testing::gpu();
         let mut rng = Pcg64::seed_from_u64(5);
-        let (anchors, offsets) = (77, 10);
+        let slots = 770;
         let camera = camera(LENSES[1]);
-        let mut arrays = case(&mut rng, anchors * offsets, 0);
-        arrays.groups[3] = anchors as u32;
-        let push = push(&camera, NEAR, offsets as u32);
-        let want = testing::run_once::<project::Kernel>(&gpu, &arrays, push, anchors * offsets);
+        let arrays = case(&mut rng, slots, 0);
+        let want = testing::run_once::<project::Kernel>(&gpu, &arrays, push(&camera, NEAR), slots);
         let upstream = backward_case(&mut rng, &want);
-        let push = push_backward(&camera, NEAR, offsets as u32);
-        let want_backward = testing::run_once::<project_backward::Kernel>(&gpu, &upstream, push, anchors * offsets);
+        let push = push_backward(&camera, NEAR);
+        let want_backward = testing::run_once::<project_backward::Kernel>(&gpu, &upstream, push, slots);
 
         let fine = "the device runs a test";
-        let forward = Project::new(&gpu, anchors as u32 + 9, offsets as u32).expect(fine);
+        let forward = Project::new(&gpu, 86, 10).expect(fine);
         let backward = ProjectBackward::new(&gpu, &forward).expect(fine);
-        let count = gpu.upload("visible_count", &[anchors as u32]).expect(fine);
-        let groups = dispatch::groups(&gpu, "groups", 64).expect(fine);
+        let list = |count: &[u32], list: &[u32]| {
+            let slots = Slots::new(&gpu, ["list", "list_count", "list_groups"], 860).expect(fine);
+            gpu.write(&slots.count, count).expect(fine);
+            gpu.write(&slots.list, list).expect(fine);
+            slots
+        };
+        let (existing, drawn) = (list(&arrays.count, &arrays.list), list(&upstream.count, &upstream.list));
         let position = gpu.upload("position", &arrays.position).expect(fine);
         let scale = gpu.upload("scale", &arrays.scale).expect(fine);
         let rotation = gpu.upload("rotation", &arrays.rotation).expect(fine);
-        let opacity = gpu.upload("opacity", &arrays.opacity).expect(fine);
         let mean = gpu.upload("grad_mean", &upstream.grad_mean).expect(fine);
         let covariance = gpu.upload("grad_covariance", &upstream.grad_covariance).expect(fine);
         let depth = gpu.upload("grad_depth", &upstream.grad_depth).expect(fine);
-        let of = Gaussians { position: &position, scale: &scale, rotation: &rotation, opacity: &opacity };
+        let of = Gaussians { position: &position, scale: &scale, rotation: &rotation };
         let grad = SplatGradients { mean: &mean, covariance: &covariance, depth: Some(&depth) };
         let mut rec = gpu.recorder().expect(fine);
-        dispatch::record(&mut rec, &count, &groups, anchors as u32 + 9, offsets as u32);
-        forward.record(&mut rec, &groups, of, &camera, NEAR);
-        backward.record(&mut rec, &forward, &groups, of, grad, &camera, NEAR);
+        existing.dispatch(&mut rec);
+        drawn.dispatch(&mut rec);
+        forward.record(&mut rec, &existing, of, &camera, NEAR);
+        backward.record(&mut rec, &drawn, of, grad, &camera, NEAR);
         rec.submit().expect(fine).wait().expect(fine);
-        let slots = anchors * offsets;
-        assert_eq!(gpu.read_range(&forward.mean, slots).expect(fine), want.mean);
-        assert_eq!(gpu.read_range(&forward.covariance, slots).expect(fine), want.covariance);
-        assert_eq!(gpu.read_range(&forward.depth, slots).expect(fine), want.depth);
-        assert_eq!(gpu.read_range(&backward.grad_position, slots).expect(fine), want_backward.grad_position);
-        assert_eq!(gpu.read_range(&backward.grad_scale, slots).expect(fine), want_backward.grad_scale);
-        assert_eq!(gpu.read_range(&backward.grad_rotation, slots).expect(fine), want_backward.grad_rotation);
+        for s in arrays.list[..arrays.count[0] as usize].iter().map(|&s| s as usize) {
+            assert_eq!(gpu.read(&forward.mean).expect(fine)[s], want.mean[s]);
+            assert_eq!(gpu.read(&forward.covariance).expect(fine)[s], want.covariance[s]);
+            assert_eq!(gpu.read(&forward.depth).expect(fine)[s], want.depth[s]);
+        }
+        for s in upstream.list[..upstream.count[0] as usize].iter().map(|&s| s as usize) {
+            assert_eq!(gpu.read(&backward.grad_position).expect(fine)[s], want_backward.grad_position[s]);
+            assert_eq!(gpu.read(&backward.grad_scale).expect(fine)[s], want_backward.grad_scale[s]);
+            assert_eq!(gpu.read(&backward.grad_rotation).expect(fine)[s], want_backward.grad_rotation[s]);
+        }
     }
 }

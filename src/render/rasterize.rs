@@ -11,12 +11,14 @@
 
 use super::bin::{Binned, Tiling};
 use super::method::Method;
+use super::slots::Slots;
 use crate::gpu::kernels::render::{
     rasterize, rasterize_backward, rasterize_backward_color, rasterize_backward_depth, rasterize_backward_narrow,
     rasterize_backward_narrow_color, rasterize_backward_narrow_depth, rasterize_color, rasterize_depth,
     rasterize_gather, rasterize_gather_color, rasterize_narrow, rasterize_narrow_color, rasterize_narrow_depth,
 };
-use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
+use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
+use crate::primitives::Count;
 
 /// Largest alpha of a sample.
 pub const ALPHA_MAX: f64 = 0.99;
@@ -254,10 +256,11 @@ macro_rules! gather_twin {
     ($module:ident $(, $depth:ident)?) => {
         impl Reference for $module::Kernel {
             fn reference(host: $module::Host<'_>, (): (), (): ()) {
-                let drawn = if host.pair_count[0] == 0 { 0 } else { host.drawn_count[0] as usize };
+                let drawn = host.drawn_count[0] as usize;
+                let fits = host.pair_count[0] > 0;
                 for s in host.drawn[..drawn].iter().map(|&slot| slot as usize) {
                     let first = host.first_pair[s] as usize;
-                    let pairs = first..first + host.tiles[s] as usize;
+                    let pairs = first..first + if fits { host.tiles[s] as usize } else { 0 };
                     let sum = |f: &dyn Fn(usize) -> f32| pairs.clone().map(|p| f64::from(f(p))).sum::<f64>();
                     let g: [f64; 3] = std::array::from_fn(|c| sum(&|p| host.pair_conic[p][c]));
                     let [a, _, b] = host.conic[s].map(f64::from);
@@ -281,10 +284,10 @@ gather_twin!(rasterize_gather_color);
 /// Gaussians in screen space, per slot.
 #[derive(Clone, Copy)]
 pub struct Projected<'a> {
-    /// Workgroups of a thread per slot; their fourth word counts the visible anchors.
-    pub slots: &'a Groups,
-    /// Slots per visible anchor.
-    pub offsets: u32,
+    /// How many slots there are.
+    pub slots: Count<'a>,
+    /// Those whose Gaussian exists; the others hold nothing.
+    pub existing: &'a Slots,
     /// `[slot]` px.
     pub mean: &'a Buffer<[f32; 2]>,
     /// `[slot]` factored: variance of x given y in px^2, slope of x on y, variance of y in px^2.
@@ -396,7 +399,7 @@ pub struct Backward {
     pair_opacity: Buffer<f32>,
     pair_color: Buffer<[f32; 3]>,
     pair_depth: Option<Buffer<f32>>,
-    /// `[slot]` 1/px; as the others 0 where nothing is drawn.
+    /// `[slot]` 1/px; as the others of Gaussians that touch a tile alone.
     pub grad_mean: Buffer<[f32; 2]>,
     /// `[slot]` of xx, the one off-diagonal parameter, yy.
     pub grad_covariance: Buffer<[f32; 3]>,
@@ -445,7 +448,8 @@ impl Backward {
         gradient: PictureGradient<'_>,
     ) {
         let Projected { mean, depth, opacity, color, .. } = gaussians;
-        let Binned { ranges, sorted, pair_slot, conic, tiles, drawn, drawn_count, pair_count, first_pair, .. } = binned;
+        let Binned { ranges, sorted, pair_slot, conic, tiles, drawn, pair_count, first_pair, .. } = binned;
+        let Slots { list: drawn, count: drawn_count, groups: drawn_groups } = drawn;
         let Self {
             pair_mean,
             pair_conic,
@@ -463,11 +467,6 @@ impl Backward {
         let threads = [grid[0] * tiling.threads(), grid[1], 1];
         let subgroups = subgroups(rec.gpu());
         let (rgb, grad_rgb) = (&picture.rgb, gradient.rgb);
-        // Most slots draw nothing and are not looked at again.
-        rec.zero(grad_mean);
-        rec.zero(grad_covariance);
-        rec.zero(grad_opacity);
-        rec.zero(grad_color);
         macro_rules! back {
             ($module:ident $(, $field:ident)*) => {{
                 let buffers = $module::Buffers {
@@ -480,7 +479,6 @@ impl Backward {
         }
         match (&picture.depth, &self.pair_depth, &self.grad_depth, gradient.depth) {
             (Some(depth_map), Some(pair_depth), Some(grad_depth), Some(grad_depth_map)) => {
-                rec.zero(grad_depth);
                 match (picture.transmittance.as_ref().zip(gradient.transmittance), tiling) {
                     (Some((transmittance, grad_transmittance)), Tiling::Wide) => {
                         back!(
@@ -529,7 +527,7 @@ impl Backward {
                     pair_depth,
                     grad_depth,
                 };
-                rec.run(rasterize_gather::Kernel, buffers, (), binned.drawn_groups);
+                rec.run(rasterize_gather::Kernel, buffers, (), drawn_groups);
             }
             _ => {
                 match tiling {
@@ -552,7 +550,7 @@ impl Backward {
                     grad_opacity,
                     grad_color,
                 };
-                rec.run(rasterize_gather_color::Kernel, buffers, (), binned.drawn_groups);
+                rec.run(rasterize_gather_color::Kernel, buffers, (), drawn_groups);
             }
         }
     }

@@ -52,7 +52,6 @@ pub struct Forward {
     /// Tiles' lists.
     pub bin: Bin,
     method: Method,
-    offsets: u32,
 }
 
 impl Forward {
@@ -69,12 +68,11 @@ impl Forward {
         cull: bool,
     ) -> Result<Self, Error> {
         Ok(Self {
-            visible: gpu.stage(stage::CULL, || Visible::new(gpu, capacity.anchors, offsets, capacity.visible, cull))?,
+            visible: gpu.stage(stage::CULL, || Visible::new(gpu, capacity.anchors, capacity.visible, cull))?,
             decode: gpu.stage(stage::DECODE, || Decode::new(gpu, capacity.visible, offsets))?,
             project: gpu.stage(stage::PROJECT, || Project::new(gpu, capacity.visible, offsets))?,
             bin: gpu.stage(stage::BIN, || Bin::new(gpu, method, capacity.visible * offsets, capacity.pairs, size))?,
             method,
-            offsets,
         })
     }
 
@@ -85,15 +83,15 @@ impl Forward {
 
     /// The decoded Gaussians as the projection reads them.
     pub fn gaussians(&self) -> Gaussians<'_> {
-        let Decode { position, scale, rotation, opacity, .. } = &self.decode;
-        Gaussians { position, scale, rotation, opacity }
+        let Decode { position, scale, rotation, .. } = &self.decode;
+        Gaussians { position, scale, rotation }
     }
 
     /// The projected Gaussians as the rasteriser reads them.
     pub fn projected(&self) -> Projected<'_> {
         Projected {
-            slots: &self.visible.slots,
-            offsets: self.offsets,
+            slots: self.decode.slots(),
+            existing: &self.decode.existing,
             mean: &self.project.mean,
             covariance: &self.project.covariance,
             depth: &self.project.depth,
@@ -123,7 +121,7 @@ impl Forward {
             visible: &self.visible.list,
         };
         self.decode.record(rec, model, &self.visible.count, camera.center());
-        self.project.record(rec, &self.visible.slots, self.gaussians(), camera, near);
+        self.project.record(rec, &self.decode.existing, self.gaussians(), camera, near);
         self.bin.record(rec, self.projected(), camera.size, limits)
     }
 }

@@ -1,47 +1,42 @@
 //! The list of anchors to decode.
 
 use super::cull::Cull;
-use crate::gpu::{Buffer, Error, Gpu, Groups, Recorder};
+use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::model::anchors::Anchors;
 use crate::primitives::compact::Compact;
 use crate::primitives::limit::{Counter, Limits};
-use crate::primitives::{Count, dispatch};
+use crate::primitives::Count;
 use crate::scene::Camera;
 
-/// Visible anchors in ascending order, and the dispatch of a thread per slot (visible anchor x Gaussian).
+/// Visible anchors in ascending order.
 pub struct Visible {
     cull: Option<Cull>,
     all: Option<Buffer<u32>>,
     compact: Compact,
     capacity: u32,
-    offsets: u32,
     wanted: Buffer<u32>,
     /// `[V]` anchor ids.
     pub list: Buffer<u32>,
     /// `[1]`
     pub count: Buffer<u32>,
-    /// A thread per slot; the fourth word counts the visible anchors.
-    pub slots: Groups,
 }
 
 impl Visible {
-    /// For `anchors` anchors of `offsets` Gaussians of which at most `capacity` are visible at once; without culling all
+    /// For `anchors` anchors of which at most `capacity` are visible at once; without culling all
     /// are.
     ///
     /// # Errors
     /// As [`Gpu::buffer`].
-    pub fn new(gpu: &Gpu, anchors: u32, offsets: u32, capacity: u32, cull: bool) -> Result<Self, Error> {
+    pub fn new(gpu: &Gpu, anchors: u32, capacity: u32, cull: bool) -> Result<Self, Error> {
         Ok(Self {
             cull: if cull { Some(Cull::new(gpu, anchors)?) } else { None },
             all: if cull { None } else { Some(gpu.upload("flags", &vec![1; anchors as usize])?) },
             compact: Compact::new(gpu, anchors)?,
             capacity,
-            offsets,
             wanted: gpu.buffer("visible_wanted", 1)?,
             // Room for all: a list that is too long is counted before it is refused.
             list: gpu.buffer("visible", anchors as usize)?,
             count: gpu.buffer("visible_count", 1)?,
-            slots: dispatch::groups(gpu, "slots", 64)?,
         })
     }
 
@@ -55,8 +50,6 @@ impl Visible {
             (None, None) => unreachable!("made with one of the two"),
         };
         self.compact.record(rec, flags, &self.list, &self.wanted, Count::Host(anchors.count));
-        limits.record(rec, &self.wanted, &self.count, self.capacity, Counter::Visible, 1);
-        limits.record(rec, &self.wanted, limits.slots(), self.capacity, Counter::Visible, self.offsets);
-        dispatch::record(rec, &self.count, &self.slots, self.capacity, self.offsets);
+        limits.record(rec, &self.wanted, &self.count, self.capacity, Counter::Visible);
     }
 }

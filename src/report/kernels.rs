@@ -537,7 +537,7 @@ impl Capture {
         let mut slots = vec![];
         for (v, anchor) in self.visible().iter().enumerate() {
             let Some(w) = theirs.get(anchor) else { continue };
-            let pairs = (0..self.offsets).map(|k| (v * self.offsets + k, w * self.offsets + k));
+            let pairs = (0..self.offsets).map(|k| (k * self.visible().len() + v, k * other.visible().len() + w));
             slots.extend(pairs.filter(|(own, other_slot)| drawn(self, *own) && drawn(other, *other_slot)));
         }
         slots

@@ -467,7 +467,7 @@ impl Step {
         rec.stage(stage::DECODE);
         forward.decode.record(rec, model, &forward.visible.count, camera.center());
         rec.stage(stage::PROJECT);
-        forward.project.record(rec, &forward.visible.slots, forward.gaussians(), camera, *near);
+        forward.project.record(rec, &forward.decode.existing, forward.gaussians(), camera, *near);
         rec.stage(stage::BIN);
         let binned = forward.bin.record(rec, forward.projected(), camera.size, limits);
         rec.stage(stage::RASTERIZE);
@@ -483,10 +483,10 @@ impl Step {
             covariance: &backward.grad_covariance,
             depth: gradient.depth.and(backward.grad_depth.as_ref()),
         };
-        let slots = &forward.visible.slots;
         rec.stage(stage::PROJECT_BACKWARD);
-        project_backward.record(rec, &forward.project, slots, forward.gaussians(), splats, camera, *near);
+        project_backward.record(rec, binned.drawn, forward.gaussians(), splats, camera, *near);
         let gaussians = GaussianGradients {
+            drawn: binned.tiles,
             position: &project_backward.grad_position,
             opacity: &backward.grad_opacity,
             color: &backward.grad_color,
@@ -510,7 +510,7 @@ impl Step {
         self.watch(rec, canvas.losses.terms(), attended, step);
         if let Some(statistics) = &self.statistics {
             let drawn = Drawn {
-                slots,
+                visible_count: &forward.visible.count,
                 overflow: limits.overflow(),
                 visible: &forward.visible.list,
                 grad_mean: &backward.grad_mean,

@@ -69,7 +69,9 @@ fn run(gpu: &Gpu, feature: &[f32], weights: &[f32], what: &str) -> Outcome {
     let g2 = gpu.upload("grad_scale", &g2).expect(fine);
     let g3 = gpu.upload("grad_opacity", &vec![0.5f32; slots]).expect(fine);
     let g4 = gpu.upload("grad_rotation", &vec![[0.5f32, -0.25, 0.75, 1.0]; slots]).expect(fine);
-    let grad = GaussianGradients { position: &g0, opacity: &g3, color: &g1, scale: &g2, rotation: &g4 };
+    let forward = Decode::of(gpu, n as u32, K as u32, Decode::ALL).expect(fine);
+    let drawn = forward.decoded();
+    let grad = GaussianGradients { drawn, position: &g0, opacity: &g3, color: &g1, scale: &g2, rotation: &g4 };
     let unwritten = |name, len: usize| gpu.upload(name, &vec![testing::UNWRITTEN; len]).expect(fine);
     let to_offset = gpu.upload("grad_offset", &vec![[testing::UNWRITTEN; 3]; slots]).expect(fine);
     let to_feature = unwritten("grad_feature", n * FEATURE);
@@ -77,7 +79,6 @@ fn run(gpu: &Gpu, feature: &[f32], weights: &[f32], what: &str) -> Outcome {
     let to_weights = unwritten("grad_weights", weights.len());
     let to =
         AnchorGradients { feature: &to_feature, offset: &to_offset, log_scaling: &to_scaling, weights: &to_weights };
-    let forward = Decode::of(gpu, n as u32, K as u32, Decode::ALL).expect(fine);
     let backward = DecodeBackward::new(gpu, &forward).expect(fine);
     let mut rec = gpu.recorder().expect(fine);
     forward.record(&mut rec, anchors, &count, [0.0; 3]);
@@ -129,7 +130,7 @@ fn saturated(gpu: &Gpu) {
                 (41.0 + 34.0) * U * (through + magnitudes[layout.second(head, output, HIDDEN)])
             };
             for (k, want) in want.iter().enumerate() {
-                let s = a * K + k;
+                let s = k * n + a;
                 let opacity = f64::from(got.opacity[s]);
                 let limit = error(0, k) + 16.0 * U;
                 assert!((opacity - want.opacity).abs() <= limit, "{what}: opacity {opacity} not {}", want.opacity);

@@ -173,7 +173,11 @@ fn run_with(gpu: &Gpu, method: Method, model: &Model, camera: &Camera, near: f32
         visible: &forward.visible.list,
     };
     forward.decode.record(&mut rec, of, &forward.visible.count, camera.center());
-    forward.project.record(&mut rec, &forward.visible.slots, forward.gaussians(), camera, near);
+    // What does not exist is not written: absent.
+    rec.zero(&forward.project.mean);
+    rec.zero(&forward.project.covariance);
+    rec.zero(&forward.project.depth);
+    forward.project.record(&mut rec, &forward.decode.existing, forward.gaussians(), camera, near);
     let binned = forward.bin.record(&mut rec, forward.projected(), size, &limits);
     rasterize::forward(&mut rec, method, forward.projected(), binned, BACKGROUND, &picture);
     let gradient = PictureGradient { rgb: &grad_rgb, depth: Some(&grad_z), transmittance: None };
@@ -183,9 +187,9 @@ fn run_with(gpu: &Gpu, method: Method, model: &Model, camera: &Camera, near: f32
         covariance: &backward.grad_covariance,
         depth: backward.grad_depth.as_ref(),
     };
-    let groups = &forward.visible.slots;
-    project_backward.record(&mut rec, &forward.project, groups, forward.gaussians(), splats, camera, near);
+    project_backward.record(&mut rec, binned.drawn, forward.gaussians(), splats, camera, near);
     let gaussians = GaussianGradients {
+        drawn: binned.tiles,
         position: &project_backward.grad_position,
         opacity: &backward.grad_opacity,
         color: &backward.grad_color,

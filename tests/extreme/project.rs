@@ -145,16 +145,16 @@ impl Outcome {
 fn run(gpu: &Gpu, camera: &Camera, near: f32, gaussians: &[Gaussian]) -> Outcome {
     let n = gaussians.len();
     let arrays = project::Arrays {
-        groups: vec![1, 1, 1, n as u32],
+        count: vec![n as u32],
+        list: (0..n as u32).collect(),
         position: gaussians.iter().map(|g| g.position).collect(),
         scale: gaussians.iter().map(|g| g.scale).collect(),
         rotation: gaussians.iter().map(|g| g.rotation).collect(),
-        opacity: vec![0.5; n],
         mean: vec![[testing::UNWRITTEN; 2]; n],
         covariance: vec![[testing::UNWRITTEN; 3]; n],
         depth: vec![testing::UNWRITTEN; n],
     };
-    let forward = testing::run_once::<project::Kernel>(gpu, &arrays, stage::push(camera, near, 1), n);
+    let forward = testing::run_once::<project::Kernel>(gpu, &arrays, stage::push(camera, near), n);
     let mut rng = Pcg64Mcg::seed_from_u64(5);
     let upstream: Vec<Splat> = (0..n)
         .map(|s| {
@@ -167,20 +167,22 @@ fn run(gpu: &Gpu, camera: &Camera, near: f32, gaussians: &[Gaussian]) -> Outcome
             Splat { mean: mean.map(round), covariance: covariance.map(round), depth: round(depth) }
         })
         .collect();
+    let seen: Vec<u32> = (0..n as u32).filter(|&s| forward.depth[s as usize] > 0.0).collect();
+    // Of those that are not seen nothing is written: the gradient is 0.
     let case = project_backward::Arrays {
-        groups: arrays.groups,
+        count: vec![seen.len() as u32],
+        list: seen,
         position: arrays.position,
         scale: arrays.scale,
         rotation: arrays.rotation,
-        depth: forward.depth.clone(),
         grad_mean: upstream.iter().map(|g| g.mean.map(|v| v as f32)).collect(),
         grad_covariance: upstream.iter().map(|g| g.covariance.map(|v| v as f32)).collect(),
         grad_depth: upstream.iter().map(|g| g.depth as f32).collect(),
-        grad_position: vec![[testing::UNWRITTEN; 3]; n],
-        grad_scale: vec![[testing::UNWRITTEN; 3]; n],
-        grad_rotation: vec![[testing::UNWRITTEN; 4]; n],
+        grad_position: vec![[0.0; 3]; n],
+        grad_scale: vec![[0.0; 3]; n],
+        grad_rotation: vec![[0.0; 4]; n],
     };
-    let push = stage::push_backward(camera, near, 1);
+    let push = stage::push_backward(camera, near);
     let back = testing::run_once::<project_backward::Kernel>(gpu, &case, push, n);
     Outcome {
         mean: forward.mean,

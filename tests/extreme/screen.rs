@@ -14,10 +14,11 @@
 //! |S| and all |w_j v_j|.
 
 use gscream_vk::gpu::{Gpu, testing};
-use gscream_vk::primitives::dispatch;
+use gscream_vk::primitives::Count;
 use gscream_vk::primitives::limit::Limits;
 use gscream_vk::render::bin::{Bin, Tiling};
 use gscream_vk::render::rasterize::{self, Backward, Outputs, Picture, PictureGradient, Projected};
+use gscream_vk::render::slots::Slots;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
@@ -153,8 +154,7 @@ fn draw(gpu: &Gpu, tiling: Tiling, size: [u32; 2], splats: &Splats, pairs: u32) 
     let color = gpu.upload("color", &padded.color).expect(fine);
     let limits = Limits::new(gpu).expect(fine);
     let count = gpu.upload("count", &[n]).expect(fine);
-    gpu.write(limits.slots(), &[n]).expect(fine);
-    let slots = dispatch::groups(gpu, "slots", 64).expect(fine);
+    let existing = Slots::all(gpu, n).expect(fine);
     let bin = Bin::new(gpu, tiling, n.max(1), pairs, size).expect(fine);
     let mut picture = Picture::new(gpu, size, pixels, Outputs::Transmittance).expect(fine);
     picture.rgb = gpu.upload("rgb", &vec![[testing::UNWRITTEN; 3]; pixels]).expect(fine);
@@ -164,10 +164,9 @@ fn draw(gpu: &Gpu, tiling: Tiling, size: [u32; 2], splats: &Splats, pairs: u32) 
     let grad_z = gpu.upload("grad_depth_map", &up.iter().map(|u| u.1).collect::<Vec<_>>()).expect(fine);
     let grad_t = gpu.upload("grad_transmittance", &up.iter().map(|u| u.2).collect::<Vec<_>>()).expect(fine);
     let mut rec = gpu.recorder().expect(fine);
-    dispatch::record(&mut rec, &count, &slots, n, 1);
     let projected = Projected {
-        slots: &slots,
-        offsets: 1,
+        slots: Count::Device(&count),
+        existing: &existing,
         mean: &mean,
         covariance: &covariance,
         depth: &depth,
@@ -177,6 +176,12 @@ fn draw(gpu: &Gpu, tiling: Tiling, size: [u32; 2], splats: &Splats, pairs: u32) 
     let binned = bin.record(&mut rec, projected, size, &limits);
     rasterize::forward(&mut rec, tiling, projected, binned, BACKGROUND, &picture);
     let gradient = PictureGradient { rgb: &grad_rgb, depth: Some(&grad_z), transmittance: Some(&grad_t) };
+    // What touches no tile is not written: no gradient.
+    rec.zero(&backward.grad_mean);
+    rec.zero(&backward.grad_covariance);
+    rec.zero(&backward.grad_opacity);
+    rec.zero(&backward.grad_color);
+    backward.grad_depth.iter().for_each(|grad_depth| rec.zero(grad_depth));
     backward.record(&mut rec, tiling, projected, binned, &picture, gradient);
     rec.submit().expect(fine).wait().expect(fine);
     let counters = gpu.read(limits.counters()).expect(fine);

@@ -5,6 +5,12 @@ use gscream_vk::render::decode::{AnchorGradients, Anchors, Decode, DecodeBackwar
 
 use crate::support::cases;
 
+/// Rows of \[n, k\] by k first, as slots are numbered.
+fn by_slot<T: Copy>(rows: &[T], [n, k]: [usize; 2]) -> Vec<T> {
+    let width = rows.len() / (n * k);
+    (0..k).flat_map(|k_| (0..n).flat_map(move |v| (0..width).map(move |c| (v * k + k_) * width + c))).map(|i| rows[i]).collect()
+}
+
 #[test]
 fn decode() {
     let gpu = testing::gpu();
@@ -19,6 +25,9 @@ fn decode() {
         let flat: Vec<f32> = weights.iter().flat_map(|name| case.f32(name)).collect();
         let upload = |name: &'static str, tensor: &str| gpu.upload(name, &case.f32(tensor)).expect(fine);
         let upload3 = |name: &'static str, tensor: &str| gpu.upload(name, &case.vectors::<3>(tensor)).expect(fine);
+        let of_slots3 = |name: &'static str, tensor: &str| {
+            gpu.upload(name, &by_slot(&case.vectors::<3>(tensor), [n, k])).expect(fine)
+        };
         let (position, offset) = (upload3("anchor", "anchor"), upload3("offset", "offset"));
         let (feature, log_scaling) = (upload("feature", "feature"), upload("log_scaling", "log_scaling"));
         let flat = gpu.upload("weights", &flat).expect(fine);
@@ -26,11 +35,11 @@ fn decode() {
         let count = gpu.upload("visible_count", &[n as u32]).expect(fine);
         let center = case.vectors::<3>("camera_center")[0].map(f64::from);
         let grad = (
-            upload3("upstream position", "upstream.position"),
-            upload("upstream opacity", "upstream.opacity"),
-            upload3("upstream color", "upstream.color"),
-            upload3("upstream scale", "upstream.scale"),
-            gpu.upload("upstream rotation", &case.vectors::<4>("upstream.rotation")).expect(fine),
+            of_slots3("upstream position", "upstream.position"),
+            gpu.upload("upstream opacity", &by_slot(&case.f32("upstream.opacity"), [n, k])).expect(fine),
+            of_slots3("upstream color", "upstream.color"),
+            of_slots3("upstream scale", "upstream.scale"),
+            gpu.upload("upstream rotation", &by_slot(&case.vectors::<4>("upstream.rotation"), [n, k])).expect(fine),
         );
         let empty = |name, len: usize| gpu.upload(name, &vec![testing::UNWRITTEN; len]).expect(fine);
         let (to_feature, to_scaling) = (empty("grad_feature", n * 32), empty("grad_log_scaling", n * 6));
@@ -47,6 +56,7 @@ fn decode() {
             visible: &visible,
         };
         let upstream = GaussianGradients {
+            drawn: forward.decoded(),
             position: &grad.0,
             opacity: &grad.1,
             color: &grad.2,
@@ -73,11 +83,16 @@ fn decode() {
         // The decoder's positions are seen from the camera.
         let seen: Vec<f64> =
             case.f64("position").chunks_exact(3).flat_map(|p| [0, 1, 2].map(|i| p[i] - center[i])).collect();
-        case.compare_with("position", &read3(&forward.position), &seen, check);
-        case.compare("opacity", &read(&forward.opacity), check);
-        case.compare("color", &read3(&forward.color), check);
-        case.compare("scale", &read3(&forward.scale), check);
-        case.compare("rotation", gpu.read(&forward.rotation).expect(fine).as_flattened(), check);
+        let rotation = gpu.read(&forward.rotation).expect(fine).into_flattened();
+        for (name, got, want) in [
+            ("position", read3(&forward.position), seen),
+            ("opacity", read(&forward.opacity), case.f64("opacity")),
+            ("color", read3(&forward.color), case.f64("color")),
+            ("scale", read3(&forward.scale), case.f64("scale")),
+            ("rotation", rotation, case.f64("rotation")),
+        ] {
+            case.compare_with(name, &got, &by_slot(&want, [n, k]), check);
+        }
         case.compare("grad.feature", &read(&to_feature), check);
         case.compare("grad.offset", &read3(&to_offset), check);
         case.compare("grad.log_scaling", &read(&to_scaling), check);

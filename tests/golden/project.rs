@@ -37,7 +37,8 @@ fn project() {
         let (camera, n) = (camera(&case, "camera"), case.shape("position")[0]);
         let center = camera.center();
         let arrays = project::Arrays {
-            groups: vec![1, 1, 1, n as u32],
+            count: vec![n as u32],
+            list: (0..n as u32).collect(),
             position: case
                 .vectors::<3>("position")
                 .into_iter()
@@ -45,13 +46,12 @@ fn project() {
                 .collect(),
             scale: case.vectors("scale"),
             rotation: case.vectors("rotation"),
-            opacity: vec![1.0; n],
             mean: vec![[testing::UNWRITTEN; 2]; n],
             covariance: vec![[testing::UNWRITTEN; 3]; n],
             depth: vec![testing::UNWRITTEN; n],
         };
         // The oracle has no near plane (its points are all in front of the camera) and lets the lens fold back.
-        let push = project::Push { max_radius2: f32::INFINITY, ..stage::push(&camera, 0.0, 1) };
+        let push = project::Push { max_radius2: f32::INFINITY, ..stage::push(&camera, 0.0) };
         let forward = testing::run_once::<project::Kernel>(&gpu, &arrays, push, n);
         let check = |binding| <project::Kernel as gscream_vk::gpu::Reference>::check(binding);
         let backward_check = |binding| <project_backward::Kernel as gscream_vk::gpu::Reference>::check(binding);
@@ -61,11 +61,11 @@ fn project() {
         case.compare("depth", &forward.depth, check("depth"));
         let upstream = symmetric(&case.f64("upstream.covariance"), true);
         let arrays = project_backward::Arrays {
-            groups: arrays.groups,
+            count: arrays.count,
+            list: arrays.list,
             position: arrays.position,
             scale: arrays.scale,
             rotation: arrays.rotation,
-            depth: forward.depth,
             grad_mean: case.vectors("upstream.mean"),
             grad_covariance: upstream
                 .chunks_exact(3)
@@ -77,7 +77,7 @@ fn project() {
             grad_scale: vec![[testing::UNWRITTEN; 3]; n],
             grad_rotation: vec![[testing::UNWRITTEN; 4]; n],
         };
-        let push = stage::push_backward(&camera, 0.0, 1);
+        let push = stage::push_backward(&camera, 0.0);
         let got = testing::run_once::<project_backward::Kernel>(&gpu, &arrays, push, n);
         let compare = |tensor: &'static str, got: &[f32]| {
             let Check { relative, absolute, band } = backward_check(tensor);

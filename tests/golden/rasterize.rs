@@ -2,10 +2,11 @@
 
 use gscream_vk::gpu::{Check, testing};
 use gscream_vk::math::camera::{factors, factors_backward};
-use gscream_vk::primitives::dispatch;
+use gscream_vk::primitives::Count;
 use gscream_vk::primitives::limit::Limits;
 use gscream_vk::render::bin::{Bin, Tiling};
 use gscream_vk::render::rasterize::{self, Backward, Outputs, Picture, PictureGradient, Projected};
+use gscream_vk::render::slots::Slots;
 
 use super::support::{Case, cases};
 
@@ -92,8 +93,7 @@ fn rasterize() {
             let background = case.vectors::<3>("background")[0];
             let limits = Limits::new(&gpu).unwrap();
             let count = gpu.upload("count", &[n]).unwrap();
-            gpu.write(limits.slots(), &[n]).unwrap();
-            let slots = dispatch::groups(&gpu, "slots", 64).unwrap();
+            let existing = Slots::all(&gpu, n).unwrap();
             let grid = tiling.grid(size);
             let pairs = n * grid[0] * grid[1];
             let bin = Bin::new(&gpu, tiling, n, pairs, size).unwrap();
@@ -104,10 +104,9 @@ fn rasterize() {
             let grad_t = gpu.upload("grad_transmittance", &case.f32("upstream.transmittance")).unwrap();
 
             let mut rec = gpu.recorder().unwrap();
-            dispatch::record(&mut rec, &count, &slots, n, 1);
             let projected = Projected {
-                slots: &slots,
-                offsets: 1,
+                slots: Count::Device(&count),
+                existing: &existing,
                 mean: &mean,
                 covariance: &covariance,
                 depth: &depth,
@@ -117,6 +116,12 @@ fn rasterize() {
             let binned = bin.record(&mut rec, projected, size, &limits);
             rasterize::forward(&mut rec, tiling, projected, binned, background, &picture);
             let gradient = PictureGradient { rgb: &grad_rgb, depth: Some(&grad_z), transmittance: Some(&grad_t) };
+            // What touches no tile is not written: no gradient.
+            rec.zero(&backward.grad_mean);
+            rec.zero(&backward.grad_covariance);
+            rec.zero(&backward.grad_opacity);
+            rec.zero(&backward.grad_color);
+            backward.grad_depth.iter().for_each(|grad_depth| rec.zero(grad_depth));
             backward.record(&mut rec, tiling, projected, binned, &picture, gradient);
             rec.submit().unwrap().wait().unwrap();
             assert_eq!(gpu.read(limits.overflow()).unwrap(), [0]);
