@@ -6,11 +6,8 @@
 #extension GL_KHR_shader_subgroup_ballot : require
 #extension GL_KHR_shader_subgroup_arithmetic : require
 #extension GL_KHR_shader_subgroup_shuffle : require
-// variant narrow: NARROW
 // variant color: COLOR_ONLY
-// variant narrow_color: NARROW COLOR_ONLY
 // variant depth: NO_TRANSMITTANCE
-// variant narrow_depth: NARROW NO_TRANSMITTANCE
 //
 // Gradients of the blending, per (Gaussian, tile) pair. Front to back, as the forward pass, with what remains behind:
 // with v_i = c_i . g_rgb + z_i g_z, S = sum of w_i v_i + T_end (background . g_rgb + g_T) and A_i the sum's first i
@@ -23,13 +20,8 @@
 #else
 #define WITH_DEPTH
 #endif
-#ifdef NARROW
-const uint TILE = 8u, THREADS = 8u, ROWS = 8u;
-layout(local_size_x = 8) in;
-#else
 const uint TILE = 16u, THREADS = 64u, ROWS = 4u;
 layout(local_size_x = 64) in;
-#endif
 layout(constant_id = 0) const float ALPHA_MIN = 0.00392156862745098; // samples below are skipped
 layout(constant_id = 1) const float TRANSMITTANCE_MIN = 1e-4; // a pixel is finished before it falls below
 layout(binding = 0, scalar) readonly buffer Ranges { uvec2 ranges[]; };         // [tile + 1] first, one past last in the sorted list
@@ -141,26 +133,7 @@ Sums over_subgroup(Sums s) {
   return s;
 }
 
-#ifdef NARROW
-// Half of a step of eight sums over eight lanes at once: lanes with the bit keep the second's, the others the first's,
-// and both add what their partner holds of it. After bits 1, 2 and 4 lane k holds the k-th Gaussian's sums.
-Sums meet(Sums a, Sums b, uint bit) {
-  bool upper = (gl_SubgroupInvocationID & bit) != 0u;
-#define MEET(f) s.f = (upper ? b.f : a.f) + subgroupShuffleXor(upper ? a.f : b.f, bit)
-  Sums s;
-  MEET(first);
-  MEET(second);
-  MEET(opacity);
-  MEET(color);
-  s.z = 0.0;
-#ifdef WITH_DEPTH
-  MEET(z);
-#endif
-  return s;
-}
-#endif
 
-#ifndef NARROW
 const uint BATCH = 32u;
 const uint SUBGROUPS = 16u; // most there can be: 64 threads in subgroups of at least 4
 shared uint s_live;
@@ -175,7 +148,6 @@ shared vec2 s_first[BATCH * SUBGROUPS];
 shared vec3 s_second[BATCH * SUBGROUPS];
 shared vec3 s_color_sum[BATCH * SUBGROUPS];
 shared vec2 s_opacity_depth[BATCH * SUBGROUPS];
-#endif
 
 void main() {
   uint tile = gl_WorkGroupID.y * push.tiles_x + gl_WorkGroupID.x;
@@ -199,37 +171,6 @@ void main() {
   }
   uvec2 range = ranges[tile];
   uint base = range.x;
-#ifdef NARROW
-  for (; base < range.y; base += THREADS) {
-    if (!subgroupAny(any_live())) break;
-    // A lane beyond the end has opacity 0, which no pixel blends.
-    uint i = base + t;
-    bool some = i < range.y;
-    uint p = sorted[some ? i : range.x];
-    uint g = pair_slot[p];
-    vec2 m = mean[g];
-    vec3 q = conic[g];
-    float o = some ? opacity[g] : 0.0;
-    vec3 c = color[g];
-#ifdef WITH_DEPTH
-    float z = depth[g];
-#else
-    float z = 0.0;
-#endif
-#define SUMS(k) sums_of(subgroupShuffle(m, k), subgroupShuffle(q, k), subgroupShuffle(o, k), subgroupShuffle(c, k), subgroupShuffle(z, k))
-    Sums a = SUMS(0u);
-    a = meet(a, SUMS(1u), 1u);
-    Sums b = SUMS(2u);
-    b = meet(b, SUMS(3u), 1u);
-    a = meet(a, b, 2u);
-    b = SUMS(4u);
-    b = meet(b, SUMS(5u), 1u);
-    Sums d = SUMS(6u);
-    d = meet(d, SUMS(7u), 1u);
-    Sums mine = meet(a, meet(b, d, 2u), 4u);
-    if (some) write(p, q, mine);
-  }
-#else
   for (; base < range.y; base += BATCH) {
     uint n = min(BATCH, range.y - base);
     if (t == 0u) s_live = 0u;
@@ -277,7 +218,6 @@ void main() {
     }
     barrier();
   }
-#endif
   // Behind the last Gaussian that any pixel of the tile can still see.
   for (uint i = base + t; i < range.y; i += THREADS) write(sorted[i], vec3(0.0), NO_SUMS);
   // Pairs that were counted but touch no tile stand behind the last tile (see bin_expand): the gather reads them too.

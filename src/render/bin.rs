@@ -192,6 +192,17 @@ pub struct Binned<'a> {
     pub sorted: &'a Buffer<u32>,
     /// `[tile + 1]` first and one past last in `sorted`.
     pub ranges: &'a Buffer<[u32; 2]>,
+    /// Where narrow tiles' pictures note what they are made of.
+    pub blended: Option<Blended<'a>>,
+}
+
+/// The pairs of which a pixel took something, written by the forward and read by the backward pass of narrow tiles.
+#[derive(Clone, Copy)]
+pub struct Blended<'a> {
+    /// `[pair]` from a tile's first on: numbers and slots of its pairs, nearest first.
+    pub pairs: &'a Buffer<[u32; 2]>,
+    /// `[tile]` how many.
+    pub count: &'a Buffer<u32>,
 }
 
 /// The stage: its lists for so many slots and pairs.
@@ -235,6 +246,8 @@ struct Tally {
     run_first: Buffer<u32>,
     placed: Buffer<u32>,
     scan: Scan,
+    blended: Buffer<[u32; 2]>,
+    blended_count: Buffer<u32>,
 }
 
 impl Tally {
@@ -243,8 +256,8 @@ impl Tally {
     /// Most counters, where there are at least eight runs.
     const COUNTERS: u32 = 1 << 22;
 
-    /// Counters of pictures of at most so many tiles, that behind the last included.
-    fn new(gpu: &Gpu, tiles: u32) -> Result<Self, Error> {
+    /// Counters of pictures of at most so many tiles, that behind the last included, and pairs.
+    fn new(gpu: &Gpu, tiles: u32, pairs: usize) -> Result<Self, Error> {
         let runs = (Self::COUNTERS / tiles).clamp(8, Self::RUNS);
         let counters = runs * tiles;
         Ok(Self {
@@ -253,6 +266,8 @@ impl Tally {
             run_first: gpu.buffer("run_first", counters as usize)?,
             placed: gpu.buffer("placed", 1)?,
             scan: Scan::new(gpu, counters)?,
+            blended: gpu.buffer("blended", pairs)?,
+            blended_count: gpu.buffer("blended_count", tiles as usize)?,
         })
     }
 }
@@ -294,7 +309,7 @@ impl Bin {
                 Tiling::Wide => {
                     ByTile::Sort { sort: Sort::new(gpu, pairs)?, groups: dispatch::groups(gpu, "pair_groups", 64)? }
                 }
-                Tiling::Narrow => ByTile::Tally(Tally::new(gpu, tiles)?),
+                Tiling::Narrow => ByTile::Tally(Tally::new(gpu, tiles, p)?),
             },
         })
     }
@@ -362,7 +377,7 @@ impl Bin {
         let constants = bin_expand::Constants { alpha_min };
         rec.run_with(bin_expand::Kernel, constants, buffers, bin_expand::Push { grid, tile }, drawn_groups);
         let last = grid[0] * grid[1];
-        let sorted = match &self.by_tile {
+        let (sorted, blended) = match &self.by_tile {
             ByTile::Sort { sort, groups } => {
                 let pairs = Pairs { keys: pair_tile, values: sorted };
                 let bits = 32 - last.leading_zeros();
@@ -371,9 +386,9 @@ impl Bin {
                 dispatch::record(rec, pair_count, groups, self.pairs, 1);
                 let buffers = bin_ranges::Buffers { pair_count, sorted_tile: sorted.keys, ranges };
                 rec.run(bin_ranges::Kernel, buffers, (), groups);
-                sorted.values
+                (sorted.values, None)
             }
-            ByTile::Tally(Tally { runs, run_pairs, run_first, placed, scan }) => {
+            ByTile::Tally(Tally { runs, run_pairs, run_first, placed, scan, blended, blended_count }) => {
                 let (runs, tiles) = (*runs, last + 1);
                 rec.zero(run_pairs);
                 let buffers = bin_tally::Buffers { pair_count, pair_tile, run_pairs };
@@ -383,10 +398,22 @@ impl Bin {
                 rec.run(bin_tally_ranges::Kernel, buffers, bin_tally_ranges::Push { tiles, runs }, tiles);
                 let buffers = bin_place::Buffers { pair_count, pair_tile, run_first, sorted };
                 rec.run(bin_place::Kernel, buffers, bin_place::Push { runs }, runs);
-                sorted
+                (sorted, Some(Blended { pairs: blended, count: blended_count }))
             }
         };
-        Binned { conic, tiles, drawn, drawn_count, drawn_groups, pair_count, first_pair, pair_slot, sorted, ranges }
+        Binned {
+            conic,
+            tiles,
+            drawn,
+            drawn_count,
+            drawn_groups,
+            pair_count,
+            first_pair,
+            pair_slot,
+            sorted,
+            ranges,
+            blended,
+        }
     }
 }
 
