@@ -1,30 +1,17 @@
 #version 460
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_EXT_control_flow_attributes : require
-#extension GL_KHR_shader_subgroup_basic : require
-#extension GL_KHR_shader_subgroup_vote : require
-#extension GL_KHR_shader_subgroup_ballot : require
-#extension GL_KHR_shader_subgroup_shuffle : require
-// variant narrow: NARROW
 // variant color: COLOR_ONLY
-// variant narrow_color: NARROW COLOR_ONLY
 // variant depth: NO_TRANSMITTANCE
-// variant narrow_depth: NARROW NO_TRANSMITTANCE
 //
 // Front-to-back blending of a tile's Gaussians (3D Gaussian Splatting, equation 3): colour, depth and transmittance.
-// The base kernel takes 16 x 16 tiles, 64 threads of 4 pixels, and passes Gaussians through shared memory. `narrow` is
-// for subgroups of 8 (CPU drivers): 8 x 8 tiles, one subgroup of 8 threads x 8 pixels; each lane loads one Gaussian and
-// broadcasts it, so there is no shared memory and no barrier. `depth` leaves transmittance out, `color` also depth.
+// 16 x 16 tiles, 64 threads of 4 pixels; Gaussians pass through shared memory. `depth` leaves transmittance out, `color`
+// also depth.
 #ifdef COLOR_ONLY
 #define NO_TRANSMITTANCE
 #endif
-#ifdef NARROW
-const uint TILE = 8u, THREADS = 8u, ROWS = 8u;
-layout(local_size_x = 8) in;
-#else
 const uint TILE = 16u, THREADS = 64u, ROWS = 4u;
 layout(local_size_x = 64) in;
-#endif
 layout(constant_id = 0) const float ALPHA_MIN = 0.00392156862745098; // samples below are skipped
 layout(constant_id = 1) const float TRANSMITTANCE_MIN = 1e-4; // a pixel is finished before it falls below
 layout(binding = 0, scalar) readonly buffer Ranges { uvec2 ranges[]; };         // [tile + 1] first, one past last in the sorted list
@@ -80,7 +67,6 @@ void blend(vec2 m, vec3 q, float o, vec3 c, float z) {
   }
 }
 
-#ifndef NARROW
 const uint BATCH = 64u;
 shared vec2 s_mean[BATCH];
 shared vec3 s_conic[BATCH];
@@ -90,7 +76,6 @@ shared vec3 s_color[BATCH];
 shared float s_depth[BATCH];
 #endif
 shared uint s_live;
-#endif
 
 void main() {
   uint tile = gl_WorkGroupID.y * push.tiles_x + gl_WorkGroupID.x;
@@ -106,28 +91,6 @@ void main() {
     live[r] = first.x < push.size.x && first.y + r < push.size.y;
   }
   uvec2 range = ranges[tile];
-#ifdef NARROW
-  for (uint base = range.x; base < range.y; base += THREADS) {
-    // A lane beyond the end has opacity 0, which no pixel blends.
-    uint i = base + t;
-    bool some = i < range.y;
-    uint g = pair_slot[sorted[some ? i : range.x]];
-    vec2 m = mean[g];
-    vec3 q = conic[g];
-    float o = some ? opacity[g] : 0.0;
-    vec3 c = color[g];
-#ifdef COLOR_ONLY
-    float z = 0.0;
-#else
-    float z = depth[g];
-#endif
-#define BLEND(k) blend(subgroupShuffle(m, k), subgroupShuffle(q, k), subgroupShuffle(o, k), subgroupShuffle(c, k), subgroupShuffle(z, k))
-    BLEND(0u); BLEND(1u); BLEND(2u); BLEND(3u); BLEND(4u); BLEND(5u); BLEND(6u); BLEND(7u);
-    bool any_live = false;
-    [[unroll]] for (uint r = 0u; r < ROWS; r++) any_live = any_live || live[r];
-    if (!subgroupAny(any_live)) break;
-  }
-#else
   for (uint base = range.x; base < range.y; base += BATCH) {
     uint i = base + t;
     if (t == 0u) s_live = 0u;
@@ -155,7 +118,6 @@ void main() {
 #endif
     barrier();
   }
-#endif
   [[unroll]] for (uint r = 0u; r < ROWS; r++) {
     if (first.x < push.size.x && first.y + r < push.size.y) {
       uint p = (first.y + r) * push.size.x + first.x;

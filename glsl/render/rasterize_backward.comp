@@ -6,11 +6,8 @@
 #extension GL_KHR_shader_subgroup_ballot : require
 #extension GL_KHR_shader_subgroup_arithmetic : require
 #extension GL_KHR_shader_subgroup_shuffle : require
-// variant narrow: NARROW
 // variant color: COLOR_ONLY
-// variant narrow_color: NARROW COLOR_ONLY
 // variant depth: NO_TRANSMITTANCE
-// variant narrow_depth: NARROW NO_TRANSMITTANCE
 //
 // Gradients of the blending, per (Gaussian, tile) pair. Front to back, as the forward pass, with what remains behind:
 // with v_i = c_i . g_rgb + z_i g_z, S = sum of w_i v_i + T_end (background . g_rgb + g_T) and A_i the sum's first i
@@ -23,13 +20,8 @@
 #else
 #define WITH_DEPTH
 #endif
-#ifdef NARROW
-const uint TILE = 8u, THREADS = 8u, ROWS = 8u;
-layout(local_size_x = 8) in;
-#else
 const uint TILE = 16u, THREADS = 64u, ROWS = 4u;
 layout(local_size_x = 64) in;
-#endif
 layout(constant_id = 0) const float ALPHA_MIN = 0.00392156862745098; // samples below are skipped
 layout(constant_id = 1) const float TRANSMITTANCE_MIN = 1e-4; // a pixel is finished before it falls below
 layout(constant_id = 2) const uint SUBGROUPS = 16u; // subgroups of a wide tile's 64 threads; those of four are the most
@@ -149,7 +141,6 @@ Sums meet(Sums a, Sums b, uint bit) {
   return s;
 }
 
-#ifndef NARROW
 const uint BATCH = 32u;
 const uint GROUP = 4u; // Gaussians whose sums meet: the fewest lanes a subgroup has
 shared uint s_live;
@@ -164,7 +155,6 @@ shared vec2 s_first[BATCH * SUBGROUPS];
 shared vec3 s_second[BATCH * SUBGROUPS];
 shared vec3 s_color_sum[BATCH * SUBGROUPS];
 shared vec2 s_opacity_depth[BATCH * SUBGROUPS];
-#endif
 
 void main() {
   uint tile = gl_WorkGroupID.y * push.tiles_x + gl_WorkGroupID.x;
@@ -188,37 +178,6 @@ void main() {
   }
   uvec2 range = ranges[tile];
   uint base = range.x;
-#ifdef NARROW
-  for (; base < range.y; base += THREADS) {
-    if (!subgroupAny(any_live())) break;
-    // A lane beyond the end has opacity 0, which no pixel blends.
-    uint i = base + t;
-    bool some = i < range.y;
-    uint p = sorted[some ? i : range.x];
-    uint g = pair_slot[p];
-    vec2 m = mean[g];
-    vec3 q = conic[g];
-    float o = some ? opacity[g] : 0.0;
-    vec3 c = color[g];
-#ifdef WITH_DEPTH
-    float z = depth[g];
-#else
-    float z = 0.0;
-#endif
-#define SUMS(k) sums_of(subgroupShuffle(m, k), subgroupShuffle(q, k), subgroupShuffle(o, k), subgroupShuffle(c, k), subgroupShuffle(z, k))
-    Sums a = SUMS(0u);
-    a = meet(a, SUMS(1u), 1u);
-    Sums b = SUMS(2u);
-    b = meet(b, SUMS(3u), 1u);
-    a = meet(a, b, 2u);
-    b = SUMS(4u);
-    b = meet(b, SUMS(5u), 1u);
-    Sums d = SUMS(6u);
-    d = meet(d, SUMS(7u), 1u);
-    Sums mine = meet(a, meet(b, d, 2u), 4u);
-    if (some) write(p, q, mine);
-  }
-#else
   for (; base < range.y; base += BATCH) {
     uint n = min(BATCH, range.y - base);
     if (t == 0u) s_live = 0u;
@@ -284,7 +243,6 @@ void main() {
     }
     barrier();
   }
-#endif
   // Behind the last Gaussian that any pixel of the tile can still see.
   for (uint i = base + t; i < range.y; i += THREADS) write(sorted[i], vec3(0.0), NO_SUMS);
   // Pairs that were counted but touch no tile stand behind the last tile (see bin_expand): the gather reads them too.

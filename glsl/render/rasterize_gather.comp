@@ -2,10 +2,12 @@
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_GOOGLE_include_directive : require
 // variant color: COLOR_ONLY
+// variant marked: MARKED
+// variant marked_color: MARKED COLOR_ONLY
 //
 // Gradients of a Gaussian that touches a tile: the sum over its pairs, which lie one behind the other, and from the factors
 // of the conic (1/N, k, 1/V) to those of the covariance (N, k, V): dL/dN = -dL/d(1/N) / N^2. Where the pairs do not fit there
-// are none, and no gradient.
+// are none, and no gradient. `marked`: a pair without a mark has no gradient, and none is there to be read.
 layout(local_size_x = 64) in;
 #include "thread.glsl"
 layout(binding = 0, scalar) readonly buffer DrawnCount { uint drawn_count[]; }; // [1] Gaussians that touch a tile
@@ -22,26 +24,45 @@ layout(binding = 10, scalar) writeonly buffer GradMean { vec2 grad_mean[]; };   
 layout(binding = 11, scalar) writeonly buffer GradCovariance { vec3 grad_covariance[]; }; // [slot] of the factors
 layout(binding = 12, scalar) writeonly buffer GradOpacity { float grad_opacity[]; }; // [slot]
 layout(binding = 13, scalar) writeonly buffer GradColor { vec3 grad_color[]; }; // [slot]
+#ifdef MARKED
+layout(binding = 16, scalar) readonly buffer Marks { uint marks[]; };           // [pair / 32] a bit for each pair that has a gradient
+#endif
 #ifndef COLOR_ONLY
 layout(binding = 14, scalar) readonly buffer PairDepth { float pair_depth[]; }; // [pair]
 layout(binding = 15, scalar) writeonly buffer GradDepth { float grad_depth[]; }; // [slot]
 #endif
+vec2 m = vec2(0.0);
+vec3 g = vec3(0.0), c = vec3(0.0);
+float o = 0.0, z = 0.0;
+
+void add(uint p) {
+  m += pair_mean[p];
+  g += pair_conic[p];
+  o += pair_opacity[p];
+  c += pair_color[p];
+#ifndef COLOR_ONLY
+  z += pair_depth[p];
+#endif
+}
+
 void main() {
   uint i = thread_index();
   if (i >= drawn_count[0]) return;
   uint s = drawn[i], p = first_pair[s], end = pair_count[0] == 0u ? p : p + tiles[s];
-  vec2 m = vec2(0.0);
-  vec3 g = vec3(0.0), c = vec3(0.0);
-  float o = 0.0, z = 0.0;
-  for (; p < end; p++) {
-    m += pair_mean[p];
-    g += pair_conic[p];
-    o += pair_opacity[p];
-    c += pair_color[p];
-#ifndef COLOR_ONLY
-    z += pair_depth[p];
+#ifdef MARKED
+  // CPU drivers run a loop's body once more, masked, when the test at its head fails; a Gaussian drawn has a pair.
+  if (p < end) do {
+    uint first = p & 31u, n = min(end - p, 32u - first);
+    uint bits = marks[p >> 5u] >> first & 0xffffffffu >> (32u - n);
+    if (bits != 0u) do {
+      add(p + findLSB(bits));
+      bits &= bits - 1u;
+    } while (bits != 0u);
+    p += n;
+  } while (p < end);
+#else
+  for (; p < end; p++) add(p);
 #endif
-  }
   vec3 q = conic[s];
   grad_mean[s] = m;
   grad_covariance[s] = vec3(-(q.x * g.x) * q.x, g.y, -(q.z * g.z) * q.z);

@@ -15,8 +15,8 @@ use crate::gpu::kernels::render::{
 use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
 use crate::math::tiles::Support;
 use crate::primitives::compact::Compact;
-use crate::primitives::limit::{Counter, Limits};
 use crate::primitives::dispatch::Shape;
+use crate::primitives::limit::{Counter, Limits};
 use crate::primitives::scan::{self, Scan};
 use crate::primitives::sort::{Pairs, Sort};
 use crate::primitives::{Count, dispatch};
@@ -191,6 +191,17 @@ pub struct Binned<'a> {
     pub sorted: &'a Buffer<u32>,
     /// `[tile + 1]` first and one past last in `sorted`.
     pub ranges: &'a Buffer<[u32; 2]>,
+    /// Where narrow tiles' pictures note what they are made of.
+    pub blended: Option<Blended<'a>>,
+}
+
+/// The pairs of which a pixel took something, written by the forward and read by the backward pass of narrow tiles.
+#[derive(Clone, Copy)]
+pub struct Blended<'a> {
+    /// `[pair]` from a tile's first on: numbers and slots of its pairs, nearest first.
+    pub pairs: &'a Buffer<[u32; 2]>,
+    /// `[tile]` how many.
+    pub count: &'a Buffer<u32>,
 }
 
 /// The stage: its lists for so many slots and pairs.
@@ -234,6 +245,8 @@ struct Tally {
     run_first: Buffer<u32>,
     placed: Buffer<u32>,
     scan: Scan,
+    blended: Buffer<[u32; 2]>,
+    blended_count: Buffer<u32>,
 }
 
 impl Tally {
@@ -242,8 +255,8 @@ impl Tally {
     /// Most counters, where there are at least eight runs.
     const COUNTERS: u32 = 1 << 22;
 
-    /// Counters of pictures of at most so many tiles, that behind the last included.
-    fn new(gpu: &Gpu, tiles: u32) -> Result<Self, Error> {
+    /// Counters of pictures of at most so many tiles, that behind the last included, and pairs.
+    fn new(gpu: &Gpu, tiles: u32, pairs: usize) -> Result<Self, Error> {
         let runs = (Self::COUNTERS / tiles).clamp(8, Self::RUNS);
         let counters = runs * tiles;
         Ok(Self {
@@ -252,6 +265,8 @@ impl Tally {
             run_first: gpu.buffer("run_first", counters as usize)?,
             placed: gpu.buffer("placed", 1)?,
             scan: Scan::new(gpu, counters)?,
+            blended: gpu.buffer("blended", pairs)?,
+            blended_count: gpu.buffer("blended_count", tiles as usize)?,
         })
     }
 }
@@ -274,11 +289,7 @@ impl Bin {
             conic: gpu.buffer("conic", n)?,
             tiles: gpu.buffer("tiles", n)?,
             first_pair: gpu.buffer("first_pair", n)?,
-            drawn: Slots {
-                list: gpu.buffer("drawn", n)?,
-                count: gpu.buffer("drawn_count", 1)?,
-                groups: per_drawn,
-            },
+            drawn: Slots { list: gpu.buffer("drawn", n)?, count: gpu.buffer("drawn_count", 1)?, groups: per_drawn },
             per_sorted,
             per_scanned,
             depth_keys: gpu.buffer("depth_keys", n)?,
@@ -298,7 +309,7 @@ impl Bin {
                 Tiling::Wide => {
                     ByTile::Sort { sort: Sort::new(gpu, pairs)?, groups: dispatch::groups(gpu, "pair_groups", 64)? }
                 }
-                Tiling::Narrow => ByTile::Tally(Tally::new(gpu, tiles)?),
+                Tiling::Narrow => ByTile::Tally(Tally::new(gpu, tiles, p)?),
             },
         })
     }
@@ -318,16 +329,7 @@ impl Bin {
     ) -> Binned<'a> {
         let Projected { slots, existing, mean, covariance, depth, opacity, .. } = gaussians;
         let Self {
-            conic,
-            tiles,
-            drawn,
-            per_sorted,
-            per_scanned,
-            depth_keys,
-            depth_values,
-            rank_tiles,
-            rank_first,
-            ..
+            conic, tiles, drawn, per_sorted, per_scanned, depth_keys, depth_values, rank_tiles, rank_first, ..
         } = self;
         let Self { pair_total, pair_count, pair_tile, pair_slot, first_pair, ranges, sorted, .. } = self;
         let Method { tiling, alpha_min, depth_key, .. } = self.method;
@@ -342,15 +344,15 @@ impl Bin {
         self.compact.record(rec, tiles, &drawn.list, &drawn.count, slots);
         limits.note(rec, &drawn.count, Counter::Drawn);
         let (drawn_count, drawn_groups) = (&drawn.count, &drawn.groups);
-        let shapes =
-            [(drawn_groups, Shape::EACH), (per_sorted, self.depth_sort.shape()), (per_scanned, scan::SHAPE)];
+        let shapes = [(drawn_groups, Shape::EACH), (per_sorted, self.depth_sort.shape()), (per_scanned, scan::SHAPE)];
         dispatch::record_several(rec, drawn_count, drawn.list.len() as u32, shapes);
         let buffers =
             bin_depth_keys::Buffers { drawn_count, drawn: &drawn.list, depth, keys: depth_keys, values: depth_values };
         let push = bin_depth_keys::Push { base: depth_key.base, last: depth_key.last() };
         rec.run(bin_depth_keys::Kernel, buffers, push, drawn_groups);
         let pairs = Pairs { keys: depth_keys, values: depth_values };
-        let order = self.depth_sort.record(rec, pairs, Count::Counted(drawn_count, per_sorted), 0..depth_key.bits).values;
+        let order =
+            self.depth_sort.record(rec, pairs, Count::Counted(drawn_count, per_sorted), 0..depth_key.bits).values;
 
         rec.run(bin_rank::Kernel, bin_rank::Buffers { drawn_count, order, tiles, rank_tiles }, (), drawn_groups);
         self.scan.record(rec, rank_tiles, rank_first, pair_total, Count::Counted(drawn_count, per_scanned));
@@ -371,7 +373,7 @@ impl Bin {
         let constants = bin_expand::Constants { alpha_min };
         rec.run_with(bin_expand::Kernel, constants, buffers, bin_expand::Push { grid, tile }, drawn_groups);
         let last = grid[0] * grid[1];
-        let sorted = match &self.by_tile {
+        let (sorted, blended) = match &self.by_tile {
             ByTile::Sort { sort, groups } => {
                 let pairs = Pairs { keys: pair_tile, values: sorted };
                 let bits = 32 - last.leading_zeros();
@@ -380,9 +382,9 @@ impl Bin {
                 dispatch::record(rec, pair_count, groups, self.pairs, 1);
                 let buffers = bin_ranges::Buffers { pair_count, sorted_tile: sorted.keys, ranges };
                 rec.run(bin_ranges::Kernel, buffers, (), groups);
-                sorted.values
+                (sorted.values, None)
             }
-            ByTile::Tally(Tally { runs, run_pairs, run_first, placed, scan }) => {
+            ByTile::Tally(Tally { runs, run_pairs, run_first, placed, scan, blended, blended_count }) => {
                 let (runs, tiles) = (*runs, last + 1);
                 rec.zero(run_pairs);
                 let buffers = bin_tally::Buffers { pair_count, pair_tile, run_pairs };
@@ -392,10 +394,10 @@ impl Bin {
                 rec.run(bin_tally_ranges::Kernel, buffers, bin_tally_ranges::Push { tiles, runs }, tiles);
                 let buffers = bin_place::Buffers { pair_count, pair_tile, run_first, sorted };
                 rec.run(bin_place::Kernel, buffers, bin_place::Push { runs }, runs);
-                sorted
+                (sorted, Some(Blended { pairs: blended, count: blended_count }))
             }
         };
-        Binned { conic, tiles, drawn, pair_count, first_pair, pair_slot, sorted, ranges }
+        Binned { conic, tiles, drawn, pair_count, first_pair, pair_slot, sorted, ranges, blended }
     }
 }
 

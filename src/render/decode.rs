@@ -146,7 +146,8 @@ macro_rules! hidden_twin {
                 for v in 0..host.groups[3] as usize {
                     for unit in 0..HEADS * HIDDEN {
                         let product = |i: usize| {
-                            f64::from(packed[unit * Layout::PADDED_INPUT + i]) * f64::from(inputs[v * Layout::PADDED_INPUT + i])
+                            f64::from(packed[unit * Layout::PADDED_INPUT + i])
+                                * f64::from(inputs[v * Layout::PADDED_INPUT + i])
                         };
                         let sum: f64 = (0..Layout::PADDED_INPUT).map(product).sum();
                         hidden[v * HEADS * HIDDEN + unit] = sum.max(0.0) as f32;
@@ -347,7 +348,7 @@ macro_rules! backward_feature_twin {
                         };
                         let sum: f64 = (0..HEADS * HIDDEN).map(product).sum();
                         let grad_feature: &mut [f32] = bytemuck::cast_slice_mut(host.grad_feature);
-                    grad_feature[FEATURE * host.visible[v] as usize + i] = sum as f32;
+                        grad_feature[FEATURE * host.visible[v] as usize + i] = sum as f32;
                     }
                 }
             }
@@ -847,8 +848,13 @@ impl DecodeBackward {
             let groups = &forward.per_feature;
             if *lanes {
                 let grad_feature = &grad_feature.view();
-                let buffers =
-                    decode_backward_feature_lanes::Buffers { groups: count, visible, packed, grad_hidden, grad_feature };
+                let buffers = decode_backward_feature_lanes::Buffers {
+                    groups: count,
+                    visible,
+                    packed,
+                    grad_hidden,
+                    grad_feature,
+                };
                 rec.run(decode_backward_feature_lanes::Kernel, buffers, (), groups);
             } else {
                 let buffers =

@@ -9,13 +9,14 @@
 //! The exponential is the driver's: on lavapipe every polynomial tried, down to one of 7e-5 relative error in seven
 //! operations, took longer and was less exact, and GPUs have an instruction for it.
 
-use super::bin::{Binned, Tiling};
+use super::bin::{Binned, Blended, Tiling};
 use super::method::Method;
 use super::slots::Slots;
 use crate::gpu::kernels::render::{
     rasterize, rasterize_backward, rasterize_backward_color, rasterize_backward_depth, rasterize_backward_narrow,
     rasterize_backward_narrow_color, rasterize_backward_narrow_depth, rasterize_color, rasterize_depth,
-    rasterize_gather, rasterize_gather_color, rasterize_narrow, rasterize_narrow_color, rasterize_narrow_depth,
+    rasterize_gather, rasterize_gather_color, rasterize_gather_marked, rasterize_gather_marked_color, rasterize_narrow,
+    rasterize_narrow_color, rasterize_narrow_depth,
 };
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::primitives::Count;
@@ -106,19 +107,22 @@ const PICTURE: Check = Check { relative: 1e-5, absolute: 1e-5, band: 1e-3 };
 const PAIR: Check = Check { relative: 2e-4, absolute: 2e-5, band: 5e-3 };
 
 macro_rules! forward_twin {
-    ($module:ident, $tile:expr $(, depth: $depth:ident)? $(, transmittance: $transmittance:ident)?) => {
+    ($module:ident, $tile:expr, $check:expr
+        $(, blended: $blended:ident)? $(, depth: $depth:ident)? $(, transmittance: $transmittance:ident)?) => {
         impl Reference for $module::Kernel {
             fn reference(host: $module::Host<'_>, push: $module::Push, constants: $module::Constants) {
                 let $module::Constants { alpha_min, transmittance_min } = constants;
                 let $module::Host { ranges, sorted, pair_slot, mean, conic, opacity, color, rgb, .. } = host;
                 let splats = Splats { ranges, sorted, pair_slot, mean, conic, opacity, color, alpha_min, transmittance_min };
                 let [width, height] = push.size;
+                let mut _seen = vec![false; pair_slot.len()];
                 for y in 0..height {
                     for x in 0..width {
                         let p = (y * width + x) as usize;
                         let mut sum = [0f64; 3];
                         let mut _z = 0f64;
-                        let left = splats.walk([x, y], $tile, push.tiles_x, |_, slot, _, _, w| {
+                        let left = splats.walk([x, y], $tile, push.tiles_x, |pair, slot, _, _, w| {
+                            _seen[pair] = true;
                             for c in 0..3 {
                                 sum[c] += w * f64::from(color[slot][c]);
                             }
@@ -132,19 +136,38 @@ macro_rules! forward_twin {
                         $(host.$transmittance[p] = left as f32;)?
                     }
                 }
+                $(
+                    for tile in 0..(push.tiles_x * height.div_ceil($tile)) as usize {
+                        let [first, end] = ranges[tile].map(|i| i as usize);
+                        let listed = sorted[first..end].iter().filter(|pair| _seen[**pair as usize]);
+                        let mut count = 0;
+                        for (place, &pair) in std::iter::zip(&mut host.$blended[first..end], listed) {
+                            *place = [pair, pair_slot[pair as usize]];
+                            count += 1;
+                        }
+                        host.blended_count[tile] = count;
+                    }
+                )?
             }
-            fn check(_: &'static str) -> Check {
-                PICTURE
+            fn check(binding: &'static str) -> Check {
+                $check(binding)
             }
         }
     };
 }
-forward_twin!(rasterize, 16, depth: depth, transmittance: transmittance);
-forward_twin!(rasterize_narrow, 8, depth: depth, transmittance: transmittance);
-forward_twin!(rasterize_depth, 16, depth: depth);
-forward_twin!(rasterize_narrow_depth, 8, depth: depth);
-forward_twin!(rasterize_color, 16);
-forward_twin!(rasterize_narrow_color, 8);
+
+/// Of narrow tiles' lists, which hold a pair if at least one sample is blended: one that flips where there is no other
+/// moves the rest of its tile's list by a place (`lists_hold_what_is_blended` looks at what they hold).
+fn narrow_picture(binding: &'static str) -> Check {
+    Check { band: if binding == "blended" { 1.0 } else { PICTURE.band }, ..PICTURE }
+}
+
+forward_twin!(rasterize, 16, |_| PICTURE, depth: depth, transmittance: transmittance);
+forward_twin!(rasterize_narrow, 8, narrow_picture, blended: blended, depth: depth, transmittance: transmittance);
+forward_twin!(rasterize_depth, 16, |_| PICTURE, depth: depth);
+forward_twin!(rasterize_narrow_depth, 8, narrow_picture, blended: blended, depth: depth);
+forward_twin!(rasterize_color, 16, |_| PICTURE);
+forward_twin!(rasterize_narrow_color, 8, narrow_picture, blended: blended);
 
 /// Gradients of one pair.
 #[derive(Clone, Copy, Default)]
@@ -246,22 +269,78 @@ macro_rules! backward_twin {
     };
 }
 backward_twin!(rasterize_backward, 16, depth: depth, transmittance: transmittance);
-backward_twin!(rasterize_backward_narrow, 8, depth: depth, transmittance: transmittance);
 backward_twin!(rasterize_backward_depth, 16, depth: depth);
-backward_twin!(rasterize_backward_narrow_depth, 8, depth: depth);
 backward_twin!(rasterize_backward_color, 16);
-backward_twin!(rasterize_backward_narrow_color, 8);
+
+macro_rules! narrow_backward_twin {
+    ($module:ident $(, depth: $depth:ident)? $(, transmittance: $transmittance:ident)?) => {
+        impl Reference for $module::Kernel {
+            fn reference(host: $module::Host<'_>, push: $module::Push, constants: $module::Constants) {
+                let $module::Constants { alpha_min, transmittance_min } = constants;
+                let $module::Host { ranges, blended, blended_count, mean, conic, opacity, color, .. } = host;
+                let tiles = (push.tiles_x * push.size[1].div_ceil(8)) as usize;
+                let lists: Vec<[u32; 2]> =
+                    (0..tiles).map(|t| [ranges[t][0], ranges[t][0] + blended_count[t]]).collect();
+                let (mut sorted, mut pair_slot) = (vec![0; blended.len()], vec![0; host.pair_mean.len()]);
+                for i in lists.iter().flat_map(|list| list[0] as usize..list[1] as usize) {
+                    let [pair, slot] = blended[i];
+                    sorted[i] = pair;
+                    pair_slot[pair as usize] = slot;
+                }
+                let (ranges, sorted, pair_slot) = (&lists[..], &sorted[..], &pair_slot[..]);
+                let splats = Splats { ranges, sorted, pair_slot, mean, conic, opacity, color, alpha_min, transmittance_min };
+                let mut _depth: Option<&[f32]> = None;
+                $(_depth = Some(host.$depth);)?
+                let gradients = backward(&splats, _depth, push.size, 8, push.tiles_x, |p| {
+                    let rgb = host.grad_rgb[p].map(f64::from);
+                    let mut total: f64 = (0..3).map(|c| f64::from(host.rgb[p][c]) * rgb[c]).sum();
+                    let mut _z = 0.0;
+                    $(
+                        let _ = &host.$depth;
+                        _z = f64::from(host.grad_depth_map[p]);
+                        total += f64::from(host.depth_map[p]) * _z;
+                    )?
+                    $(total += f64::from(host.$transmittance[p]) * f64::from(host.grad_transmittance[p]);)?
+                    let z = _z;
+                    total += 0.0;
+                    Upstream { total, rgb, z }
+                });
+                for pair in lists.iter().flat_map(|list| &sorted[list[0] as usize..list[1] as usize]) {
+                    let (p, g) = (*pair as usize, &gradients[*pair as usize]);
+                    host.pair_mean[p] = g.mean.map(|v| v as f32);
+                    host.pair_conic[p] = g.conic.map(|v| v as f32);
+                    host.pair_opacity[p] = g.opacity as f32;
+                    host.pair_color[p] = g.color.map(|v| v as f32);
+                    $(
+                        let _ = &host.$depth;
+                        host.pair_depth[p] = g.depth as f32;
+                    )?
+                    host.marks[p / 32] |= 1 << (p % 32);
+                }
+            }
+            fn check(_: &'static str) -> Check {
+                PAIR
+            }
+        }
+    };
+}
+narrow_backward_twin!(rasterize_backward_narrow, depth: depth, transmittance: transmittance);
+narrow_backward_twin!(rasterize_backward_narrow_depth, depth: depth);
+narrow_backward_twin!(rasterize_backward_narrow_color);
 
 macro_rules! gather_twin {
-    ($module:ident $(, $depth:ident)?) => {
+    ($module:ident $(, depth: $depth:ident)? $(, marks: $marks:ident)?) => {
         impl Reference for $module::Kernel {
             fn reference(host: $module::Host<'_>, (): (), (): ()) {
                 let drawn = host.drawn_count[0] as usize;
                 let fits = host.pair_count[0] > 0;
                 for s in host.drawn[..drawn].iter().map(|&slot| slot as usize) {
                     let first = host.first_pair[s] as usize;
-                    let pairs = first..first + if fits { host.tiles[s] as usize } else { 0 };
-                    let sum = |f: &dyn Fn(usize) -> f32| pairs.clone().map(|p| f64::from(f(p))).sum::<f64>();
+                    let end = first + if fits { host.tiles[s] as usize } else { 0 };
+                    let pairs: Vec<usize> = (first..end)
+                        $(.filter(|p| host.$marks[p / 32] >> (p % 32) & 1 == 1))?
+                        .collect();
+                    let sum = |f: &dyn Fn(usize) -> f32| pairs.iter().map(|p| f64::from(f(*p))).sum::<f64>();
                     let g: [f64; 3] = std::array::from_fn(|c| sum(&|p| host.pair_conic[p][c]));
                     let [a, _, b] = host.conic[s].map(f64::from);
                     host.grad_mean[s] = std::array::from_fn(|c| sum(&|p| host.pair_mean[p][c]) as f32);
@@ -278,8 +357,10 @@ macro_rules! gather_twin {
         }
     };
 }
-gather_twin!(rasterize_gather, grad_depth);
+gather_twin!(rasterize_gather, depth: grad_depth);
 gather_twin!(rasterize_gather_color);
+gather_twin!(rasterize_gather_marked, depth: grad_depth, marks: marks);
+gather_twin!(rasterize_gather_marked_color, marks: marks);
 
 /// Gaussians in screen space, per slot.
 #[derive(Clone, Copy)]
@@ -369,15 +450,20 @@ pub fn forward(
             rec.run_with($module::Kernel, constants, buffers, $module::Push { size, tiles_x: grid[0], background }, threads);
         }};
     }
-    match (&picture.depth, &picture.transmittance, tiling) {
-        (Some(depth_map), Some(transmittance), Tiling::Wide) => draw!(rasterize, depth, depth_map, transmittance),
-        (Some(depth_map), Some(transmittance), Tiling::Narrow) => {
-            draw!(rasterize_narrow, depth, depth_map, transmittance);
+    if let Some(Blended { pairs: blended, count: blended_count }) = binned.blended {
+        match (&picture.depth, &picture.transmittance) {
+            (Some(depth_map), Some(transmittance)) => {
+                draw!(rasterize_narrow, blended, blended_count, depth, depth_map, transmittance);
+            }
+            (Some(depth_map), None) => draw!(rasterize_narrow_depth, blended, blended_count, depth, depth_map),
+            (None, _) => draw!(rasterize_narrow_color, blended, blended_count),
         }
-        (Some(depth_map), None, Tiling::Wide) => draw!(rasterize_depth, depth, depth_map),
-        (Some(depth_map), None, Tiling::Narrow) => draw!(rasterize_narrow_depth, depth, depth_map),
-        (None, _, Tiling::Wide) => draw!(rasterize_color),
-        (None, _, Tiling::Narrow) => draw!(rasterize_narrow_color),
+    } else {
+        match (&picture.depth, &picture.transmittance) {
+            (Some(depth_map), Some(transmittance)) => draw!(rasterize, depth, depth_map, transmittance),
+            (Some(depth_map), None) => draw!(rasterize_depth, depth, depth_map),
+            (None, _) => draw!(rasterize_color),
+        }
     }
 }
 
@@ -399,6 +485,8 @@ pub struct Backward {
     pair_opacity: Buffer<f32>,
     pair_color: Buffer<[f32; 3]>,
     pair_depth: Option<Buffer<f32>>,
+    /// `[pair / 32]` which pairs have a gradient; on wide tiles all.
+    marks: Option<Buffer<u32>>,
     /// `[slot]` 1/px; as the others of Gaussians that touch a tile alone.
     pub grad_mean: Buffer<[f32; 2]>,
     /// `[slot]` of xx, the one off-diagonal parameter, yy.
@@ -421,14 +509,21 @@ impl Backward {
     ///
     /// # Errors
     /// As [`Gpu::buffer`].
-    pub fn new(gpu: &Gpu, slots: usize, pairs: usize, outputs: Outputs) -> Result<Self, Error> {
-        let depth = outputs != Outputs::Color;
+    pub fn new(
+        gpu: &Gpu,
+        method: impl Into<Method>,
+        slots: usize,
+        pairs: usize,
+        outputs: Outputs,
+    ) -> Result<Self, Error> {
+        let (depth, marked) = (outputs != Outputs::Color, method.into().tiling == Tiling::Narrow);
         Ok(Self {
             pair_mean: gpu.buffer("pair_mean", pairs)?,
             pair_conic: gpu.buffer("pair_conic", pairs)?,
             pair_opacity: gpu.buffer("pair_opacity", pairs)?,
             pair_color: gpu.buffer("pair_color", pairs)?,
             pair_depth: depth.then(|| gpu.buffer("pair_depth", pairs)).transpose()?,
+            marks: marked.then(|| gpu.buffer("marks", pairs.div_ceil(32))).transpose()?,
             grad_mean: gpu.buffer("grad_mean", slots)?,
             grad_covariance: gpu.buffer("grad_covariance", slots)?,
             grad_opacity: gpu.buffer("grad_opacity", slots)?,
@@ -437,7 +532,8 @@ impl Backward {
         })
     }
 
-    /// Walks back from the picture to the Gaussians in screen space.
+    /// Walks back from the picture to the Gaussians in screen space. `method` is that of [`Backward::new`], of the lists
+    /// and of the picture.
     pub fn record(
         &self,
         rec: &mut Recorder<'_>,
@@ -468,21 +564,36 @@ impl Backward {
         let subgroups = subgroups(rec.gpu());
         let (rgb, grad_rgb) = (&picture.rgb, gradient.rgb);
         macro_rules! back {
+            ($module:ident $([$constant:ident])? $(, $field:ident)*) => {{
+                let buffers = $module::Buffers {
+                    ranges, mean, conic, opacity, color, rgb, grad_rgb, pair_mean, pair_conic, pair_opacity, pair_color
+                    $(, $field)*
+                };
+                let constants = $module::Constants { alpha_min, transmittance_min $(, $constant)? };
+                rec.run_with($module::Kernel, constants, buffers, $module::Push { size, tiles_x: grid[0] }, threads);
+            }};
+        }
+        macro_rules! gather {
             ($module:ident $(, $field:ident)*) => {{
                 let buffers = $module::Buffers {
-                    ranges, sorted, pair_slot, mean, conic, opacity, color, rgb, grad_rgb, pair_mean, pair_conic,
-                    pair_opacity, pair_color $(, $field)*
+                    drawn_count, drawn, tiles, pair_count, first_pair, conic, pair_mean, pair_conic, pair_opacity,
+                    pair_color, grad_mean, grad_covariance, grad_opacity, grad_color $(, $field)*
                 };
-                let constants = $module::Constants { alpha_min, transmittance_min, subgroups };
-            rec.run_with($module::Kernel, constants, buffers, $module::Push { size, tiles_x: grid[0] }, threads);
+                rec.run($module::Kernel, buffers, (), drawn_groups);
             }};
+        }
+        let narrow = binned.blended.zip(self.marks.as_ref());
+        if let Some((_, marks)) = narrow {
+            rec.zero(marks);
         }
         match (&picture.depth, &self.pair_depth, &self.grad_depth, gradient.depth) {
             (Some(depth_map), Some(pair_depth), Some(grad_depth), Some(grad_depth_map)) => {
-                match (picture.transmittance.as_ref().zip(gradient.transmittance), tiling) {
-                    (Some((transmittance, grad_transmittance)), Tiling::Wide) => {
+                match (picture.transmittance.as_ref().zip(gradient.transmittance), narrow) {
+                    (Some((transmittance, grad_transmittance)), None) => {
                         back!(
-                            rasterize_backward,
+                            rasterize_backward[subgroups],
+                            sorted,
+                            pair_slot,
                             depth,
                             depth_map,
                             grad_depth_map,
@@ -491,9 +602,13 @@ impl Backward {
                             grad_transmittance
                         );
                     }
-                    (Some((transmittance, grad_transmittance)), Tiling::Narrow) => {
+                    (Some((transmittance, grad_transmittance)), Some((lists, marks))) => {
+                        let Blended { pairs: blended, count: blended_count } = lists;
                         back!(
                             rasterize_backward_narrow,
+                            blended,
+                            blended_count,
+                            marks,
                             depth,
                             depth_map,
                             grad_depth_map,
@@ -502,56 +617,45 @@ impl Backward {
                             grad_transmittance
                         );
                     }
-                    (None, Tiling::Wide) => {
-                        back!(rasterize_backward_depth, depth, depth_map, grad_depth_map, pair_depth)
+                    (None, None) => {
+                        back!(
+                            rasterize_backward_depth[subgroups],
+                            sorted,
+                            pair_slot,
+                            depth,
+                            depth_map,
+                            grad_depth_map,
+                            pair_depth
+                        );
                     }
-                    (None, Tiling::Narrow) => {
-                        back!(rasterize_backward_narrow_depth, depth, depth_map, grad_depth_map, pair_depth);
+                    (None, Some((Blended { pairs: blended, count: blended_count }, marks))) => {
+                        back!(
+                            rasterize_backward_narrow_depth,
+                            blended,
+                            blended_count,
+                            marks,
+                            depth,
+                            depth_map,
+                            grad_depth_map,
+                            pair_depth
+                        );
                     }
                 }
-                let buffers = rasterize_gather::Buffers {
-                    drawn_count,
-                    drawn,
-                    tiles,
-                    pair_count,
-                    first_pair,
-                    conic,
-                    pair_mean,
-                    pair_conic,
-                    pair_opacity,
-                    pair_color,
-                    grad_mean,
-                    grad_covariance,
-                    grad_opacity,
-                    grad_color,
-                    pair_depth,
-                    grad_depth,
-                };
-                rec.run(rasterize_gather::Kernel, buffers, (), drawn_groups);
-            }
-            _ => {
-                match tiling {
-                    Tiling::Wide => back!(rasterize_backward_color),
-                    Tiling::Narrow => back!(rasterize_backward_narrow_color),
+                match narrow {
+                    Some((_, marks)) => gather!(rasterize_gather_marked, pair_depth, grad_depth, marks),
+                    None => gather!(rasterize_gather, pair_depth, grad_depth),
                 }
-                let buffers = rasterize_gather_color::Buffers {
-                    drawn_count,
-                    drawn,
-                    tiles,
-                    pair_count,
-                    first_pair,
-                    conic,
-                    pair_mean,
-                    pair_conic,
-                    pair_opacity,
-                    pair_color,
-                    grad_mean,
-                    grad_covariance,
-                    grad_opacity,
-                    grad_color,
-                };
-                rec.run(rasterize_gather_color::Kernel, buffers, (), drawn_groups);
             }
+            _ => match narrow {
+                Some((Blended { pairs: blended, count: blended_count }, marks)) => {
+                    back!(rasterize_backward_narrow_color, blended, blended_count, marks);
+                    gather!(rasterize_gather_marked_color, marks);
+                }
+                None => {
+                    back!(rasterize_backward_color[subgroups], sorted, pair_slot);
+                    gather!(rasterize_gather_color);
+                }
+            },
         }
     }
 }
@@ -626,8 +730,23 @@ mod tests {
         s
     }
 
+    /// What the forward pass of narrow tiles lists.
+    struct Lists {
+        blended: Vec<[u32; 2]>,
+        blended_count: Vec<u32>,
+    }
+
+    impl Lists {
+        fn new(scene: &Scene) -> Self {
+            Self { blended: vec![[7; 2]; scene.pair_slot.len()], blended_count: vec![7; scene.ranges.len()] }
+        }
+    }
+
     /// Bindings that only some variants have.
     struct Extra {
+        sorted: Vec<u32>,
+        pair_slot: Vec<u32>,
+        marks: Vec<u32>,
         depth: Vec<f32>,
         pair_depth: Vec<f32>,
         depth_map: Vec<f32>,
@@ -648,13 +767,15 @@ mod tests {
             let (alpha_min, transmittance_min) = THRESHOLDS[i % THRESHOLDS.len()];
             for n in [0, 1, 65, 700] {
                 macro_rules! check {
-                    ($module:ident, $tiling:expr $(, $depth:ident $(, $transmittance:ident)?)?) => {{
+                    ($module:ident, $tiling:expr, [$($list:ident),*] $(, $depth:ident $(, $transmittance:ident)?)?) => {{
                         let s = scene(i as u64, n, size, $tiling, alpha_min);
+                        let _lists = Lists::new(&s);
                         let pixels = (size[0] * size[1]) as usize;
                         let grid = $tiling.grid(size);
                         let case = $module::Arrays {
                             ranges: s.ranges, sorted: s.sorted, pair_slot: s.pair_slot, mean: s.mean, conic: s.conic,
                             opacity: s.opacity, color: s.color, rgb: vec![[UNWRITTEN; 3]; pixels],
+                            $($list: _lists.$list,)*
                             $($depth: s.depth, depth_map: vec![UNWRITTEN; pixels],
                             $($transmittance: vec![UNWRITTEN; pixels],)?)?
                         };
@@ -664,13 +785,13 @@ mod tests {
                         testing::assert_twin_with($module::Kernel, &gpu, constants, case, push, threads);
                     }};
                 }
-                check!(rasterize, Tiling::Wide, depth, transmittance);
-                check!(rasterize_depth, Tiling::Wide, depth);
-                check!(rasterize_color, Tiling::Wide);
+                check!(rasterize, Tiling::Wide, [], depth, transmittance);
+                check!(rasterize_depth, Tiling::Wide, [], depth);
+                check!(rasterize_color, Tiling::Wide, []);
                 if gpu.info().subgroup_size == 8 {
-                    check!(rasterize_narrow, Tiling::Narrow, depth, transmittance);
-                    check!(rasterize_narrow_depth, Tiling::Narrow, depth);
-                    check!(rasterize_narrow_color, Tiling::Narrow);
+                    check!(rasterize_narrow, Tiling::Narrow, [blended, blended_count], depth, transmittance);
+                    check!(rasterize_narrow_depth, Tiling::Narrow, [blended, blended_count], depth);
+                    check!(rasterize_narrow_color, Tiling::Narrow, [blended, blended_count]);
                 }
             }
         }
@@ -679,48 +800,56 @@ mod tests {
     #[test]
     fn backward_matches_its_twin() {
         let gpu = testing::gpu();
+        let subgroups = subgroups(&gpu);
         for (i, size) in SIZES.into_iter().enumerate() {
             let (alpha_min, transmittance_min) = THRESHOLDS[i % THRESHOLDS.len()];
             for n in [0, 1, 65, 300] {
                 macro_rules! check {
-                    ($forward:ident, $module:ident, $tiling:expr $(, $field:ident)*) => {{
+                    ($forward:ident, $module:ident $([$constant:ident])?, $tiling:expr, [$($list:ident),*] $(, $field:ident)*) => {{
                         let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(i as u64);
                         let s = scene(i as u64, n, size, $tiling, alpha_min);
                         let pixels = (size[0] * size[1]) as usize;
                         let grid = $tiling.grid(size);
                         let mut random = || (0..pixels).map(|_| rng.random_range(-1f32..1.0)).collect::<Vec<f32>>();
                         let threads = [grid[0] * $tiling.threads(), grid[1], 1];
+                        let mut _lists = Lists::new(&s);
                         let picture = $forward::Arrays {
                             ranges: s.ranges.clone(), sorted: s.sorted.clone(), pair_slot: s.pair_slot.clone(),
                             mean: s.mean.clone(), conic: s.conic.clone(), opacity: s.opacity.clone(),
                             color: s.color.clone(), depth: s.depth.clone(), rgb: vec![[0.0; 3]; pixels],
                             depth_map: vec![0.0; pixels], transmittance: vec![0.0; pixels],
+                            $($list: _lists.$list,)*
                         };
                         let push = $forward::Push { size, tiles_x: grid[0], background: [0.1, 0.2, 0.3] };
                         let constants = $forward::Constants { alpha_min, transmittance_min };
                         let picture = testing::run_once_with::<$forward::Kernel>(&gpu, &picture, push, constants, threads);
+                        $(_lists.$list = picture.$list;)*
                         let pairs = s.pair_slot.len();
                         let extra = Extra {
+                            sorted: s.sorted, pair_slot: s.pair_slot, marks: vec![0; pairs.div_ceil(32)],
                             depth: s.depth, pair_depth: vec![UNWRITTEN; pairs], depth_map: picture.depth_map,
                             transmittance: picture.transmittance, grad_depth_map: random(), grad_transmittance: random(),
                         };
                         let grad_rgb = (0..pixels).map(|p| [extra.grad_depth_map[p], -extra.grad_transmittance[p], 0.5]).collect();
                         let case = $module::Arrays {
-                            ranges: s.ranges, sorted: s.sorted, pair_slot: s.pair_slot, mean: s.mean, conic: s.conic,
-                            opacity: s.opacity, color: s.color, rgb: picture.rgb, grad_rgb,
+                            ranges: s.ranges, mean: s.mean, conic: s.conic,
+                            opacity: s.opacity, color: s.color, rgb: picture.rgb, grad_rgb, $($list: _lists.$list,)*
                             pair_mean: vec![[UNWRITTEN; 2]; pairs], pair_conic: vec![[UNWRITTEN; 3]; pairs],
                             pair_opacity: vec![UNWRITTEN; pairs], pair_color: vec![[UNWRITTEN; 3]; pairs],
                             $($field: extra.$field,)*
                         };
                         let push = $module::Push { size, tiles_x: grid[0] };
-                        let constants = $module::Constants { alpha_min, transmittance_min, subgroups: subgroups(&gpu) };
+                        let constants = $module::Constants { alpha_min, transmittance_min $(, $constant)? };
                         testing::assert_twin_with($module::Kernel, &gpu, constants, case, push, threads);
                     }};
                 }
                 check!(
                     rasterize,
-                    rasterize_backward,
+                    rasterize_backward[subgroups],
                     Tiling::Wide,
+                    [],
+                    sorted,
+                    pair_slot,
                     depth,
                     depth_map,
                     grad_depth_map,
@@ -728,13 +857,26 @@ mod tests {
                     transmittance,
                     grad_transmittance
                 );
-                check!(rasterize, rasterize_backward_depth, Tiling::Wide, depth, depth_map, grad_depth_map, pair_depth);
-                check!(rasterize, rasterize_backward_color, Tiling::Wide);
+                check!(
+                    rasterize,
+                    rasterize_backward_depth[subgroups],
+                    Tiling::Wide,
+                    [],
+                    sorted,
+                    pair_slot,
+                    depth,
+                    depth_map,
+                    grad_depth_map,
+                    pair_depth
+                );
+                check!(rasterize, rasterize_backward_color[subgroups], Tiling::Wide, [], sorted, pair_slot);
                 if gpu.info().subgroup_size == 8 {
                     check!(
                         rasterize_narrow,
                         rasterize_backward_narrow,
                         Tiling::Narrow,
+                        [blended, blended_count],
+                        marks,
                         depth,
                         depth_map,
                         grad_depth_map,
@@ -746,14 +888,88 @@ mod tests {
                         rasterize_narrow,
                         rasterize_backward_narrow_depth,
                         Tiling::Narrow,
+                        [blended, blended_count],
+                        marks,
                         depth,
                         depth_map,
                         grad_depth_map,
                         pair_depth
                     );
-                    check!(rasterize_narrow, rasterize_backward_narrow_color, Tiling::Narrow);
+                    check!(
+                        rasterize_narrow,
+                        rasterize_backward_narrow_color,
+                        Tiling::Narrow,
+                        [blended, blended_count],
+                        marks
+                    );
                 }
             }
+        }
+    }
+
+    /// Narrow tiles list the pairs of which a pixel takes something, nearest first, and no others. A sample within rounding
+    /// of a threshold may flip (see `PICTURE`): of a hundred samples of a pair the only one that counts is rarely that.
+    #[test]
+    fn lists_hold_what_is_blended() {
+        let gpu = testing::gpu();
+        if gpu.info().subgroup_size != 8 {
+            println!("skipped: narrow tiles need subgroups of 8 threads");
+            return;
+        }
+        let size = [129, 97];
+        let pixels = (size[0] * size[1]) as usize;
+        for (alpha_min, transmittance_min) in THRESHOLDS {
+            let s = scene(3, 2000, size, Tiling::Narrow, alpha_min);
+            let lists = Lists::new(&s);
+            let case = rasterize_narrow_color::Arrays {
+                ranges: s.ranges,
+                sorted: s.sorted,
+                pair_slot: s.pair_slot,
+                mean: s.mean,
+                conic: s.conic,
+                opacity: s.opacity,
+                color: s.color,
+                rgb: vec![[0.0; 3]; pixels],
+                blended: lists.blended,
+                blended_count: lists.blended_count,
+            };
+            let grid = Tiling::Narrow.grid(size);
+            let push = rasterize_narrow_color::Push { size, tiles_x: grid[0], background: [0.0; 3] };
+            let constants = rasterize_narrow_color::Constants { alpha_min, transmittance_min };
+            let threads = [grid[0] * Tiling::Narrow.threads(), grid[1], 1];
+            type K = rasterize_narrow_color::Kernel;
+            let got = testing::run_once_with::<K>(&gpu, &case, push, constants, threads);
+            let splats = Splats {
+                ranges: &case.ranges,
+                sorted: &case.sorted,
+                pair_slot: &case.pair_slot,
+                mean: &case.mean,
+                conic: &case.conic,
+                opacity: &case.opacity,
+                color: &case.color,
+                alpha_min,
+                transmittance_min,
+            };
+            let mut seen = vec![false; case.pair_slot.len()];
+            for p in 0..size[0] * size[1] {
+                splats.walk([p % size[0], p / size[0]], 8, grid[0], |pair, _, _, _, _| seen[pair] = true);
+            }
+            let (mut listed, mut other) = (0, 0);
+            for tile in 0..(grid[0] * grid[1]) as usize {
+                let [first, end] = case.ranges[tile].map(|i| i as usize);
+                let list = &got.blended[first..][..got.blended_count[tile] as usize];
+                assert!(list.iter().all(|[pair, slot]| case.pair_slot[*pair as usize] == *slot));
+                let numbers: Vec<u32> = list.iter().map(|[pair, _]| *pair).collect();
+                let mut rest = numbers.iter().peekable();
+                for &pair in &case.sorted[first..end] {
+                    let has = rest.next_if_eq(&&pair).is_some();
+                    listed += usize::from(has);
+                    other += usize::from(has != seen[pair as usize]);
+                }
+                assert!(rest.next().is_none(), "tile {tile}: {numbers:?} is not in the list's order");
+            }
+            assert!(listed > 1000 && listed < seen.len(), "{listed} of {}", seen.len());
+            assert!(other <= listed / 1000, "{other} of {listed} pairs are listed on one side only");
         }
     }
 
@@ -784,6 +1000,47 @@ mod tests {
                 grad_depth: vec![UNWRITTEN; n],
             };
             testing::assert_twin(rasterize_gather::Kernel, &gpu, case.clone(), (), n);
+            let mut bits = || rng.random::<u32>() & rng.random::<u32>();
+            let c = case.clone();
+            let marked = rasterize_gather_marked::Arrays {
+                drawn_count: c.drawn_count,
+                drawn: c.drawn,
+                tiles: c.tiles,
+                pair_count: c.pair_count,
+                first_pair: c.first_pair,
+                conic: c.conic,
+                pair_mean: c.pair_mean,
+                pair_conic: c.pair_conic,
+                pair_opacity: c.pair_opacity,
+                pair_color: c.pair_color,
+                grad_mean: c.grad_mean,
+                grad_covariance: c.grad_covariance,
+                grad_opacity: c.grad_opacity,
+                grad_color: c.grad_color,
+                pair_depth: c.pair_depth,
+                grad_depth: c.grad_depth,
+                marks: (0..pairs.div_ceil(32)).map(|_| bits()).collect(),
+            };
+            testing::assert_twin(rasterize_gather_marked::Kernel, &gpu, marked.clone(), (), n);
+            let c = marked;
+            let marked = rasterize_gather_marked_color::Arrays {
+                drawn_count: c.drawn_count,
+                drawn: c.drawn,
+                tiles: c.tiles,
+                pair_count: c.pair_count,
+                first_pair: c.first_pair,
+                conic: c.conic,
+                pair_mean: c.pair_mean,
+                pair_conic: c.pair_conic,
+                pair_opacity: c.pair_opacity,
+                pair_color: c.pair_color,
+                grad_mean: c.grad_mean,
+                grad_covariance: c.grad_covariance,
+                grad_opacity: c.grad_opacity,
+                grad_color: c.grad_color,
+                marks: c.marks,
+            };
+            testing::assert_twin(rasterize_gather_marked_color::Kernel, &gpu, marked, (), n);
             let color = rasterize_gather_color::Arrays {
                 drawn_count: case.drawn_count,
                 drawn: case.drawn,

@@ -72,7 +72,8 @@ impl Stages {
         let slots = (capacity.visible * offsets) as usize;
         let pairs = capacity.pairs as usize;
         Ok(Self {
-            rasterize: gpu.stage(stage::RASTERIZE_BACKWARD, || Backward::new(gpu, slots, pairs, plan.outputs()))?,
+            rasterize: gpu
+                .stage(stage::RASTERIZE_BACKWARD, || Backward::new(gpu, method, slots, pairs, plan.outputs()))?,
             project: gpu.stage(stage::PROJECT_BACKWARD, || ProjectBackward::new(gpu, &forward.project))?,
             decode: gpu.stage(stage::DECODE_BACKWARD, || {
                 DecodeBackward::of(gpu, &forward.decode, trained.feature, trained.decoders)

@@ -146,7 +146,7 @@ fn run_with(gpu: &Gpu, method: Method, model: &Model, camera: &Camera, near: f32
     let mut picture = Picture::new(gpu, size, pixels, Outputs::Transmittance).expect(fine);
     picture.rgb = gpu.upload("rgb", &vec![[testing::UNWRITTEN; 3]; pixels]).expect(fine);
     let slots = capacity.visible as usize * K;
-    let backward = Backward::new(gpu, slots, 1 << 18, Outputs::Transmittance).expect(fine);
+    let backward = Backward::new(gpu, method, slots, 1 << 18, Outputs::Transmittance).expect(fine);
     let project_backward = ProjectBackward::new(gpu, &forward.project).expect(fine);
     let decode_backward = DecodeBackward::new(gpu, &forward.decode).expect(fine);
     let zeros = |name, len: usize| gpu.upload(name, &vec![0f32; len]).expect(fine);

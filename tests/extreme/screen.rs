@@ -158,7 +158,7 @@ fn draw(gpu: &Gpu, tiling: Tiling, size: [u32; 2], splats: &Splats, pairs: u32) 
     let bin = Bin::new(gpu, tiling, n.max(1), pairs, size).expect(fine);
     let mut picture = Picture::new(gpu, size, pixels, Outputs::Transmittance).expect(fine);
     picture.rgb = gpu.upload("rgb", &vec![[testing::UNWRITTEN; 3]; pixels]).expect(fine);
-    let backward = Backward::new(gpu, n.max(1) as usize, pairs as usize, Outputs::Transmittance).expect(fine);
+    let backward = Backward::new(gpu, tiling, n.max(1) as usize, pairs as usize, Outputs::Transmittance).expect(fine);
     let up: Vec<_> = (0..pixels).map(|p| upstream(p, farthest)).collect();
     let grad_rgb = gpu.upload("grad_rgb", &up.iter().map(|u| u.0).collect::<Vec<_>>()).expect(fine);
     let grad_z = gpu.upload("grad_depth_map", &up.iter().map(|u| u.1).collect::<Vec<_>>()).expect(fine);

@@ -98,7 +98,7 @@ fn rasterize() {
             let pairs = n * grid[0] * grid[1];
             let bin = Bin::new(&gpu, tiling, n, pairs, size).unwrap();
             let picture = Picture::new(&gpu, size, pixels, Outputs::Transmittance).unwrap();
-            let backward = Backward::new(&gpu, n as usize, pairs as usize, Outputs::Transmittance).unwrap();
+            let backward = Backward::new(&gpu, tiling, n as usize, pairs as usize, Outputs::Transmittance).unwrap();
             let grad_rgb = gpu.upload("grad_rgb", &case.vectors::<3>("upstream.rgb")).unwrap();
             let grad_z = gpu.upload("grad_depth_map", &case.f32("upstream.z")).unwrap();
             let grad_t = gpu.upload("grad_transmittance", &case.f32("upstream.transmittance")).unwrap();
