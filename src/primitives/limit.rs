@@ -41,10 +41,7 @@ impl Limits {
     /// # Errors
     /// As [`Gpu::buffer`].
     pub fn new(gpu: &Gpu) -> Result<Self, Error> {
-        Ok(Self {
-            overflow: gpu.upload("overflow", &[0])?,
-            counters: gpu.upload("counters", &[0; COUNTERS])?,
-        })
+        Ok(Self { overflow: gpu.upload("overflow", &[0])?, counters: gpu.upload("counters", &[0; COUNTERS])? })
     }
 
     /// `[1]` one bit per [`Counter`] that did not fit; stays up until [`Limits::lower`].

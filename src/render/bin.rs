@@ -15,8 +15,8 @@ use crate::gpu::kernels::render::{
 use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
 use crate::math::tiles::Support;
 use crate::primitives::compact::Compact;
-use crate::primitives::limit::{Counter, Limits};
 use crate::primitives::dispatch::Shape;
+use crate::primitives::limit::{Counter, Limits};
 use crate::primitives::scan::{self, Scan};
 use crate::primitives::sort::{Pairs, Sort};
 use crate::primitives::{Count, dispatch};
@@ -274,11 +274,7 @@ impl Bin {
             conic: gpu.buffer("conic", n)?,
             tiles: gpu.buffer("tiles", n)?,
             first_pair: gpu.buffer("first_pair", n)?,
-            drawn: Slots {
-                list: gpu.buffer("drawn", n)?,
-                count: gpu.buffer("drawn_count", 1)?,
-                groups: per_drawn,
-            },
+            drawn: Slots { list: gpu.buffer("drawn", n)?, count: gpu.buffer("drawn_count", 1)?, groups: per_drawn },
             per_sorted,
             per_scanned,
             depth_keys: gpu.buffer("depth_keys", n)?,
@@ -318,16 +314,7 @@ impl Bin {
     ) -> Binned<'a> {
         let Projected { slots, existing, mean, covariance, depth, opacity, .. } = gaussians;
         let Self {
-            conic,
-            tiles,
-            drawn,
-            per_sorted,
-            per_scanned,
-            depth_keys,
-            depth_values,
-            rank_tiles,
-            rank_first,
-            ..
+            conic, tiles, drawn, per_sorted, per_scanned, depth_keys, depth_values, rank_tiles, rank_first, ..
         } = self;
         let Self { pair_total, pair_count, pair_tile, pair_slot, first_pair, ranges, sorted, .. } = self;
         let Method { tiling, alpha_min, depth_key, .. } = self.method;
@@ -342,15 +329,15 @@ impl Bin {
         self.compact.record(rec, tiles, &drawn.list, &drawn.count, slots);
         limits.note(rec, &drawn.count, Counter::Drawn);
         let (drawn_count, drawn_groups) = (&drawn.count, &drawn.groups);
-        let shapes =
-            [(drawn_groups, Shape::EACH), (per_sorted, self.depth_sort.shape()), (per_scanned, scan::SHAPE)];
+        let shapes = [(drawn_groups, Shape::EACH), (per_sorted, self.depth_sort.shape()), (per_scanned, scan::SHAPE)];
         dispatch::record_several(rec, drawn_count, drawn.list.len() as u32, shapes);
         let buffers =
             bin_depth_keys::Buffers { drawn_count, drawn: &drawn.list, depth, keys: depth_keys, values: depth_values };
         let push = bin_depth_keys::Push { base: depth_key.base, last: depth_key.last() };
         rec.run(bin_depth_keys::Kernel, buffers, push, drawn_groups);
         let pairs = Pairs { keys: depth_keys, values: depth_values };
-        let order = self.depth_sort.record(rec, pairs, Count::Counted(drawn_count, per_sorted), 0..depth_key.bits).values;
+        let order =
+            self.depth_sort.record(rec, pairs, Count::Counted(drawn_count, per_sorted), 0..depth_key.bits).values;
 
         rec.run(bin_rank::Kernel, bin_rank::Buffers { drawn_count, order, tiles, rank_tiles }, (), drawn_groups);
         self.scan.record(rec, rank_tiles, rank_first, pair_total, Count::Counted(drawn_count, per_scanned));

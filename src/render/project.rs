@@ -6,8 +6,8 @@
 //!
 //! Positions are seen from the camera's centre, covariances are factored: see [`crate::math::camera`].
 
-use crate::gpu::kernels::render::{project, project_backward, project_backward_color};
 use super::slots::Slots;
+use crate::gpu::kernels::render::{project, project_backward, project_backward_color};
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::math::camera::{Camera, Lens, Splat};
 use crate::math::camera::{project as project_one, project_backward as project_one_backward};

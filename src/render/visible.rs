@@ -3,9 +3,9 @@
 use super::cull::Cull;
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::model::anchors::Anchors;
+use crate::primitives::Count;
 use crate::primitives::compact::Compact;
 use crate::primitives::limit::{Counter, Limits};
-use crate::primitives::Count;
 use crate::scene::Camera;
 
 /// Visible anchors in ascending order.

@@ -8,7 +8,10 @@ use crate::support::cases;
 /// Rows of \[n, k\] by k first, as slots are numbered.
 fn by_slot<T: Copy>(rows: &[T], [n, k]: [usize; 2]) -> Vec<T> {
     let width = rows.len() / (n * k);
-    (0..k).flat_map(|k_| (0..n).flat_map(move |v| (0..width).map(move |c| (v * k + k_) * width + c))).map(|i| rows[i]).collect()
+    (0..k)
+        .flat_map(|k_| (0..n).flat_map(move |v| (0..width).map(move |c| (v * k + k_) * width + c)))
+        .map(|i| rows[i])
+        .collect()
 }
 
 #[test]
