@@ -3,6 +3,7 @@
 const uint HEADS = 3u;             // opacity, color, cov
 const uint INPUT_VEC4 = 10u;       // vec4s of a padded input
 const uint HIDDEN_VEC4 = 24u;      // vec4s of the hidden units of the three heads
+const uint POSITIVE = 6u;          // words of their signs
 const uint ROW_VEC4 = 8u;          // vec4s of one head's hidden units: a row of the second layer
 const uint FIRST_WEIGHTS = HIDDEN * INPUT + HIDDEN; // of one head, biases included
 const uint FIRST_VEC4 = HEADS * HIDDEN * INPUT_VEC4; // packed first layer; the second one follows, then its biases
@@ -64,6 +65,13 @@ uint chunk_anchors(uint anchors) { return BLOCK * max(1u, (anchors + BLOCK * CHU
 
 // Listed Gaussians of one chunk.
 uint chunk_listed(uint listed) { return BLOCK * max(1u, (listed + BLOCK * SECOND_CHUNKS - 1u) / (BLOCK * SECOND_CHUNKS)); }
+
+// Which of the hidden units of a run of 16 are positive, a bit for each: of the q-th vec4.
+uint positive_bits(vec4 h, uint q) {
+  uvec4 bits = mix(uvec4(0u), uvec4(1u, 2u, 4u, 8u) << 4u * q, greaterThan(h, vec4(0.0)));
+  return bits.x | bits.y | bits.z | bits.w;
+}
+bvec4 positive_at(uint bits, uint q) { return notEqual(uvec4(bits) & (uvec4(1u, 2u, 4u, 8u) << 4u * q), uvec4(0u)); }
 
 float dot_add(float sum, vec4 a, vec4 b) { return fma(a.w, b.w, fma(a.z, b.z, fma(a.y, b.y, fma(a.x, b.x, sum)))); }
 vec4 add_scaled(vec4 sum, float a, vec4 b) { return fma(vec4(a), b, sum); }

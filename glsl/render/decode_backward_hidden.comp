@@ -11,7 +11,7 @@ layout(constant_id = 1) const uint TILE = 8u;     // anchors of a thread
 #include "decoder.glsl"
 layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };  // [4] x, y, z of the dispatch; visible anchors
 layout(binding = 1, scalar) readonly buffer Packed { vec4 packed[]; };            // of decode_pack
-layout(binding = 2, scalar) readonly buffer Hidden { vec4 hidden[]; };            // [V*24] of decode_hidden
+layout(binding = 2, scalar) readonly buffer Positive { uint positive[]; };        // [V*6] of decode_hidden
 layout(binding = 3, scalar) readonly buffer GradOutput { vec4 grad_output[]; };   // [V*D/4] of decode_backward
 layout(binding = 4, scalar) writeonly buffer GradHidden { vec4 grad_hidden[]; };  // [V*24] before the ReLU
 void main() {
@@ -39,8 +39,9 @@ void main() {
   [[unroll]] for (uint a = 0u; a < TILE; ++a) {
     if (v + a < n) {
       uint to = (v + a) * HIDDEN_VEC4 + UNITS_VEC4 * part;
+      uint bits = positive[(v + a) * POSITIVE + part];
       [[unroll]] for (uint q = 0u; q < UNITS_VEC4; ++q)
-        grad_hidden[to + q] = mix(vec4(0.0), sum[UNITS_VEC4 * a + q], greaterThan(hidden[to + q], vec4(0.0)));
+        grad_hidden[to + q] = mix(vec4(0.0), sum[UNITS_VEC4 * a + q], positive_at(bits, q));
     }
   }
 }

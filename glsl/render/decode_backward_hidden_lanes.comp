@@ -13,7 +13,7 @@ layout(constant_id = 0) const uint OFFSETS = 10u; // Gaussians per anchor
 #include "decoder.glsl"
 layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };  // [4] x, y, z of the dispatch; visible anchors
 layout(binding = 1, scalar) readonly buffer Packed { vec4 packed[]; };            // of decode_pack
-layout(binding = 2, scalar) readonly buffer Hidden { vec4 hidden[]; };            // [V*24] of decode_hidden
+layout(binding = 2, scalar) readonly buffer Positive { uint positive[]; };        // [V*6] of decode_hidden
 layout(binding = 3, scalar) readonly buffer GradOutput { vec4 grad_output[]; };   // [V*D/4] of decode_backward
 layout(binding = 4, scalar) writeonly buffer GradHidden { vec4 grad_hidden[]; };  // [V*24] before the ReLU
 void main() {
@@ -39,8 +39,13 @@ void main() {
   [[unroll]] for (uint a = 0u; a < 8u; ++a) {
     if (v + 8u * a < n) {
       uint to = (v + 8u * a) * HIDDEN_VEC4 + ROW_VEC4 * head;
-      [[unroll]] for (uint q = 0u; q < ROW_VEC4; ++q)
-        grad_hidden[to + q] = mix(vec4(0.0), sum[ROW_VEC4 * a + q], greaterThan(hidden[to + q], vec4(0.0)));
+      [[unroll]] for (uint run = 0u; run < HIDDEN / UNITS; ++run) {
+        uint bits = positive[(v + 8u * a) * POSITIVE + HIDDEN / UNITS * head + run];
+        [[unroll]] for (uint q = 0u; q < UNITS_VEC4; ++q) {
+          uint at = UNITS_VEC4 * run + q;
+          grad_hidden[to + at] = mix(vec4(0.0), sum[ROW_VEC4 * a + at], positive_at(bits, q));
+        }
+      }
     }
   }
 }

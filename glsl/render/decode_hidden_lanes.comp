@@ -14,6 +14,7 @@ layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };  // [4] x
 layout(binding = 1, scalar) readonly buffer Packed { vec4 packed[]; };    // of decode_pack
 layout(binding = 2, scalar) readonly buffer Inputs { vec4 inputs[]; };    // [V*10] of decode_input
 layout(binding = 3, scalar) writeonly buffer Hidden { vec4 hidden[]; };   // [V*24] opacity 32, color 32, cov 32
+layout(binding = 4, scalar) writeonly buffer Positive { uint positive[]; }; // [V*6] 16 bits each: which of the units are positive
 void main() {
   const uint PARTS = 2u, ALL = HEADS * HIDDEN / PARTS, LOADS = ALL / 8u;
   uint id = group_index(), lane = gl_SubgroupInvocationID, n = groups[3];
@@ -35,9 +36,15 @@ void main() {
   [[unroll]] for (uint a = 0u; a < 8u; ++a) {
     if (v + 8u * a < n) {
       uint to = (v + 8u * a) * HIDDEN_VEC4 + unit / 4u;
-      [[unroll]] for (uint q = 0u; q < ALL / 4u; ++q) {
-        uint u = ALL * a + 4u * q;
-        hidden[to + q] = max(vec4(sum[u], sum[u + 1u], sum[u + 2u], sum[u + 3u]), 0.0);
+      [[unroll]] for (uint run = 0u; run < ALL / UNITS; ++run) {
+        uint bits = 0u;
+        [[unroll]] for (uint q = 0u; q < UNITS_VEC4; ++q) {
+          uint u = ALL * a + UNITS * run + 4u * q;
+          vec4 h = max(vec4(sum[u], sum[u + 1u], sum[u + 2u], sum[u + 3u]), 0.0);
+          hidden[to + UNITS_VEC4 * run + q] = h;
+          bits |= positive_bits(h, q);
+        }
+        positive[(v + 8u * a) * POSITIVE + unit / UNITS + run] = bits;
       }
     }
   }

@@ -260,8 +260,8 @@ pub const TABLE: &[Formula] = &[
     Formula {
         pass: "render/decode_hidden",
         variants: &["lanes"],
-        derivation: "the first layer; per visible anchor input 160 and hidden units 384 B; 96 units of 37 multiply-adds and a maximum",
-        work: |c, _| work(c.first_bytes() + 544.0 * c.visible, 96.0 * 38.0 * c.visible, 0.0),
+        derivation: "the first layer; per visible anchor input 160, hidden units 384 and their signs 24 B; 96 units of 37 multiply-adds and a maximum",
+        work: |c, _| work(c.first_bytes() + 568.0 * c.visible, 96.0 * 38.0 * c.visible, 0.0),
     },
     Formula {
         pass: "render/decode_opacity",
@@ -430,10 +430,10 @@ pub const TABLE: &[Formula] = &[
     Formula {
         pass: "render/decode_backward_hidden",
         variants: &["lanes"],
-        derivation: "the second layer; per visible anchor 4 B per padded output, hidden units 384, their gradient 384 B; 11 K outputs times 32 multiply-adds, 192 for the ReLU",
+        derivation: "the second layer; per visible anchor 4 B per padded output, signs of the hidden units 24, their gradient 384 B; 11 K outputs times 32 multiply-adds, 192 for the ReLU",
         work: |c, _| {
             work(
-                c.second_bytes() + (4.0 * c.rows() + 768.0) * c.visible,
+                c.second_bytes() + (4.0 * c.rows() + 408.0) * c.visible,
                 11.0 * 32.0 * c.slots() + 192.0 * c.visible,
                 0.0,
             )

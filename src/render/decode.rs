@@ -50,6 +50,8 @@ const SECOND_VEC4: usize = 91;
 /// vec4s of a padded input, of the hidden units.
 const INPUT_VEC4: usize = Layout::PADDED_INPUT / 4;
 const HIDDEN_VEC4: usize = HEADS * HIDDEN / 4;
+/// Words of the hidden units' signs.
+const POSITIVE: usize = HEADS * HIDDEN / UNITS as usize;
 /// vec4s of the packed first layer.
 const FIRST_VEC4: usize = HEADS * HIDDEN * INPUT_VEC4;
 /// Anchors of the smallest chunk of a weight gradient, and chunks at most.
@@ -150,12 +152,17 @@ macro_rules! hidden_twin {
                                 * f64::from(inputs[v * Layout::PADDED_INPUT + i])
                         };
                         let sum: f64 = (0..Layout::PADDED_INPUT).map(product).sum();
-                        hidden[v * HEADS * HIDDEN + unit] = sum.max(0.0) as f32;
+                        let h = sum.max(0.0) as f32;
+                        hidden[v * HEADS * HIDDEN + unit] = h;
+                        let bits = &mut host.positive[v * POSITIVE + unit / UNITS as usize];
+                        *bits = if unit % UNITS as usize == 0 { 0 } else { *bits };
+                        *bits |= u32::from(h > 0.0) << (unit % UNITS as usize);
                     }
                 }
             }
-            fn check(_: &'static str) -> Check {
-                sums(Layout::PADDED_INPUT)
+            /// A unit within rounding of 0 may be positive or not: one in some ten thousand at most.
+            fn check(binding: &'static str) -> Check {
+                Check { band: if binding == "positive" { 2e-3 } else { 0.0 }, ..sums(Layout::PADDED_INPUT) }
             }
         }
     };
@@ -311,7 +318,7 @@ macro_rules! backward_hidden_twin {
         impl Reference for $module::Kernel {
             fn reference(host: $module::Host<'_>, (): (), constants: $module::Constants) {
                 let layout = Layout { offsets: constants.offsets as usize };
-                let (packed, hidden) = (host.packed.as_flattened(), host.hidden.as_flattened());
+                let packed = host.packed.as_flattened();
                 let (grad_output, grad_hidden) = (host.grad_output.as_flattened(), host.grad_hidden.as_flattened_mut());
                 for v in 0..host.groups[3] as usize {
                     for unit in 0..HEADS * HIDDEN {
@@ -322,7 +329,8 @@ macro_rules! backward_hidden_twin {
                         };
                         let at = v * HEADS * HIDDEN + unit;
                         let sum: f64 = (layout.row(head)..layout.row(head + 1)).map(product).sum();
-                        grad_hidden[at] = if hidden[at] > 0.0 { sum as f32 } else { 0.0 };
+                        let bits = host.positive[v * POSITIVE + unit / UNITS as usize];
+                        grad_hidden[at] = if bits >> (unit % UNITS as usize) & 1 > 0 { sum as f32 } else { 0.0 };
                     }
                 }
             }
@@ -553,6 +561,7 @@ pub struct Decode {
     packed: Buffer<[f32; 4]>,
     inputs: Buffer<[f32; 4]>,
     hidden: Buffer<[f32; 4]>,
+    positive: Buffer<u32>,
     /// `[slot]` which are decoded, and how many slots there are.
     flags: Buffer<u32>,
     slot_count: Buffer<u32>,
@@ -615,6 +624,7 @@ impl Decode {
             packed: gpu.buffer("packed", layout.packed())?,
             inputs: gpu.buffer("inputs", anchors * INPUT_VEC4)?,
             hidden: gpu.buffer("hidden", anchors * HIDDEN_VEC4)?,
+            positive: gpu.buffer("positive", anchors * POSITIVE)?,
             flags: gpu.buffer("decoded", slots)?,
             slot_count: gpu.buffer("slot_count", 1)?,
             existing: Slots {
@@ -687,7 +697,7 @@ impl Decode {
         let [center, center_low] = split(center);
         let (offsets, tile) = (self.layout.offsets as u32, self.tile);
         self.count(rec, visible_count);
-        let Self { packed, inputs, hidden, opacity, flags, slot_count, existing, segments, bound, .. } = self;
+        let Self { packed, inputs, hidden, positive, opacity, flags, slot_count, existing, segments, bound, .. } = self;
         let Slots { list: listed, count: listed_count, .. } = existing;
         let groups = &self.per_anchor.buffer;
         let pack = decode_pack::Buffers { weights: anchors.weights, groups, packed, slot_count };
@@ -701,10 +711,10 @@ impl Decode {
         };
         rec.run(decode_input::Kernel, buffers, decode_input::Push { center, center_low }, &self.per_anchor);
         if self.lanes {
-            let buffers = decode_hidden_lanes::Buffers { groups, packed, inputs, hidden };
+            let buffers = decode_hidden_lanes::Buffers { groups, packed, inputs, hidden, positive };
             rec.run(decode_hidden_lanes::Kernel, buffers, (), &self.per_hidden);
         } else {
-            let buffers = decode_hidden::Buffers { groups, packed, inputs, hidden };
+            let buffers = decode_hidden::Buffers { groups, packed, inputs, hidden, positive };
             rec.run_with(decode_hidden::Kernel, decode_hidden::Constants { tile }, buffers, (), &self.per_hidden);
         }
         let buffers = decode_opacity::Buffers { groups, packed, hidden, opacity, flags };
@@ -831,16 +841,16 @@ impl DecodeBackward {
             return;
         }
         let grad_hidden = self.grad_hidden.as_ref().expect("made with features or weights");
-        let Decode { packed, inputs, hidden, segments, existing, tile, lanes, .. } = forward;
+        let Decode { packed, inputs, hidden, positive, segments, existing, tile, lanes, .. } = forward;
         let listed = &existing.list;
         let groups = &forward.per_hidden_backward;
         if *lanes {
             let buffers =
-                decode_backward_hidden_lanes::Buffers { groups: count, packed, hidden, grad_output, grad_hidden };
+                decode_backward_hidden_lanes::Buffers { groups: count, packed, positive, grad_output, grad_hidden };
             let constants = decode_backward_hidden_lanes::Constants { offsets };
             rec.run_with(decode_backward_hidden_lanes::Kernel, constants, buffers, (), groups);
         } else {
-            let buffers = decode_backward_hidden::Buffers { groups: count, packed, hidden, grad_output, grad_hidden };
+            let buffers = decode_backward_hidden::Buffers { groups: count, packed, positive, grad_output, grad_hidden };
             let constants = decode_backward_hidden::Constants { offsets, tile: *tile };
             rec.run_with(decode_backward_hidden::Kernel, constants, buffers, (), groups);
         }
@@ -1002,6 +1012,7 @@ mod tests {
                         packed: packed.clone(),
                         inputs: inputs.clone(),
                         hidden: unwritten(count * HIDDEN_VEC4 + 3),
+                        positive: vec![7; count * POSITIVE + 3],
                     }
                 };
             }
@@ -1010,8 +1021,9 @@ mod tests {
             }
             let case = hidden!(decode_hidden);
             let tiles = |n: usize| n.div_ceil(tile as usize);
-            let hidden =
-                twin(decode_hidden::Kernel, &gpu, decode_hidden::Constants { tile }, case, (), tiles(count) * 6).hidden;
+            let constants = decode_hidden::Constants { tile };
+            let decode_hidden::Arrays { hidden, positive, .. } =
+                twin(decode_hidden::Kernel, &gpu, constants, case, (), tiles(count) * 6);
             let case = decode_opacity::Arrays {
                 groups: m.counted(),
                 packed: packed.clone(),
@@ -1102,7 +1114,7 @@ mod tests {
                     $module::Arrays {
                         groups: m.counted(),
                         packed: packed.clone(),
-                        hidden: hidden.clone(),
+                        positive: positive.clone(),
                         grad_output: grad_output.clone(),
                         grad_hidden: unwritten(count * HIDDEN_VEC4 + 3),
                     }

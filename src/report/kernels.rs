@@ -688,7 +688,7 @@ mod tests {
     #[test]
     fn slots_are_matched_by_anchor() {
         let bits = |values: &[f32]| values.iter().map(|v| v.to_bits()).collect::<Vec<u32>>();
-        let (own, other) = (bits(&[1.0, 2.0, 3.0, 4.0]), bits(&[3.5, 9.0, 5.0, 6.0]));
+        let (own, other) = (bits(&[1.0, 3.0, 2.0, 4.0]), bits(&[3.5, 9.0, 5.0, 6.0]));
         let a = capture(
             &[("visible", &[3, 7, 0]), ("visible_count", &[2]), ("tiles", &[1, 1, 1, 0]), ("opacity", &own)],
             2,
@@ -697,7 +697,7 @@ mod tests {
             &[("visible", &[7, 9, 0]), ("visible_count", &[2]), ("tiles", &[2, 2, 2, 2]), ("opacity", &other)],
             2,
         );
-        assert_eq!(a.common_slots(&b), [(2, 0)]);
+        assert_eq!(a.common_slots(&b), [(1, 0)]);
         let mut tensors = Tensors::default();
         tensors.add(&a, &b, &BTreeMap::new());
         let opacity = tensors.worst(|_, name| name == "opacity").expect("compared");
