@@ -7,11 +7,8 @@
 // variant color: COLOR_ONLY
 // variant depth: NO_TRANSMITTANCE
 //
-// `rasterize_backward` for subgroups of 8, as `rasterize_narrow`: only the pairs that it lists are looked at, written
-// and marked. Of dL/d exponent = gp a column sums gp, gp y and gp y^2 with y counted from the middle row; the sums over the
-// columns' x and y then make those of gp times 1, a, dy, a^2, a dy and dy^2 with a = dx - k dy, which is linear in x and
-// y. Counted from the tile, not from the mean, x / sqrt(N) and k y / sqrt(N) are at most 4 / sqrt(0.3) = 7.3: the terms are at
-// most some hundred times their sum, so 1e-5 of it is lost at worst (a Gaussian of less than a pixel), else 1e-7.
+// `rasterize_backward` for subgroups of 8, as `rasterize_narrow`: only the pairs that it lists are looked at, written and
+// marked.
 #ifdef COLOR_ONLY
 #define NO_TRANSMITTANCE
 #endif
@@ -49,8 +46,6 @@ layout(push_constant, scalar) uniform Push {
   uint tiles_x; // tiles in x
 } push;
 
-const float CENTRE = 3.5; // of a tile's columns
-
 float T[SIDE]; // 0 once the pixel is finished
 float remaining[SIDE]; // S - A_i
 vec3 g_rgb[SIDE];
@@ -58,18 +53,23 @@ vec3 g_rgb[SIDE];
 float g_z[SIDE];
 #endif
 
-// Sums over pixels for one Gaussian: of gp times 1, y, y^2, x, x^2, x y, of gradients times weights.
+vec2 pixel; // centre of this thread's first pixel
+
+// Sums over pixels for one Gaussian: of gp, gp a, gp dy, gp a^2, gp a dy, gp dy^2 with a = dx - k dy (gp = dL/d exponent).
 struct Sums {
-  float one, y, yy, x, xx, xy;
+  float power;
+  vec2 first;
+  vec3 second;
   vec3 color;
   float z;
 };
 
-Sums sums_of(Splat splat, float x, vec3 c, float z) {
-  float raw[8] = raw_alphas(splat, x);
-  Sums s = Sums(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, vec3(0.0), 0.0);
+Sums sums_of(vec2 m, vec3 q, float o, vec3 c, float z) {
+  Sums s = Sums(0.0, vec2(0.0), vec3(0.0), vec3(0.0), 0.0);
+  float dx = pixel.x - m.x;
   [[unroll]] for (uint r = 0u; r < SIDE; r++) {
-    float alpha = alpha_of(raw[r], ALPHA_MIN);
+    float dy = pixel.y + float(r) - m.y, across = across_of(dx, dy, q);
+    float raw = raw_alpha(across, dy, q, o), alpha = alpha_of(raw, ALPHA_MIN);
     precise float left = 1.0 - alpha;
     precise float after = T[r] * left;
     bool stop = after < TRANSMITTANCE_MIN;
@@ -83,19 +83,14 @@ Sums sums_of(Splat splat, float x, vec3 c, float z) {
     float wv = w * v;
     remaining[r] -= wv;
     // alpha dL/d alpha; none where nothing is blended, nor through the clamp at 0.99.
-    float gp = raw[r] == alpha && !stop ? wv - remaining[r] * (alpha / left) : 0.0;
-    float y = float(r) - float(MIDDLE);
-    s.one += gp;
-    if (r != MIDDLE) {
-      s.y += gp * y;
-      s.yy += gp * (y * y);
-    }
+    float gp = raw == alpha && !stop ? wv - remaining[r] * (alpha / left) : 0.0;
+    s.power += gp;
+    // Squares overflow for pixels far from the largest Gaussians, where gp is 0: products from gp on.
+    vec2 gd = gp * vec2(across, dy);
+    s.first += gd;
+    s.second += vec3(gd.x * across, gd.x * dy, gd.y * dy);
     T[r] = stop ? 0.0 : after;
   }
-  x -= CENTRE;
-  s.x = x * s.one;
-  s.xx = x * s.x;
-  s.xy = x * s.y;
   return s;
 }
 
@@ -105,12 +100,9 @@ Sums meet(Sums a, Sums b, uint bit) {
   bool upper = (gl_SubgroupInvocationID & bit) != 0u;
 #define MEET(f) s.f = (upper ? b.f : a.f) + subgroupShuffleXor(upper ? a.f : b.f, bit)
   Sums s;
-  MEET(one);
-  MEET(y);
-  MEET(yy);
-  MEET(x);
-  MEET(xx);
-  MEET(xy);
+  MEET(power);
+  MEET(first);
+  MEET(second);
   MEET(color);
   s.z = 0.0;
 #ifndef COLOR_ONLY
@@ -123,8 +115,7 @@ void main() {
   uint tile = gl_WorkGroupID.y * push.tiles_x + gl_WorkGroupID.x;
   uint t = gl_SubgroupInvocationID;
   uvec2 size = push.size, first = gl_WorkGroupID.xy * SIDE + uvec2(t, 0u);
-  vec2 origin = vec2(gl_WorkGroupID.xy * SIDE) + 0.5;
-  float x = float(t);
+  pixel = vec2(first) + 0.5;
   uint base = ranges[tile].x, end = base + blended_count[tile];
   if (base == end) return;
   [[unroll]] for (uint r = 0u; r < SIDE; r++) {
@@ -150,7 +141,7 @@ void main() {
     uvec2 pair = blended[some ? i : base];
     uint p = pair.x, g = pair.y;
     vec2 m = mean[g];
-    vec3 q = conic[g];
+    vec3 q = conic[g], half_q = halved(q);
     float o = some ? opacity[g] : 0.0;
     vec3 c = color[g];
 #ifdef COLOR_ONLY
@@ -158,8 +149,8 @@ void main() {
 #else
     float z = depth[g];
 #endif
-    Splat own = splat_of(origin, m, q, o);
-#define SUMS(k) sums_of(of_lane(own, k), x, subgroupShuffle(c, k), subgroupShuffle(z, k))
+#define TAKE(v, k) subgroupShuffle(v, k)
+#define SUMS(k) sums_of(TAKE(m, k), TAKE(half_q, k), TAKE(o, k), TAKE(c, k), TAKE(z, k))
     Sums a = SUMS(0u);
     a = meet(a, SUMS(1u), 1u);
     Sums b = SUMS(2u);
@@ -171,15 +162,10 @@ void main() {
     d = meet(d, SUMS(7u), 1u);
     Sums s = meet(a, meet(b, d, 2u), 4u);
     if (some) {
-      // a = at + x - k y and dy = down + y of the sums' x and y. Products from the sums on: the mean may be far.
-      float k = q.y, at = CENTRE - own.axis, down = origin.y - m.y + float(MIDDLE);
-      float x_one = s.x + at * s.one, x_y = s.xy + at * s.y, x_x = s.xx + at * (s.x + x_one);
-      float a_one = x_one - k * s.y, a_y = x_y - k * s.yy, dy_one = s.y + down * s.one;
-      float aa = x_x - k * (x_y + a_y), ady = down * a_one + a_y, dydy = down * (dy_one + s.y) + s.yy;
-      float gx = q.x * a_one;
-      pair_mean[p] = vec2(gx, q.z * dy_one - k * gx);
-      pair_conic[p] = vec3(-0.5 * aa, q.x * ady, -0.5 * dydy);
-      pair_opacity[p] = s.one / o;
+      float gx = q.x * s.first.x;
+      pair_mean[p] = vec2(gx, q.z * s.first.y - q.y * gx);
+      pair_conic[p] = vec3(-0.5 * s.second.x, q.x * s.second.y, -0.5 * s.second.z);
+      pair_opacity[p] = s.power / o;
       pair_color[p] = s.color;
 #ifndef COLOR_ONLY
       pair_depth[p] = s.z;

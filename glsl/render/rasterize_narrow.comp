@@ -17,6 +17,7 @@
 #endif
 #include "column.glsl"
 const uint SIDE = 8u;
+const float SMALLEST = 1.17549435e-38; // normal number: what less a pixel takes is none, whether or not the device flushes it
 layout(local_size_x = 8) in;
 layout(constant_id = 0) const float ALPHA_MIN = 0.00392156862745098; // samples below are skipped
 layout(constant_id = 1) const float TRANSMITTANCE_MIN = 1e-4; // a pixel is finished before it falls below
@@ -49,12 +50,14 @@ vec3 sum_rgb[SIDE];
 float sum_z[SIDE];
 #endif
 
+vec2 pixel; // centre of this thread's first pixel
+
 // The largest weight with which this column blends a Gaussian.
-float blend(Splat s, float x, vec3 c, float z) {
-  float raw[8] = raw_alphas(s, x);
-  float largest = 0.0;
+float blend(vec2 m, vec3 q, float o, vec3 c, float z) {
+  float dx = pixel.x - m.x, largest = 0.0;
   [[unroll]] for (uint r = 0u; r < SIDE; r++) {
-    float alpha = alpha_of(raw[r], ALPHA_MIN);
+    float dy = pixel.y + float(r) - m.y;
+    float alpha = alpha_of(raw_alpha(across_of(dx, dy, q), dy, q, o), ALPHA_MIN);
     // Where nothing is blended it stays: a finished pixel stops again, another one is not below the threshold.
     precise float after = T[r] * (1.0 - alpha);
     bool stop = after < TRANSMITTANCE_MIN;
@@ -73,8 +76,7 @@ void main() {
   uint tile = gl_WorkGroupID.y * push.tiles_x + gl_WorkGroupID.x;
   uint t = gl_SubgroupInvocationID;
   uvec2 size = push.size, first = gl_WorkGroupID.xy * SIDE + uvec2(t, 0u);
-  vec2 origin = vec2(gl_WorkGroupID.xy * SIDE) + 0.5;
-  float x = float(t);
+  pixel = vec2(first) + 0.5;
   [[unroll]] for (uint r = 0u; r < SIDE; r++) {
     T[r] = first.x < size.x && first.y + r < size.y ? 1.0 : -1.0;
     sum_rgb[r] = vec3(0.0);
@@ -91,7 +93,9 @@ void main() {
     bool some = i < range.y;
     uint p = sorted[some ? i : range.x];
     uint g = pair_slot[p];
-    Splat own = splat_of(origin, mean[g], conic[g], some ? opacity[g] : 0.0);
+    vec2 m = mean[g];
+    vec3 q = halved(conic[g]);
+    float o = some ? opacity[g] : 0.0;
     vec3 c = color[g];
 #ifdef COLOR_ONLY
     float z = 0.0;
@@ -99,7 +103,8 @@ void main() {
     float z = depth[g];
 #endif
     uint seen = 0u;
-#define BLEND(k) if (blend(of_lane(own, k), x, subgroupShuffle(c, k), subgroupShuffle(z, k)) > 0.0) seen |= 1u << k
+#define TAKE(v, k) subgroupShuffle(v, k)
+#define BLEND(k) if (blend(TAKE(m, k), TAKE(q, k), TAKE(o, k), TAKE(c, k), TAKE(z, k)) >= SMALLEST) seen |= 1u << k
     BLEND(0u); BLEND(1u); BLEND(2u); BLEND(3u); BLEND(4u); BLEND(5u); BLEND(6u); BLEND(7u);
     seen |= subgroupShuffleXor(seen, 1u);
     seen |= subgroupShuffleXor(seen, 2u);

@@ -346,7 +346,7 @@ pub const TABLE: &[Formula] = &[
     },
     Formula {
         pass: "render/rasterize",
-        variants: &["narrow", "color", "narrow_color", "depth", "narrow_depth"],
+        variants: &["color", "depth"],
         derivation: "per tile a range 8, per pair up to the tile's end 8, per Gaussian drawn 36, per pixel rgb 12 B; with depth \
                      4 more per Gaussian and 8 per pixel. Per sample (pixel and pair up to the tile's end) an exponential and 25 \
                      operations: dy 1, across 2, power 6, alpha 2, after 2, decisions 6, weight 2, colour 3, transmittance 1; \
@@ -364,8 +364,51 @@ pub const TABLE: &[Formula] = &[
         },
     },
     Formula {
+        pass: "render/rasterize_narrow",
+        variants: &["color", "depth"],
+        derivation: "per tile a range 8 and a count 4, per pair up to the tile's end 8, per pair seen 8, per Gaussian drawn 36, \
+                     per pixel rgb 12 B; with depth 4 more per Gaussian and 8 per pixel. Per sample (pixel and pair up to the \
+                     tile's end) an exponential and 23 operations: dy 1, across 2, power 5, alpha 2, decision 2, after 2, stop \
+                     1, weight 2, colour 3, seen 1, transmittance 2; with depth 1 more",
+        work: |c, d| {
+            let depth = if_so(!d.is("color"));
+            work(
+                12.0 * c.tiles
+                    + 8.0 * (c.evaluated + c.seen)
+                    + splat_bytes(depth > 0.0) * c.drawn
+                    + (12.0 + 8.0 * depth) * c.pixels,
+                (23.0 + depth) * c.samples,
+                c.samples,
+            )
+        },
+    },
+    Formula {
+        pass: "render/rasterize_backward_narrow",
+        variants: &["color", "depth"],
+        derivation: "per tile a range 8 and a count 4, per pair seen 8, per Gaussian drawn 36, per pixel rgb 12 and its gradient \
+                     12, per pair seen 36 B of gradients, per pair a bit; with depth 4 more per Gaussian and pair seen and 8 \
+                     per pixel, with transmittance 8 per pixel. Per sample (pixel and pair seen) an exponential and 39 \
+                     operations: sample 18 as forward, product with the colour 3, colour 3, weighted product 1, remainder 1, \
+                     gradient of the exponent 2, whether it is one 3, its sum 1, mean 4, conic 3; with depth 2 more; over the \
+                     tile's columns 9 (10) additions; per pair 7 more",
+        work: |c, d| {
+            let depth = if_so(!d.is("color"));
+            let transmittance = if_so(!d.is("color") && !d.is("depth"));
+            let samples = c.samples * if c.evaluated > 0.0 { c.seen / c.evaluated } else { 0.0 };
+            work(
+                12.0 * c.tiles
+                    + (44.0 + 4.0 * depth) * c.seen
+                    + c.pairs / 8.0
+                    + splat_bytes(depth > 0.0) * c.drawn
+                    + (24.0 + 8.0 * depth + 8.0 * transmittance) * c.pixels,
+                (39.0 + 2.0 * depth + (9.0 + depth) / c.tile_side) * samples + 7.0 * c.seen,
+                samples,
+            )
+        },
+    },
+    Formula {
         pass: "render/rasterize_backward",
-        variants: &["narrow", "color", "narrow_color", "depth", "narrow_depth"],
+        variants: &["color", "depth"],
         derivation: "per tile a range 8, per pair up to the tile's end 8 and behind it 4, per Gaussian drawn 36, per pixel rgb \
                      12 and its gradient 12, per pair 36 B of gradients; with depth 4 more per Gaussian and pair and 8 per pixel, \
                      with transmittance 8 per pixel. Per sample an exponential and 44 operations: sample 21 as forward, \
@@ -396,6 +439,19 @@ pub const TABLE: &[Formula] = &[
             work(
                 (60.0 + 4.0 * depth) * c.drawn + (36.0 + 4.0 * depth) * c.pairs,
                 4.0 * c.drawn + (9.0 + depth) * c.pairs,
+                0.0,
+            )
+        },
+    },
+    Formula {
+        pass: "render/rasterize_gather_marked",
+        variants: &["color"],
+        derivation: "per Gaussian drawn slot 4, first pair 4, tiles 4, conic 12, gradients 36 B and 4 operations; per pair a bit; per pair seen 36 B, 9 additions and 2 for the bit; with depth 4 B more per Gaussian and pair seen and an addition",
+        work: |c, d| {
+            let depth = if_so(!d.is("color"));
+            work(
+                (60.0 + 4.0 * depth) * c.drawn + (36.0 + 4.0 * depth) * c.seen + c.pairs / 8.0,
+                4.0 * c.drawn + (11.0 + depth) * c.seen,
                 0.0,
             )
         },

@@ -30,6 +30,9 @@ pub struct Counts {
     pub samples: f64,
     /// Samples that changed a pixel.
     pub blended: f64,
+    /// Pairs with such a sample; 0 in records of versions that did not count them.
+    #[serde(default)]
+    pub seen: f64,
     /// Pixels.
     pub pixels: f64,
     /// Tiles.
@@ -43,7 +46,7 @@ pub struct Counts {
 }
 
 impl Counts {
-    fn fields(&mut self) -> [&mut f64; 14] {
+    fn fields(&mut self) -> [&mut f64; 15] {
         let Self {
             anchors,
             offsets,
@@ -54,6 +57,7 @@ impl Counts {
             evaluated,
             samples,
             blended,
+            seen,
             pixels,
             tiles,
             tile_side,
@@ -70,6 +74,7 @@ impl Counts {
             evaluated,
             samples,
             blended,
+            seen,
             pixels,
             tiles,
             tile_side,
@@ -150,6 +155,7 @@ pub fn count(words: &BTreeMap<&'static str, Vec<u32>>, schedule: &Schedule, meth
         evaluated: walked[0],
         samples: walked[1],
         blended: walked[2],
+        seen: walked[3],
         pixels: f64::from(known.size[0]) * f64::from(known.size[1]),
         tiles: tiles as f64,
         tile_side: tiling.side().into(),
@@ -179,8 +185,8 @@ struct Lists<'a> {
 const MOST_SAMPLES: u64 = 1 << 29;
 
 impl Lists<'_> {
-    /// Pairs and samples up to where the tiles end, and samples that changed a pixel.
-    fn walk(&self, tiling: Tiling, size: [u32; 2], method: Method) -> [f64; 3] {
+    /// Pairs and samples up to where the tiles end, samples that changed a pixel, and pairs with such a sample.
+    fn walk(&self, tiling: Tiling, size: [u32; 2], method: Method) -> [f64; 4] {
         let [columns, rows] = tiling.grid(size);
         let tiles = columns * rows;
         let pairs: u64 = self.ranges.iter().take(tiles as usize).map(|[first, end]| u64::from(end - first)).sum();
@@ -189,7 +195,7 @@ impl Lists<'_> {
         let sums = chosen
             .par_iter()
             .map(|&tile| self.tile([tile % columns, tile / columns], tile, tiling.side(), size, method))
-            .reduce(|| [0; 3], |a, b| std::array::from_fn(|i| a[i] + b[i]));
+            .reduce(|| [0; 4], |a, b| std::array::from_fn(|i| a[i] + b[i]));
         // By pairs, not by tiles: a tile stands for others as full as it is.
         let walked: u64 =
             chosen.iter().map(|&t| self.ranges.get(t as usize).map_or(0, |[a, b]| u64::from(b - a))).sum();
@@ -198,8 +204,8 @@ impl Lists<'_> {
     }
 
     /// The rasteriser's decisions, in its own float32.
-    fn tile(&self, [column, row]: [u32; 2], tile: u32, side: u32, size: [u32; 2], method: Method) -> [u64; 3] {
-        let Some(&[first, end]) = self.ranges.get(tile as usize) else { return [0; 3] };
+    fn tile(&self, [column, row]: [u32; 2], tile: u32, side: u32, size: [u32; 2], method: Method) -> [u64; 4] {
+        let Some(&[first, end]) = self.ranges.get(tile as usize) else { return [0; 4] };
         let mut pixels = vec![];
         for y in row * side..((row + 1) * side).min(size[1]) {
             for x in column * side..((column + 1) * side).min(size[0]) {
@@ -207,12 +213,13 @@ impl Lists<'_> {
             }
         }
         let all = pixels.len() as u64;
-        let (mut evaluated, mut blended) = (0, 0);
+        let (mut evaluated, mut blended, mut seen) = (0, 0, 0);
         for &pair in &self.sorted[first as usize..end as usize] {
             if pixels.is_empty() {
                 break;
             }
             evaluated += 1;
+            let before = blended;
             let slot = self.pair_slot[pair as usize] as usize;
             let (mean, conic, opacity) = (self.mean[slot], self.conic[slot], self.opacity[slot]);
             pixels.retain_mut(|(at, transmittance)| {
@@ -231,8 +238,9 @@ impl Lists<'_> {
                 *transmittance = after;
                 true
             });
+            seen += u64::from(blended > before);
         }
-        [evaluated, evaluated * all, blended]
+        [evaluated, evaluated * all, blended, seen]
     }
 }
 
@@ -253,14 +261,14 @@ mod tests {
             opacity: &[0.7, 0.9, 0.5],
         };
         // First tile: 0.7 leaves 0.3; 0.9 would leave 0.03, below 0.2: every pixel ends there.
-        let [evaluated, samples, blended] = lists.walk(Tiling::Narrow, [9, 8], method);
-        assert_eq!((evaluated, samples, blended), (2.0 + 1.0, 128.0 + 8.0, 64.0 + 8.0));
+        let [evaluated, samples, blended, seen] = lists.walk(Tiling::Narrow, [9, 8], method);
+        assert_eq!((evaluated, samples, blended, seen), (2.0 + 1.0, 128.0 + 8.0, 64.0 + 8.0, 1.0 + 1.0));
         let never = Method { transmittance_min: 0.0, ..method };
-        let [evaluated, samples, blended] = lists.walk(Tiling::Narrow, [9, 8], never);
-        assert_eq!((evaluated, samples, blended), (4.0, 200.0, 200.0));
+        let [evaluated, samples, blended, seen] = lists.walk(Tiling::Narrow, [9, 8], never);
+        assert_eq!((evaluated, samples, blended, seen), (4.0, 200.0, 200.0, 4.0));
         // Below the alpha threshold nothing is blended, and nothing ends.
         let faint = Lists { opacity: &[1e-3; 3], ..lists };
-        assert_eq!(faint.walk(Tiling::Narrow, [9, 8], method), [4.0, 200.0, 0.0]);
+        assert_eq!(faint.walk(Tiling::Narrow, [9, 8], method), [4.0, 200.0, 0.0, 0.0]);
     }
 
     #[test]

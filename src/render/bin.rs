@@ -265,8 +265,8 @@ impl Tally {
             run_first: gpu.buffer("run_first", counters as usize)?,
             placed: gpu.buffer("placed", 1)?,
             scan: Scan::new(gpu, counters)?,
-            blended: gpu.buffer("blended", pairs)?,
-            blended_count: gpu.buffer("blended_count", tiles as usize)?,
+            blended: gpu.buffer("seen_pairs", pairs)?,
+            blended_count: gpu.buffer("seen_count", tiles as usize)?,
         })
     }
 }

@@ -122,7 +122,7 @@ macro_rules! forward_twin {
                         let mut sum = [0f64; 3];
                         let mut _z = 0f64;
                         let left = splats.walk([x, y], $tile, push.tiles_x, |pair, slot, _, _, w| {
-                            _seen[pair] = true;
+                            _seen[pair] |= w >= f64::from(f32::MIN_POSITIVE);
                             for c in 0..3 {
                                 sum[c] += w * f64::from(color[slot][c]);
                             }
@@ -952,7 +952,9 @@ mod tests {
             };
             let mut seen = vec![false; case.pair_slot.len()];
             for p in 0..size[0] * size[1] {
-                splats.walk([p % size[0], p / size[0]], 8, grid[0], |pair, _, _, _, _| seen[pair] = true);
+                splats.walk([p % size[0], p / size[0]], 8, grid[0], |pair, _, _, _, w| {
+                    seen[pair] |= w >= f64::from(f32::MIN_POSITIVE);
+                });
             }
             let (mut listed, mut other) = (0, 0);
             for tile in 0..(grid[0] * grid[1]) as usize {
