@@ -456,10 +456,10 @@ pub const TABLE: &[Formula] = &[
     Formula {
         pass: "render/decode_backward_second",
         variants: &[],
-        derivation: "per visible anchor hidden units 384 B; per Gaussian that exists its place in the list 4 B and 44 B of gradients of 11 outputs, times 33; per chunk of 64 a second layer's share of 1452 B written",
+        derivation: "one of the three heads, a third of them all; per visible anchor hidden units 384 B; per Gaussian that exists its place in the list 4 B and 44 B of gradients of 11 outputs, times 33; per chunk of 64 a second layer's share of 1452 B written",
         work: |c, _| {
             let bytes = 384.0 * c.visible + (48.0 + 1452.0 / 64.0) * c.gaussians;
-            work(bytes, 11.0 * 33.0 * c.gaussians, 0.0)
+            work(bytes / 3.0, 11.0 * 33.0 * c.gaussians / 3.0, 0.0)
         },
     },
     Formula {

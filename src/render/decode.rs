@@ -414,13 +414,14 @@ fn listed_chunks(segments: &[u32], listed: &[u32], offsets: usize) -> Vec<(usize
 impl Reference for decode_backward_second::Kernel {
     fn reference(host: decode_backward_second::Host<'_>, (): (), constants: decode_backward_second::Constants) {
         let layout = Layout { offsets: constants.offsets as usize };
+        let head = constants.head as usize;
         let (hidden, partial) = (host.hidden.as_flattened(), host.partial.as_flattened_mut());
         for (part, (k, anchors)) in listed_chunks(host.segments, host.listed, layout.offsets).into_iter().enumerate() {
             let partial = &mut partial[4 * SECOND_VEC4 * part..][..4 * SECOND_VEC4];
-            for (at, (of, output)) in outputs_of(k).enumerate() {
+            for (at, (of, output)) in outputs_of(k).enumerate().filter(|(_, (of, _))| *of == head) {
                 let grad = |v: usize| f64::from(host.grad_output[v * layout.rows() + layout.row(of) + output]);
                 for j in 0..HIDDEN {
-                    let product = |&v: &usize| grad(v) * f64::from(hidden[(v * HEADS + of) * HIDDEN + j]);
+                    let product = |&v: &usize| grad(v) * f64::from(hidden[(v * HEADS + head) * HIDDEN + j]);
                     partial[at * HIDDEN + j] = anchors.iter().map(product).sum::<f64>() as f32;
                 }
                 partial[11 * HIDDEN + at] = anchors.iter().map(|&v| grad(v)).sum::<f64>() as f32;
@@ -662,11 +663,6 @@ impl Decode {
         &self.flags
     }
 
-    /// Threads for each chunk of the second layer's weight gradients: fewer load less, more hold less in registers.
-    fn second_parts(&self) -> u32 {
-        if self.tile == 16 { 2 } else { 4 }
-    }
-
     /// Most entries of the lists if each k's were padded to chunks.
     fn most_bound(&self) -> u32 {
         (self.capacity + BLOCK as u32) * self.layout.offsets as u32
@@ -724,7 +720,7 @@ impl Decode {
         self.compact.record(rec, flags, listed, listed_count, self.slots());
         let buffers = decode_lists::Buffers { groups, listed, listed_count, segments, bound };
         rec.run_with(decode_lists::Kernel, decode_lists::Constants { offsets }, buffers, (), offsets + 1);
-        let parts = self.second_parts();
+        let parts = HIDDEN as u32 / UNITS;
         let shapes = [
             (&existing.groups, Shape::EACH),
             (&self.per_listed, Shape { tile, factor: 1 }),
@@ -883,9 +879,12 @@ impl DecodeBackward {
             rec.run(decode_backward_first::Kernel, buffers, (), &forward.per_first);
         }
         let rows = self.grad_output.view();
-        let buffers = decode_backward_second::Buffers { segments, listed, hidden, grad_output: &rows, partial: second };
-        let constants = decode_backward_second::Constants { offsets, parts: forward.second_parts() };
-        rec.run_with(decode_backward_second::Kernel, constants, buffers, (), &forward.per_second);
+        for head in 0..HEADS as u32 {
+            let buffers =
+                decode_backward_second::Buffers { segments, listed, hidden, grad_output: &rows, partial: second };
+            let constants = decode_backward_second::Constants { offsets, head };
+            rec.run_with(decode_backward_second::Kernel, constants, buffers, (), &forward.per_second);
+        }
         let buffers = decode_backward_weights::Buffers { groups: count, partial: first, grad_weights };
         let constants = decode_backward_weights::Constants { offsets };
         rec.run_with(decode_backward_weights::Kernel, constants, buffers, (), FIRST_VEC4);
@@ -1168,17 +1167,18 @@ mod tests {
             let grad_weights = vec![testing::UNWRITTEN; layout.weights() + 3];
             let chunks = listed_chunks(&segments, &listed, offsets).len();
             let rows = grad_output.into_flattened();
-            let case = decode_backward_second::Arrays {
-                segments: segments.clone(),
-                listed: listed.clone(),
-                hidden: hidden.clone(),
-                grad_output: rows,
-                partial: unwritten(chunks * SECOND_VEC4 + 3),
-            };
-            let parts = if tile == 16 { 2 } else { 4 };
-            let constants = decode_backward_second::Constants { offsets: k, parts };
-            let threads = chunks * parts as usize;
-            let second = twin(decode_backward_second::Kernel, &gpu, constants, case, (), threads).partial;
+            let mut second = unwritten(chunks * SECOND_VEC4 + 3);
+            for head in 0..3 {
+                let case = decode_backward_second::Arrays {
+                    segments: segments.clone(),
+                    listed: listed.clone(),
+                    hidden: hidden.clone(),
+                    grad_output: rows.clone(),
+                    partial: second,
+                };
+                let constants = decode_backward_second::Constants { offsets: k, head };
+                second = twin(decode_backward_second::Kernel, &gpu, constants, case, (), chunks * 2).partial;
+            }
             let case = decode_backward_weights::Arrays { groups: m.counted(), partial: first, grad_weights };
             let constants = decode_backward_weights::Constants { offsets: k };
             let grad_weights =
@@ -1223,8 +1223,8 @@ mod tests {
             grad_output: flat(&mut rng, count * layout.rows(), -1.0, 1.0),
             partial: vec![[0.0; 4]; chunks * SECOND_VEC4 + 3],
         };
-        let constants = decode_backward_second::Constants { offsets: 9, parts: 4 };
-        let partial = twin(decode_backward_second::Kernel, &gpu, constants, case, (), chunks * 4).partial;
+        let constants = decode_backward_second::Constants { offsets: 9, head: 0 };
+        let partial = twin(decode_backward_second::Kernel, &gpu, constants, case, (), chunks * 2).partial;
         let case = decode_backward_weights_second::Arrays { segments, partial, grad_weights };
         let constants = decode_backward_weights_second::Constants { offsets: 9 };
         twin(decode_backward_weights_second::Kernel, &gpu, constants, case, (), offsets * SECOND_VEC4);
