@@ -415,14 +415,18 @@ pub const TABLE: &[Formula] = &[
     Formula {
         pass: "render/decode_backward",
         variants: &["fixed_offset", "fixed_scaling", "fixed"],
-        derivation: "per visible anchor its number 4, log-scales 24 and their gradient 24 B, 6 exponentials; per slot tiles 4 B; \
-                     per Gaussian drawn offset 12 and its gradient 12, Gaussian 48, its gradients 56 and those of its outputs \
-                     44 B and 62 operations (offset 9, opacity 3, colour 9, scale 15, rotation 26)",
+        derivation: "per visible anchor its number 4, log-scales 24 and their gradient 24 B, 6 exponentials; per slot opacity 4 B; \
+                     per Gaussian that exists tiles 4, offset 12 and its gradient 12, the rest of the Gaussian 44, gradients of \
+                     its outputs 44 B and 62 operations (offset 9, opacity 3, colour 9, scale 15, rotation 26); per Gaussian \
+                     drawn its gradients 56 B",
         work: |c, d| {
             let (offset, scaling) = (!d.is("fixed") || d.is("scaling"), !d.is("fixed") || d.is("offset"));
             work(
-                (28.0 + 24.0 * if_so(scaling)) * c.visible + 4.0 * c.slots() + (160.0 + 12.0 * if_so(offset)) * c.drawn,
-                62.0 * c.drawn,
+                (28.0 + 24.0 * if_so(scaling)) * c.visible
+                    + 4.0 * c.slots()
+                    + (104.0 + 12.0 * if_so(offset)) * c.gaussians
+                    + 56.0 * c.drawn,
+                62.0 * c.gaussians,
                 6.0 * c.visible,
             )
         },

@@ -2,8 +2,8 @@
 //!
 //! Two in three Gaussians do not exist: their opacity is not positive. Opacities come first; the Gaussians that exist are
 //! listed by their number k, then by anchor ([`Slots`]), and the other heads and the second layer's weight gradients are
-//! computed for those alone. What is not listed is not written. On the way back few of these have a gradient: those that
-//! touch a tile.
+//! computed for those alone. What is not listed is not written. On the way back those of them that touch no tile have a
+//! gradient of 0, whatever its arrays hold.
 //!
 //! Both layers and all their gradients are matrix products in which a thread holds a tile of the result in registers
 //! (16 units of 8 anchors, of 16 on a CPU, whose loads cost more than what does not fit its registers), so that a load
@@ -255,7 +255,7 @@ impl Reference for decode::Kernel {
 macro_rules! backward_twin {
     ($module:ident $(, position: $position:ident)? $(, offset: $offset:ident)? $(, scaling: $scaling:ident)?) => {
         impl Reference for $module::Kernel {
-            fn reference(host: $module::Host<'_>, (): (), constants: $module::Constants) {
+            fn reference(host: $module::Host<'_>, push: $module::Push, constants: $module::Constants) {
                 let layout = Layout { offsets: constants.offsets as usize };
                 let grad_output = host.grad_output.as_flattened_mut();
                 let n = host.groups[3] as usize;
@@ -263,7 +263,7 @@ macro_rules! backward_twin {
                     let anchor = host.visible[v] as usize;
                     let log_scaling = six(host.log_scaling, anchor);
                     let mut sum = [0.0; 6];
-                    for k in (0..layout.offsets).filter(|k| host.drawn[k * n + v] != 0) {
+                    for k in (0..layout.offsets).filter(|k| host.opacity[k * n + v] > push.above) {
                         let (slot, at) = (k * n + v, anchor * layout.offsets + k);
                         let of = Gaussian {
                             position: [0.0; 3],
@@ -279,14 +279,14 @@ macro_rules! backward_twin {
                             let _ = &host.$scaling;
                             _offset = wide(host.offset[at]);
                         )?
-                        let grad = Gaussian {
+                        let grad = if host.drawn[slot] == 0 { Gaussian::default() } else { Gaussian {
                             position: _position,
                             opacity: host.grad_opacity[slot].into(),
                             color: wide(host.grad_color[slot]),
                             scale: wide(host.grad_scale[slot]),
                             rotation: wide(host.grad_rotation[slot]),
                             norm: 0.0,
-                        };
+                        } };
                         let g = activate_backward(&of, _offset, log_scaling, &grad);
                         let _ = at;
                         $(host.$offset[at] = narrow(g.offset);)?
@@ -499,7 +499,7 @@ pub struct Anchors<'a> {
 /// Gradients of [`Decode`]'s outputs, \[slot\].
 #[derive(Clone, Copy)]
 pub struct GaussianGradients<'a> {
-    /// Not 0 where a Gaussian has a gradient: the tiles that it touches. Elsewhere nothing else is read.
+    /// Not 0 where a Gaussian has a gradient: the tiles that it touches. Elsewhere the others count as 0.
     pub drawn: &'a Buffer<u32>,
     /// World.
     pub position: &'a Buffer<[f32; 3]>,
@@ -518,7 +518,7 @@ pub struct GaussianGradients<'a> {
 pub struct AnchorGradients<'a> {
     /// \[N*32\]; rows of visible anchors are written, the others left alone.
     pub feature: &'a Buffer<f32>,
-    /// \[N*K\]; those of Gaussians that have a gradient are written, the others left alone.
+    /// \[N*K\]; those of Gaussians that exist are written, the others left alone.
     pub offset: &'a Buffer<[f32; 3]>,
     /// \[N*6\], as the features'.
     pub log_scaling: &'a Buffer<f32>,
@@ -819,7 +819,8 @@ impl DecodeBackward {
                     groups: count, visible, log_scaling, drawn, opacity, color, scale, rotation, rotation_norm,
                     grad_opacity, grad_color, grad_scale, grad_rotation, grad_output $(, $field)*
                 };
-                rec.run_with($module::Kernel, $module::Constants { offsets }, buffers, (), groups);
+                let push = $module::Push { above: forward.above };
+                rec.run_with($module::Kernel, $module::Constants { offsets }, buffers, push, groups);
             }};
         }
         rec.zero(grad_output);
@@ -1066,7 +1067,7 @@ mod tests {
             let push = decode::Push { center, center_low };
             let forward = twin(decode::Kernel, &gpu, constants, case, push, tiles(found) + offsets);
 
-            // Every other of those that exist touches a tile; no row of the others' is left as it was.
+            // Every other of those that exist touches a tile.
             let mut touched = vec![0; slots + 3];
             for &slot in &listed[..found] {
                 touched[slot as usize] = (slot + slot / k) % 2 * 3;
@@ -1100,14 +1101,15 @@ mod tests {
                         grad_opacity: c.grad_opacity, grad_color: c.grad_color, grad_scale: c.grad_scale,
                         grad_rotation: c.grad_rotation, grad_output: c.grad_output $(, $field: c.$field)*
                     };
-                    twin($module::Kernel, &gpu, $module::Constants { offsets: k }, case, (), count);
+                    twin($module::Kernel, &gpu, $module::Constants { offsets: k }, case, $module::Push { above }, count);
                 }};
             }
             fixed!(decode_backward_fixed_offset, offset, grad_position, grad_log_scaling);
             fixed!(decode_backward_fixed_scaling, grad_position, grad_offset);
             fixed!(decode_backward_fixed);
             let constants = decode_backward::Constants { offsets: k };
-            let grad_output = twin(decode_backward::Kernel, &gpu, constants, case, (), count).grad_output;
+            let push = decode_backward::Push { above };
+            let grad_output = twin(decode_backward::Kernel, &gpu, constants, case, push, count).grad_output;
             macro_rules! backward_hidden {
                 ($module:ident) => {
                     $module::Arrays {
