@@ -6,8 +6,8 @@
 // variant fixed_scaling: FIXED_SCALING
 // variant fixed: FIXED_OFFSET FIXED_SCALING
 //
-// Back through the activations of the Gaussians that have a gradient: gradients of offsets and log-scales, and of the second
-// layer's outputs. One thread per visible anchor.
+// Back through the activations of the Gaussians that exist: gradients of offsets and log-scales, and of the second layer's
+// outputs. Those that touch no tile have none, but what is not a number among their values becomes one. One thread per visible anchor.
 // The variants leave out the gradients of offsets or of log-scales that are not trained.
 layout(local_size_x = 64) in;
 layout(constant_id = 0) const uint OFFSETS = 10u; // Gaussians per anchor
@@ -20,7 +20,7 @@ layout(binding = 1, scalar) readonly buffer Visible { uint visible[]; };        
 layout(binding = 2, scalar) readonly buffer Offset { vec3 offset[]; };                  // [N*K]
 #endif
 layout(binding = 3, scalar) readonly buffer LogScaling { float log_scaling[]; };        // [N*6]
-layout(binding = 4, scalar) readonly buffer Drawn { uint drawn[]; };                    // [K*V] 0 where the Gaussian has no gradient
+layout(binding = 4, scalar) readonly buffer Drawn { uint drawn[]; };                    // [K*V] 0 where the Gaussian has no gradient, whatever the arrays hold
 layout(binding = 5, scalar) readonly buffer Opacity { float opacity[]; };              // [K*V] of decode
 layout(binding = 6, scalar) readonly buffer Color { vec3 color[]; };                    // [K*V] of decode
 layout(binding = 7, scalar) readonly buffer Scale { vec3 scale[]; };                    // [K*V] of decode
@@ -34,15 +34,19 @@ layout(binding = 12, scalar) readonly buffer GradColor { vec3 grad_color[]; };  
 layout(binding = 13, scalar) readonly buffer GradScale { vec3 grad_scale[]; };          // [K*V]
 layout(binding = 14, scalar) readonly buffer GradRotation { vec4 grad_rotation[]; };    // [K*V]
 #ifndef FIXED_OFFSET
-layout(binding = 15, scalar) writeonly buffer GradOffset { vec3 grad_offset[]; };       // [N*K] of Gaussians that have one only
+layout(binding = 15, scalar) writeonly buffer GradOffset { vec3 grad_offset[]; };       // [N*K] of Gaussians that exist only
 #endif
 #ifndef FIXED_SCALING
 layout(binding = 16, scalar) writeonly buffer GradLogScaling { float grad_log_scaling[]; }; // [N*6] visible anchors only
 #endif
-layout(binding = 17, scalar) writeonly buffer GradOutput { vec4 grad_output[]; };       // [V*D/4] before the activations, of Gaussians that have one only
+layout(binding = 17, scalar) writeonly buffer GradOutput { vec4 grad_output[]; };       // [V*D/4] before the activations, of Gaussians that exist only
+layout(push_constant, scalar) uniform Push {
+  float above; // Gaussians with an opacity above this exist
+} push;
 void put(uint from, uint row, float value) { grad_output[from + row / 4u][row % 4u] = value; }
 void main() {
   uint v = thread_index(), n = groups[3];
+  float above = push.above;
   if (v >= n) return;
   uint anchor = visible[v], l = 6u * anchor, rows = head_row(3u, OFFSETS), to = v * (rows / 4u);
   uint color_row = head_row(1u, OFFSETS), cov_row = head_row(2u, OFFSETS);
@@ -54,14 +58,15 @@ void main() {
   vec3 grad_spread = vec3(0.0), grad_size = vec3(0.0);
 #endif
   for (uint k = 0u; k < OFFSETS; ++k) {
-    // Each thread goes on to its own next one that has a gradient: of threads that run in step the loop then lasts as long
-    // as the most that any of them has, not K.
-    while (k < OFFSETS && drawn[k * n + v] == 0u) ++k;
+    // Each thread goes on to its own next one that exists: of threads that run in step the loop then lasts as long as the
+    // most that any of them has, not K.
+    float o = 0.0;
+    while (k < OFFSETS && !((o = opacity[k * n + v]) > above)) ++k;
     if (k >= OFFSETS) break;
     uint slot = k * n + v;
-    float o = opacity[slot];
+    bool has = drawn[slot] != 0u;
 #if !defined(FIXED_OFFSET) || !defined(FIXED_SCALING)
-    vec3 gp = grad_position[slot];
+    vec3 gp = has ? grad_position[slot] : vec3(0.0);
 #endif
 #ifndef FIXED_OFFSET
     grad_offset[anchor * OFFSETS + k] = gp * spread;
@@ -70,18 +75,18 @@ void main() {
     // By the displacement, which is finite where there is a Gaussian: the gradient of an offset of 0 may overflow, this not.
     grad_spread += gp * (offset[anchor * OFFSETS + k] * spread);
 #endif
-    put(to, k, grad_opacity[slot] * ((1.0 - o) * (1.0 + o)));
-    vec3 c = color[slot], gc = grad_color[slot] * c * (1.0 - c);
+    put(to, k, (has ? grad_opacity[slot] : 0.0) * ((1.0 - o) * (1.0 + o)));
+    vec3 c = color[slot], gc = (has ? grad_color[slot] : vec3(0.0)) * c * (1.0 - c);
     put(to, color_row + 3u * k, gc.x);
     put(to, color_row + 3u * k + 1u, gc.y);
     put(to, color_row + 3u * k + 2u, gc.z);
-    vec3 s = scale[slot], gs = grad_scale[slot] * s;
+    vec3 s = scale[slot], gs = (has ? grad_scale[slot] : vec3(0.0)) * s;
 #ifndef FIXED_SCALING
     grad_size += gs;
 #endif
     // The sigmoid is scale / size; of a size that underflowed to 0 the scale and its gradient are 0.
     gs *= 1.0 - s / max(size, vec3(1e-37));
-    vec4 q = rotation[slot], gq = grad_rotation[slot];
+    vec4 q = rotation[slot], gq = has ? grad_rotation[slot] : vec4(0.0);
     float norm = rotation_norm[slot];
     gq = norm < 1e-12 ? gq / 1e-12 : (gq - q * dot(q, gq)) / norm;
     uint row = cov_row + 7u * k;

@@ -471,14 +471,18 @@ pub const TABLE: &[Formula] = &[
     Formula {
         pass: "render/decode_backward",
         variants: &["fixed_offset", "fixed_scaling", "fixed"],
-        derivation: "per visible anchor its number 4, log-scales 24 and their gradient 24 B, 6 exponentials; per slot tiles 4 B; \
-                     per Gaussian drawn offset 12 and its gradient 12, Gaussian 48, its gradients 56 and those of its outputs \
-                     44 B and 62 operations (offset 9, opacity 3, colour 9, scale 15, rotation 26)",
+        derivation: "per visible anchor its number 4, log-scales 24 and their gradient 24 B, 6 exponentials; per slot opacity 4 B; \
+                     per Gaussian that exists tiles 4, offset 12 and its gradient 12, the rest of the Gaussian 44, gradients of \
+                     its outputs 44 B and 62 operations (offset 9, opacity 3, colour 9, scale 15, rotation 26); per Gaussian \
+                     drawn its gradients 56 B",
         work: |c, d| {
             let (offset, scaling) = (!d.is("fixed") || d.is("scaling"), !d.is("fixed") || d.is("offset"));
             work(
-                (28.0 + 24.0 * if_so(scaling)) * c.visible + 4.0 * c.slots() + (160.0 + 12.0 * if_so(offset)) * c.drawn,
-                62.0 * c.drawn,
+                (28.0 + 24.0 * if_so(scaling)) * c.visible
+                    + 4.0 * c.slots()
+                    + (104.0 + 12.0 * if_so(offset)) * c.gaussians
+                    + 56.0 * c.drawn,
+                62.0 * c.gaussians,
                 6.0 * c.visible,
             )
         },
@@ -512,10 +516,10 @@ pub const TABLE: &[Formula] = &[
     Formula {
         pass: "render/decode_backward_second",
         variants: &[],
-        derivation: "per visible anchor hidden units 384 B; per Gaussian that exists its place in the list 4 B and 44 B of gradients of 11 outputs, times 33; per chunk of 64 a second layer's share of 1452 B written",
+        derivation: "one of the three heads, a third of them all; per visible anchor hidden units 384 B; per Gaussian that exists its place in the list 4 B and 44 B of gradients of 11 outputs, times 33; per chunk of 64 a second layer's share of 1452 B written",
         work: |c, _| {
             let bytes = 384.0 * c.visible + (48.0 + 1452.0 / 64.0) * c.gaussians;
-            work(bytes, 11.0 * 33.0 * c.gaussians, 0.0)
+            work(bytes / 3.0, 11.0 * 33.0 * c.gaussians / 3.0, 0.0)
         },
     },
     Formula {

@@ -2,8 +2,8 @@
 //!
 //! Two in three Gaussians do not exist: their opacity is not positive. Opacities come first; the Gaussians that exist are
 //! listed by their number k, then by anchor ([`Slots`]), and the other heads and the second layer's weight gradients are
-//! computed for those alone. What is not listed is not written. On the way back few of these have a gradient: those that
-//! touch a tile.
+//! computed for those alone. What is not listed is not written. On the way back those of them that touch no tile have a
+//! gradient of 0, whatever its arrays hold.
 //!
 //! Both layers and all their gradients are matrix products in which a thread holds a tile of the result in registers
 //! (16 units of 8 anchors, of 16 on a CPU, whose loads cost more than what does not fit its registers), so that a load
@@ -255,7 +255,7 @@ impl Reference for decode::Kernel {
 macro_rules! backward_twin {
     ($module:ident $(, position: $position:ident)? $(, offset: $offset:ident)? $(, scaling: $scaling:ident)?) => {
         impl Reference for $module::Kernel {
-            fn reference(host: $module::Host<'_>, (): (), constants: $module::Constants) {
+            fn reference(host: $module::Host<'_>, push: $module::Push, constants: $module::Constants) {
                 let layout = Layout { offsets: constants.offsets as usize };
                 let grad_output = host.grad_output.as_flattened_mut();
                 let n = host.groups[3] as usize;
@@ -263,7 +263,7 @@ macro_rules! backward_twin {
                     let anchor = host.visible[v] as usize;
                     let log_scaling = six(host.log_scaling, anchor);
                     let mut sum = [0.0; 6];
-                    for k in (0..layout.offsets).filter(|k| host.drawn[k * n + v] != 0) {
+                    for k in (0..layout.offsets).filter(|k| host.opacity[k * n + v] > push.above) {
                         let (slot, at) = (k * n + v, anchor * layout.offsets + k);
                         let of = Gaussian {
                             position: [0.0; 3],
@@ -279,14 +279,14 @@ macro_rules! backward_twin {
                             let _ = &host.$scaling;
                             _offset = wide(host.offset[at]);
                         )?
-                        let grad = Gaussian {
+                        let grad = if host.drawn[slot] == 0 { Gaussian::default() } else { Gaussian {
                             position: _position,
                             opacity: host.grad_opacity[slot].into(),
                             color: wide(host.grad_color[slot]),
                             scale: wide(host.grad_scale[slot]),
                             rotation: wide(host.grad_rotation[slot]),
                             norm: 0.0,
-                        };
+                        } };
                         let g = activate_backward(&of, _offset, log_scaling, &grad);
                         let _ = at;
                         $(host.$offset[at] = narrow(g.offset);)?
@@ -414,13 +414,14 @@ fn listed_chunks(segments: &[u32], listed: &[u32], offsets: usize) -> Vec<(usize
 impl Reference for decode_backward_second::Kernel {
     fn reference(host: decode_backward_second::Host<'_>, (): (), constants: decode_backward_second::Constants) {
         let layout = Layout { offsets: constants.offsets as usize };
+        let head = constants.head as usize;
         let (hidden, partial) = (host.hidden.as_flattened(), host.partial.as_flattened_mut());
         for (part, (k, anchors)) in listed_chunks(host.segments, host.listed, layout.offsets).into_iter().enumerate() {
             let partial = &mut partial[4 * SECOND_VEC4 * part..][..4 * SECOND_VEC4];
-            for (at, (of, output)) in outputs_of(k).enumerate() {
+            for (at, (of, output)) in outputs_of(k).enumerate().filter(|(_, (of, _))| *of == head) {
                 let grad = |v: usize| f64::from(host.grad_output[v * layout.rows() + layout.row(of) + output]);
                 for j in 0..HIDDEN {
-                    let product = |&v: &usize| grad(v) * f64::from(hidden[(v * HEADS + of) * HIDDEN + j]);
+                    let product = |&v: &usize| grad(v) * f64::from(hidden[(v * HEADS + head) * HIDDEN + j]);
                     partial[at * HIDDEN + j] = anchors.iter().map(product).sum::<f64>() as f32;
                 }
                 partial[11 * HIDDEN + at] = anchors.iter().map(|&v| grad(v)).sum::<f64>() as f32;
@@ -498,7 +499,7 @@ pub struct Anchors<'a> {
 /// Gradients of [`Decode`]'s outputs, \[slot\].
 #[derive(Clone, Copy)]
 pub struct GaussianGradients<'a> {
-    /// Not 0 where a Gaussian has a gradient: the tiles that it touches. Elsewhere nothing else is read.
+    /// Not 0 where a Gaussian has a gradient: the tiles that it touches. Elsewhere the others count as 0.
     pub drawn: &'a Buffer<u32>,
     /// World.
     pub position: &'a Buffer<[f32; 3]>,
@@ -517,7 +518,7 @@ pub struct GaussianGradients<'a> {
 pub struct AnchorGradients<'a> {
     /// \[N*32\]; rows of visible anchors are written, the others left alone.
     pub feature: &'a Buffer<f32>,
-    /// \[N*K\]; those of Gaussians that have a gradient are written, the others left alone.
+    /// \[N*K\]; those of Gaussians that exist are written, the others left alone.
     pub offset: &'a Buffer<[f32; 3]>,
     /// \[N*6\], as the features'.
     pub log_scaling: &'a Buffer<f32>,
@@ -662,11 +663,6 @@ impl Decode {
         &self.flags
     }
 
-    /// Threads for each chunk of the second layer's weight gradients: fewer load less, more hold less in registers.
-    fn second_parts(&self) -> u32 {
-        if self.tile == 16 { 2 } else { 4 }
-    }
-
     /// Most entries of the lists if each k's were padded to chunks.
     fn most_bound(&self) -> u32 {
         (self.capacity + BLOCK as u32) * self.layout.offsets as u32
@@ -724,7 +720,7 @@ impl Decode {
         self.compact.record(rec, flags, listed, listed_count, self.slots());
         let buffers = decode_lists::Buffers { groups, listed, listed_count, segments, bound };
         rec.run_with(decode_lists::Kernel, decode_lists::Constants { offsets }, buffers, (), offsets + 1);
-        let parts = self.second_parts();
+        let parts = HIDDEN as u32 / UNITS;
         let shapes = [
             (&existing.groups, Shape::EACH),
             (&self.per_listed, Shape { tile, factor: 1 }),
@@ -823,7 +819,8 @@ impl DecodeBackward {
                     groups: count, visible, log_scaling, drawn, opacity, color, scale, rotation, rotation_norm,
                     grad_opacity, grad_color, grad_scale, grad_rotation, grad_output $(, $field)*
                 };
-                rec.run_with($module::Kernel, $module::Constants { offsets }, buffers, (), groups);
+                let push = $module::Push { above: forward.above };
+                rec.run_with($module::Kernel, $module::Constants { offsets }, buffers, push, groups);
             }};
         }
         rec.zero(grad_output);
@@ -883,9 +880,12 @@ impl DecodeBackward {
             rec.run(decode_backward_first::Kernel, buffers, (), &forward.per_first);
         }
         let rows = self.grad_output.view();
-        let buffers = decode_backward_second::Buffers { segments, listed, hidden, grad_output: &rows, partial: second };
-        let constants = decode_backward_second::Constants { offsets, parts: forward.second_parts() };
-        rec.run_with(decode_backward_second::Kernel, constants, buffers, (), &forward.per_second);
+        for head in 0..HEADS as u32 {
+            let buffers =
+                decode_backward_second::Buffers { segments, listed, hidden, grad_output: &rows, partial: second };
+            let constants = decode_backward_second::Constants { offsets, head };
+            rec.run_with(decode_backward_second::Kernel, constants, buffers, (), &forward.per_second);
+        }
         let buffers = decode_backward_weights::Buffers { groups: count, partial: first, grad_weights };
         let constants = decode_backward_weights::Constants { offsets };
         rec.run_with(decode_backward_weights::Kernel, constants, buffers, (), FIRST_VEC4);
@@ -1067,7 +1067,7 @@ mod tests {
             let push = decode::Push { center, center_low };
             let forward = twin(decode::Kernel, &gpu, constants, case, push, tiles(found) + offsets);
 
-            // Every other of those that exist touches a tile; no row of the others' is left as it was.
+            // Every other of those that exist touches a tile.
             let mut touched = vec![0; slots + 3];
             for &slot in &listed[..found] {
                 touched[slot as usize] = (slot + slot / k) % 2 * 3;
@@ -1101,14 +1101,15 @@ mod tests {
                         grad_opacity: c.grad_opacity, grad_color: c.grad_color, grad_scale: c.grad_scale,
                         grad_rotation: c.grad_rotation, grad_output: c.grad_output $(, $field: c.$field)*
                     };
-                    twin($module::Kernel, &gpu, $module::Constants { offsets: k }, case, (), count);
+                    twin($module::Kernel, &gpu, $module::Constants { offsets: k }, case, $module::Push { above }, count);
                 }};
             }
             fixed!(decode_backward_fixed_offset, offset, grad_position, grad_log_scaling);
             fixed!(decode_backward_fixed_scaling, grad_position, grad_offset);
             fixed!(decode_backward_fixed);
             let constants = decode_backward::Constants { offsets: k };
-            let grad_output = twin(decode_backward::Kernel, &gpu, constants, case, (), count).grad_output;
+            let push = decode_backward::Push { above };
+            let grad_output = twin(decode_backward::Kernel, &gpu, constants, case, push, count).grad_output;
             macro_rules! backward_hidden {
                 ($module:ident) => {
                     $module::Arrays {
@@ -1168,17 +1169,18 @@ mod tests {
             let grad_weights = vec![testing::UNWRITTEN; layout.weights() + 3];
             let chunks = listed_chunks(&segments, &listed, offsets).len();
             let rows = grad_output.into_flattened();
-            let case = decode_backward_second::Arrays {
-                segments: segments.clone(),
-                listed: listed.clone(),
-                hidden: hidden.clone(),
-                grad_output: rows,
-                partial: unwritten(chunks * SECOND_VEC4 + 3),
-            };
-            let parts = if tile == 16 { 2 } else { 4 };
-            let constants = decode_backward_second::Constants { offsets: k, parts };
-            let threads = chunks * parts as usize;
-            let second = twin(decode_backward_second::Kernel, &gpu, constants, case, (), threads).partial;
+            let mut second = unwritten(chunks * SECOND_VEC4 + 3);
+            for head in 0..3 {
+                let case = decode_backward_second::Arrays {
+                    segments: segments.clone(),
+                    listed: listed.clone(),
+                    hidden: hidden.clone(),
+                    grad_output: rows.clone(),
+                    partial: second,
+                };
+                let constants = decode_backward_second::Constants { offsets: k, head };
+                second = twin(decode_backward_second::Kernel, &gpu, constants, case, (), chunks * 2).partial;
+            }
             let case = decode_backward_weights::Arrays { groups: m.counted(), partial: first, grad_weights };
             let constants = decode_backward_weights::Constants { offsets: k };
             let grad_weights =
@@ -1223,8 +1225,8 @@ mod tests {
             grad_output: flat(&mut rng, count * layout.rows(), -1.0, 1.0),
             partial: vec![[0.0; 4]; chunks * SECOND_VEC4 + 3],
         };
-        let constants = decode_backward_second::Constants { offsets: 9, parts: 4 };
-        let partial = twin(decode_backward_second::Kernel, &gpu, constants, case, (), chunks * 4).partial;
+        let constants = decode_backward_second::Constants { offsets: 9, head: 0 };
+        let partial = twin(decode_backward_second::Kernel, &gpu, constants, case, (), chunks * 2).partial;
         let case = decode_backward_weights_second::Arrays { segments, partial, grad_weights };
         let constants = decode_backward_weights_second::Constants { offsets: 9 };
         twin(decode_backward_weights_second::Kernel, &gpu, constants, case, (), offsets * SECOND_VEC4);
