@@ -34,17 +34,23 @@ void main() {
   ivec2 grid = ivec2(push.grid);
   vec2 m = mean[s];
   Support support = support_of(m, covariance[s], opacity[s], ALPHA_MIN, tile, grid);
-  for (int row = support.row0; row <= support.row1; row++) {
-    ivec2 columns = support_columns(support, m, row, tile, grid);
-    for (int column = columns.x; column <= columns.y && p < end; column++, p++) {
-      pair_tile[p] = uint(row * grid.x + column);
+  // One loop for rows and columns, tested at its end: CPU drivers repeat an inner loop for the widest row of eight
+  // Gaussians, and run every loop's body once more, masked, when the test at its head fails.
+  int row = support.row0;
+  ivec2 columns = support_columns(support, m, row, tile, grid);
+  do {
+    // Counting and this pass are two kernels; should a driver round them differently, a pair too many is dropped and one
+    // too few goes to the tile behind the last, which nobody draws and whose gradients are 0.
+    if (row > support.row1) columns = ivec2(grid.x * (grid.y - row));
+    if (columns.x <= columns.y) {
+      pair_tile[p] = uint(row * grid.x + columns.x);
       pair_slot[p] = s;
+      p++;
     }
-  }
-  // Counting and this pass are two kernels; should a driver round them differently, a pair too many is dropped above
-  // and one too few goes to the tile behind the last, which nobody draws and whose gradients are 0.
-  for (; p < end; p++) {
-    pair_tile[p] = uint(grid.x * grid.y);
-    pair_slot[p] = s;
-  }
+    columns.x++;
+    if (columns.x > columns.y) {
+      row++;
+      columns = support_columns(support, m, row, tile, grid);
+    }
+  } while (p < end);
 }

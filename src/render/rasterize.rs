@@ -6,6 +6,9 @@
 //! divided by coverage. The support of a Gaussian is exactly where alpha reaches the threshold, so the picture does not
 //! depend on the tiles.
 //!
+//! Narrow tiles (CPU drivers) list the pairs of which a pixel took something: a third of all on photographs. Their backward
+//! pass looks at no other, and the gather skips what has no mark.
+//!
 //! The exponential is the driver's: on lavapipe every polynomial tried, down to one of 7e-5 relative error in seven
 //! operations, took longer and was less exact, and GPUs have an instruction for it.
 
