@@ -38,17 +38,24 @@ void main() {
   uint stride = push.stride, to = h * push.capacity * stride + first / 4u;
   vec4 q[4][16], v[4][16], g[4][16];
   vec3 row[4];
-  // Loops whose length the compiler does not know: llvmpipe makes a loop of every load, and its compiler's time grows with
-  // the square of their number.
-  uint four = min(4u, n.x * HEADS), sixteen = 4u * four;
-  for (uint i = 0u; i < four; i++) {
+  [[unroll]] for (uint r = 0u; r < 4u; r++) {
+    [[unroll]] for (uint d = 0u; d < 16u; d++) q[r][d] = v[r][d] = g[r][d] = vec4(0.0);
+    row[r] = vec3(0.0);
+  }
+  // A loop whose length the compiler does not know: llvmpipe makes a loop of every load, and its compiler's time grows
+  // with the square of their number.
+  for (uint i = 0u; i < min(4u, n.x * HEADS); i++) {
     uint token = min(first + i, n.x - 1u), at = token * INNER + head;
-    for (uint d = 0u; d < sixteen; d++) {
-      q[i][d] = 0.125 * qk[at + d];
-      v[i][d] = value[at + d];
-      g[i][d] = grad_mixed[at + d];
+    [[unroll]] for (uint d = 0u; d < 16u; d++) {
+      vec4 own_qk = 0.125 * qk[at + d], own_value = value[at + d], own_grad = grad_mixed[at + d];
+      [[unroll]] for (uint r = 0u; r < 4u; r++) {
+        q[r][d] = i == r ? own_qk : q[r][d];
+        v[r][d] = i == r ? own_value : v[r][d];
+        g[r][d] = i == r ? own_grad : g[r][d];
+      }
     }
-    row[i] = rows[token * HEADS + h];
+    vec3 own_row = rows[token * HEADS + h];
+    [[unroll]] for (uint r = 0u; r < 4u; r++) row[r] = i == r ? own_row : row[r];
   }
   for (uint j = 0u; j < n.y; j += 8u) {
     uint token = min(j + lane, n.y - 1u), at = token * INNER + head;
