@@ -3,8 +3,6 @@
 #extension GL_EXT_control_flow_attributes : require
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_vote : require
-#extension GL_KHR_shader_subgroup_ballot : require
-#extension GL_KHR_shader_subgroup_arithmetic : require
 #extension GL_KHR_shader_subgroup_shuffle : require
 // variant color: COLOR_ONLY
 // variant depth: NO_TRANSMITTANCE
@@ -123,9 +121,8 @@ void write(uint p, vec3 q, Sums s) {
 #endif
 }
 
-// Half of a step of many sums over the lanes at once: lanes with the bit keep the second's, the others the first's, and
-// both add what their partner holds of it. After bits 1 and 2 lane k of four holds the k-th Gaussian's sums over the four
-// lanes, after bits 1, 2 and 4 lane k of eight the k-th's of eight: a fifth of the shuffles that a sum each would take.
+// Half of a step of two sums over the lanes at once: lanes with the bit keep the second's, the others the first's, and
+// both add what their partner holds of it. After bits 1 and 2 lane k of four holds the k-th Gaussian's sums over the four.
 Sums meet(Sums a, Sums b, uint bit) {
   bool upper = (gl_SubgroupInvocationID & bit) != 0u;
 #define MEET(f) s.f = (upper ? b.f : a.f) + subgroupShuffleXor(upper ? a.f : b.f, bit)
