@@ -17,6 +17,7 @@ layout(binding = 9, scalar) buffer Visits { uint visits[]; };                  /
 layout(push_constant, scalar) uniform Push {
   vec2 half_size; // half the picture, px
   uint offsets;   // slots per visible anchor
+  uint touched;   // not 0: a step counts for a Gaussian only where it has a gradient
 } push;
 void main() {
   uint s = thread_index();
@@ -32,7 +33,7 @@ void main() {
     float large = max(abs(g.x), abs(g.y));
     float ratio = min(abs(g.x), abs(g.y)) / max(large, 1e-37);
     gradient[at] += large * sqrt(1.0 + ratio * ratio);
-    seen[at] += 1u;
+    if (push.touched == 0u || large > 0.0) seen[at] += 1u;
   }
   if (k == 0u) {
     float sum = 0.0;

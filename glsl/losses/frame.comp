@@ -6,14 +6,17 @@
 // variant masked_depth: MASKED DEPTH
 // The step's photograph and what its mask says: from 8 bits per channel to the losses' arrays.
 layout(local_size_x = 64) in;
-layout(binding = 0, scalar) readonly buffer Picture { uint picture[]; };  // [pixel] red | green << 8 | blue << 16 | mask << 24, the mask 0 or 255
+const float NO_PRIOR = -1e4; // far below what a prior in its own range takes
+layout(binding = 0, scalar) readonly buffer Picture { uint picture[]; };  // [pixel] red | green << 8 | blue << 16 | mask << 24, the mask 0 outside, up to 255 inside
 layout(binding = 1, scalar) writeonly buffer Target { vec3 target[]; };   // [pixel] rgb in 0 to 1
 #ifdef MASKED
 layout(binding = 2, scalar) writeonly buffer Weight { float weight[]; };  // [pixel] of the photometric loss
 #endif
 #ifdef DEPTH
-layout(binding = 3, scalar) writeonly buffer Valid { float valid[]; };    // [pixel] 1 outside the mask
+layout(binding = 3, scalar) writeonly buffer Valid { float valid[]; };    // [pixel] 1 outside the mask where there is a prior
 layout(binding = 4, scalar) writeonly buffer DepthWeight { float depth_weight[]; }; // [pixel] of the depth L1 loss
+layout(binding = 5, scalar) readonly buffer Prior { float prior[]; };     // [pixel] the depth prior; at or below NO_PRIOR there is none
+layout(binding = 6, scalar) writeonly buffer Given { float given[]; };    // [pixel] 1 where there is a prior
 #endif
 layout(push_constant, scalar) uniform Push {
   uint pixels; // width * height
@@ -36,13 +39,17 @@ void main() {
   uint word = picture[pixel];
   target[pixel] = vec3(word & 255u, word >> 8 & 255u, word >> 16 & 255u) / 255.0;
 #ifdef MASKED
-  bool inside = word >> 24 != 0u;
-  weight[pixel] = inside ? push.inside : push.outside;
+  // Both ends exact: a hard mask's weights are those asked for.
+  float share = float(word >> 24) / 255.0;
+  weight[pixel] = mix(push.outside, push.inside, share);
 #endif
 #ifdef DEPTH
-  valid[pixel] = inside ? 0.0 : 1.0;
+  bool has = prior[pixel] > NO_PRIOR;
+  given[pixel] = has ? 1.0 : 0.0;
+  valid[pixel] = has && word >> 24 == 0u ? 1.0 : 0.0;
   uvec2 at = uvec2(pixel % push.width, pixel / push.width);
   bool added = all(greaterThanEqual(at, push.low)) && all(lessThan(at, push.high));
-  depth_weight[pixel] = (inside ? push.depth_inside : push.depth_outside) + (added ? push.depth_added : 0.0);
+  float at_pixel = mix(push.depth_outside, push.depth_inside, share) + (added ? push.depth_added : 0.0);
+  depth_weight[pixel] = has ? at_pixel : 0.0;
 #endif
 }

@@ -6,10 +6,11 @@
 #include "group_sum.glsl"
 #include "ssim.glsl"
 // variant weighted: WEIGHTED
+// variant weighted_outside: WEIGHTED OUTSIDE
 // variant l1: NO_SSIM
 // variant l1_weighted: NO_SSIM WEIGHTED
 // The window's adjoint along columns, SSIM's gradient by the rendered values, and L1: its loss and gradient. `l1` is for
-// losses without SSIM.
+// losses without SSIM; with `outside` pixels without weight have no gradient, though windows beside them reach in.
 const int RUN = 8;
 layout(local_size_x = 64) in;
 #ifndef NO_SSIM
@@ -63,6 +64,12 @@ void main() {
         float scale = push.factor;
 #ifdef WEIGHTED
         scale *= weight[pixel];
+#endif
+#ifdef OUTSIDE
+        if (scale == 0.0) {
+          grad_rendered[pixel] = vec3(0.0);
+          continue;
+        }
 #endif
         loss += scale * (abs(difference.r) + abs(difference.g) + abs(difference.b));
         vec3 gradient = scale * sign(difference);

@@ -4,12 +4,18 @@
 #extension GL_GOOGLE_include_directive : require
 #include "thread.glsl"
 #include "ssim.glsl"
+// variant outside: OUTSIDE
 // SSIM's moments along rows. A thread makes RUN neighbouring pixels, so that a sample is loaded once for all of them.
+// `outside` takes pixels without weight as if both pictures agreed there: the window of a pixel beside the mask does not
+// compare what is behind the object with the object.
 const int RUN = 8;
 layout(local_size_x = 64) in;
 layout(binding = 0, scalar) readonly buffer Rendered { vec3 rendered[]; }; // [pixel] rgb
 layout(binding = 1, scalar) readonly buffer Target { vec3 target[]; };     // [pixel] rgb
 layout(binding = 2, scalar) writeonly buffer Moments { vec4 moments[]; };  // [pixel * 3] along the row: mean rendered, mean difference, sum of both variances, variance of the difference
+#ifdef OUTSIDE
+layout(binding = 3, scalar) readonly buffer Weight { float weight[]; };   // [pixel] of the photometric loss
+#endif
 layout(push_constant, scalar) uniform Push {
   uvec2 size; // width, height in pixels
 } push;
@@ -28,6 +34,9 @@ void main() {
     if (x >= 0 && x < width) {
       a[i] = rendered[row + uint(x)];
       difference[i] = a[i] - target[row + uint(x)];
+#ifdef OUTSIDE
+      if (weight[row + uint(x)] == 0.0) difference[i] = vec3(0.0);
+#endif
     }
   }
   [[unroll]] for (int c = 0; c < 3; ++c) {

@@ -59,7 +59,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             Question { anchors: args.anchors, available: args.memory.map(|mib| mib << 20), also: Some(args.step) };
         let verdict = forecast::forecast(gpu, &scene, &settings, question)?;
         let plan = Plan::new(&scene, &settings);
-        let view = Order::new(scene.train.len(), settings.train.seed, settings.train.view_order).view(args.step);
+        let view = Order::of(&scene, &settings.train).view(args.step);
         let shown = Shown {
             device: &gpu.info().name,
             scene: args.scene.name(),

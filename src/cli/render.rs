@@ -97,12 +97,14 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let file = args.config.iter().cloned().map(Source::File);
     let changes = file.chain(args.set.iter().cloned().map(Source::Set)).chain(downscale).collect();
     let settings = origin.settings(changes)?;
-    let (anchors, weights) = model::files::load(&origin.model())?;
+    let (mut anchors, mut weights) = model::files::load(&origin.model())?;
     let own = origin.scene().map(Path::new);
     let scene = args.scene.as_deref().or(own).with_context(|| {
         format!("{}: a model alone does not know its cameras; name the scene with --scene", args.model.display())
     })?;
     let loaded = shared::load_scene(scene, &settings)?;
+    // A model on disk has the lengths of the scene's own files.
+    model::files::rescale(&mut anchors, &mut weights, 1.0 / loaded.unit);
     let cameras = args.views.cameras(&loaded, args.frames);
     if cameras.is_empty() {
         bail!("{}: the scene has no {} views; --views names others", scene.display(), args.views.name());
@@ -114,7 +116,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         let style = ProgressStyle::with_template("{wide_bar} {pos}/{len} views, {eta} left")?;
         let bar = ProgressBar::new(cameras.len() as u64).with_style(style);
         for (name, camera) in &cameras {
-            let view = renderer.render(camera)?;
+            let mut view = renderer.render(camera)?;
+            view.depth.iter_mut().for_each(|z| *z = (f64::from(*z) * loaded.unit) as f32);
             pictures::write_png(&pictures::path(&out, name, "png"), view.size, &view.rgb)?;
             pictures::write_exr(&pictures::path(&out, name, "exr"), view.size, &view.depth, &view.transmittance)?;
             bar.inc(1);

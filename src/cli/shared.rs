@@ -89,8 +89,10 @@ impl SceneArgs {
     /// # Errors
     /// Settings that make no sense; a scene that cannot be read.
     pub fn load(&self) -> anyhow::Result<(Scene, Settings)> {
-        let settings = self.settings.resolve()?;
-        Ok((load_scene(&self.scene, &settings)?, settings))
+        let mut settings = self.settings.resolve()?;
+        let scene = load_scene(&self.scene, &settings)?;
+        settings.fit_pixels(&scene);
+        Ok((scene, settings))
     }
 
     /// The scene as a run's record names it.
@@ -121,13 +123,13 @@ pub struct MeasureArgs {
     pub repetitions: u32,
 }
 
-/// Reads a scene and prints its notes to stderr. `synthetic` writes the built-in scene of seed `train.seed` into a
+/// Reads a scene, makes it ready for training and prints its notes to stderr. Its lengths are in [`Scene::unit`]s. `synthetic` writes the built-in scene of seed `train.seed` into a
 /// temporary folder and reads it like any other.
 ///
 /// # Errors
 /// A scene that cannot be read, a temporary folder that cannot be written.
 pub fn load_scene(scene: &Path, settings: &Settings) -> anyhow::Result<Scene> {
-    let scene = if scene == Path::new(SYNTHETIC) {
+    let mut scene = if scene == Path::new(SYNTHETIC) {
         let folder = tempfile::tempdir().context("no temporary folder for the synthetic scene can be made")?;
         let options = synthetic::Options { seed: settings.train.seed, ..Default::default() };
         let scene = folder.path().join(SYNTHETIC);
@@ -136,6 +138,7 @@ pub fn load_scene(scene: &Path, settings: &Settings) -> anyhow::Result<Scene> {
     } else {
         scene::load(scene, &settings.scene)?
     };
+    scene::condition(&mut scene, &settings.scene);
     for note in &scene.notes {
         eprintln!("scene: {note}");
     }

@@ -83,13 +83,28 @@ impl Settings {
 
     /// Refuses values that no run could use; keys are dotted from the root.
     pub fn validate(&self) -> Result<(), Invalid> {
-        ensure(self.scene.downscale > 0, "scene.downscale", self.scene.downscale, "must be at least 1")?;
+        self.scene.validate().map_err(|invalid| invalid.inside("scene"))?;
         self.train.validate().map_err(|invalid| invalid.inside("train"))?;
         self.model.validate().map_err(|invalid| invalid.inside("model"))?;
         self.render.validate().map_err(|invalid| invalid.inside("render"))?;
         self.losses.validate().map_err(|invalid| invalid.inside("losses"))?;
         self.optimizer.validate().map_err(|invalid| invalid.inside("optimizer"))?;
         self.densify.validate().map_err(|invalid| invalid.inside("densify"))
+    }
+
+    /// Turns what is given in pixels into world units of this scene, once it is read and conditioned: the initial grid, the
+    /// growth cells and the cap of the scales. What is said in world units stays.
+    pub fn fit_pixels(&mut self, scene: &crate::scene::Scene) {
+        let Some(pixel) = crate::scene::footprint(scene) else { return };
+        if self.model.voxel <= 0.0 && self.model.voxel_pixels > 0.0 {
+            self.model.voxel = self.model.voxel_pixels * self.model.voxel_factor * pixel;
+        }
+        if self.model.voxel > 0.0 && self.densify.coarsest_pixels > 0.0 {
+            self.densify.coarsest_cell = self.densify.coarsest_pixels * pixel / self.model.voxel;
+        }
+        if self.densify.max_pixels > 0.0 {
+            self.densify.max_log_scaling = (self.densify.max_pixels * pixel).ln();
+        }
     }
 
     /// The settings as TOML, every key written out; [`Settings::resolve`] reads it back to the same value.

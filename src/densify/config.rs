@@ -22,7 +22,13 @@ pub struct Config {
     /// Grid levels, coarse to fine. Level i keeps a candidate with probability 1 - 0.5^(i + 1).
     pub levels: u32,
     /// Cell of the coarsest level, in voxels; each finer level divides it by 4 (16, 4, 1).
-    pub coarsest_cell: u32,
+    pub coarsest_cell: f64,
+    /// The same in pixels of the training pictures, at the median depth of the points; above 0 it takes the place of
+    /// `coarsest_cell`.
+    pub coarsest_pixels: f64,
+    /// Count a step for a Gaussian only where it has a gradient: what only few views train is judged by these views
+    /// (GScream: false).
+    pub count_touched: bool,
     /// A Gaussian grows only if it was drawn in more than this many steps since the last round.
     pub min_slot_visits: u32,
     /// An anchor is pruned only if it was seen in more than this many steps.
@@ -32,6 +38,9 @@ pub struct Config {
     /// Cap of the Gaussians' log-scales (the last three of an anchor's six; natural logarithm of scene units) after
     /// pruning. It suits scenes a few units wide; infinity leaves the scales alone.
     pub max_log_scaling: f64,
+    /// The same cap in pixels of the training pictures, at the median depth of the points; above 0 it takes the place of
+    /// `max_log_scaling`.
+    pub max_pixels: f64,
     /// Most anchors; growing stops there. 0 means no limit but memory.
     pub max_anchors: u32,
 }
@@ -46,11 +55,14 @@ impl Default for Config {
             statistics_from: 500,
             gradient_threshold: 0.0002,
             levels: 3,
-            coarsest_cell: 16,
+            coarsest_cell: 16.0,
+            coarsest_pixels: 0.0,
+            count_touched: true,
             min_slot_visits: 40,
             min_anchor_visits: 80,
             min_opacity: 0.005,
             max_log_scaling: 0.05,
+            max_pixels: 0.0,
             max_anchors: 0,
         }
     }
@@ -81,15 +93,11 @@ impl Config {
             "must be positive, at most 1e30",
         )?;
         ensure((1..=8).contains(&self.levels), "levels", self.levels, "must be between 1 and 8")?;
-        // A cell smaller than the voxel would let two anchors share one.
-        let finest = 4u32.pow(self.levels - 1);
-        ensure(
-            self.coarsest_cell >= finest,
-            "coarsest_cell",
-            self.coarsest_cell,
-            format_args!("must be at least 4^(levels - 1) = {finest}, so that the finest cell is not below a voxel"),
-        )
-        .map_err(|invalid| invalid.against("levels"))?;
+        let cell = self.coarsest_cell;
+        ensure(cell > 0.0 && cell <= 1e9, "coarsest_cell", cell, "must be positive, at most 1e9")?;
+        for (key, pixels) in [("coarsest_pixels", self.coarsest_pixels), ("max_pixels", self.max_pixels)] {
+            ensure((0.0..=1e6).contains(&pixels), key, pixels, "must be a number of pixels, or 0 for none")?;
+        }
         ensure((0.0..=1.0).contains(&self.min_opacity), "min_opacity", self.min_opacity, "must be between 0 and 1")?;
         ensure(
             self.max_log_scaling > f64::NEG_INFINITY,

@@ -231,7 +231,7 @@ struct Cells {
 
 /// Side of a level's cells, its inverse and its logarithm.
 fn sizes(config: &Config, voxel: f32, level: u32) -> (f32, f32, f32) {
-    let size = f64::from(voxel) * f64::from(config.coarsest_cell) / 4f64.powi(level as i32);
+    let size = f64::from(voxel) * config.coarsest_cell / 4f64.powi(level as i32);
     (size as f32, (1.0 / size) as f32, size.ln() as f32)
 }
 
@@ -759,7 +759,7 @@ mod tests {
     fn grow_plainly(model: &mut files::Anchors, gathered: &mut Gathered, config: &Config, round: Round) -> u32 {
         let (judged, offsets) = (model.position.len(), model.offsets_per_anchor);
         for level in 0..config.levels {
-            let size = f64::from(round.voxel) * f64::from(config.coarsest_cell) / 4f64.powi(level as i32);
+            let size = f64::from(round.voxel) * config.coarsest_cell / 4f64.powi(level as i32);
             let threshold = config.gradient_threshold * 2f64.powi(level as i32);
             // Anchors lie on voxels, which may be the boundaries of coarser cells: their cell is float32's choice.
             let near = |p: [f32; 3]| p.map(|x| (x * (1.0 / size) as f32).round_ties_even() as i64);
@@ -871,7 +871,7 @@ mod tests {
         };
         let mut gathered = Gathered::random(&mut rng, 200, 10);
         let round = Round { voxel: 1.0, seed: 8, step: 1600 };
-        let config = Config { levels: 1, coarsest_cell: 1, ..Config::default() };
+        let config = Config { levels: 1, coarsest_cell: 1.0, ..Config::default() };
         let mut anchors = Anchors::upload(&gpu, &model, 0).unwrap();
         let mut statistics = gathered.upload(&gpu, anchors.capacity, 10);
         let grown = run(&gpu, &mut anchors, &mut statistics, &config, round).unwrap();

@@ -21,7 +21,7 @@ impl Reference for statistics::Kernel {
                     let [x, y] =
                         std::array::from_fn(|i| f64::from(host.grad_mean[s][i]) * f64::from(push.half_size[i]));
                     host.gradient[at] = (f64::from(host.gradient[at]) + x.hypot(y)) as f32;
-                    host.seen[at] += 1;
+                    host.seen[at] += u32::from(push.touched == 0 || x != 0.0 || y != 0.0);
                 }
                 sum += f64::from(host.opacity[s]).max(0.0);
             }
@@ -43,6 +43,7 @@ pub struct Statistics {
     /// \[anchor\] steps in which it was in view.
     pub visits: Buffer<u32>,
     offsets: u32,
+    touched: bool,
     per_slot: Groups,
 }
 
@@ -67,7 +68,7 @@ pub struct Drawn<'a> {
 
 impl Statistics {
     /// Room for `capacity` anchors with `offsets` Gaussians each, uninitialised.
-    fn empty(gpu: &Gpu, capacity: u32, offsets: u32) -> Result<Self, Error> {
+    fn empty(gpu: &Gpu, capacity: u32, offsets: u32, touched: bool) -> Result<Self, Error> {
         let (anchors, slots) = (capacity as usize, capacity as usize * offsets as usize);
         Ok(Self {
             gradient: gpu.buffer("accumulated_gradient", slots)?,
@@ -75,16 +76,18 @@ impl Statistics {
             opacity_sum: gpu.buffer("opacity_sum", anchors)?,
             visits: gpu.buffer("visits", anchors)?,
             offsets,
+            touched,
             per_slot: dispatch::groups(gpu, "slots", 64)?,
         })
     }
 
-    /// Nothing gathered yet, with room for `capacity` anchors of `offsets` Gaussians each.
+    /// Nothing gathered yet, with room for `capacity` anchors of `offsets` Gaussians each. With `touched` a step counts for
+    /// a Gaussian only where it has a gradient.
     ///
     /// # Errors
     /// As [`Gpu::buffer`].
-    pub fn new(gpu: &Gpu, capacity: u32, offsets: u32) -> Result<Self, Error> {
-        let new = Self::empty(gpu, capacity, offsets)?;
+    pub fn new(gpu: &Gpu, capacity: u32, offsets: u32, touched: bool) -> Result<Self, Error> {
+        let new = Self::empty(gpu, capacity, offsets, touched)?;
         let mut rec = gpu.recorder()?;
         new.zero(&mut rec);
         rec.submit()?.wait()?;
@@ -135,7 +138,12 @@ impl Statistics {
             visits: &self.visits,
         };
         let half_size = drawn.size.map(|n| n as f32 / 2.0);
-        rec.run(statistics::Kernel, buffers, statistics::Push { half_size, offsets: self.offsets }, &self.per_slot);
+        rec.run(
+            statistics::Kernel,
+            buffers,
+            statistics::Push { half_size, offsets: self.offsets, touched: self.touched.into() },
+            &self.per_slot,
+        );
     }
 }
 
@@ -158,7 +166,11 @@ mod tests {
                 groups: vec![0, 0, 0, n as u32],
                 overflow: vec![overflow],
                 visible: (0..n as u32 + 4).map(|v| 2 * v).collect(),
-                grad_mean: (0..slots).map(|_| [rng.random_range(-1.0..1.0), rng.random_range(-1e-3..1e-3)]).collect(),
+                grad_mean: (0..slots)
+                    .map(|i| {
+                        if i % 3 == 0 { [0.0; 2] } else { [rng.random_range(-1.0..1.0), rng.random_range(-1e-3..1e-3)] }
+                    })
+                    .collect(),
                 tiles: (0..slots).map(|_| rng.random_range(0..3)).collect(),
                 opacity: (0..slots).map(|_| rng.random_range(-1.0..1.0)).collect(),
                 gradient: (0..anchors * offsets).map(|_| rng.random_range(0.0..900.0)).collect(),
@@ -166,8 +178,10 @@ mod tests {
                 opacity_sum: (0..anchors).map(|_| rng.random_range(0.0..100.0)).collect(),
                 visits: (0..anchors as u32).collect(),
             };
-            let push = statistics::Push { half_size: [504.0, 283.5], offsets: offsets as u32 };
-            testing::assert_twin(statistics::Kernel, &gpu, case, push, slots);
+            for touched in [0, 1] {
+                let push = statistics::Push { half_size: [504.0, 283.5], offsets: offsets as u32, touched };
+                testing::assert_twin(statistics::Kernel, &gpu, case.clone(), push, slots);
+            }
         }
     }
 }

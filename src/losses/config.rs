@@ -8,6 +8,9 @@ use crate::config::{Invalid, ensure};
 pub struct Config {
     /// Share of 1 - SSIM in the colour loss; the rest is L1 (3DGS: 0.2).
     pub ssim_weight: f64,
+    /// Let SSIM's windows beside the mask compare what other views show inside it, the object, as GScream's release does
+    /// by weighting the finished map; otherwise nothing inside their masks has a gradient.
+    pub ssim_across_masks: bool,
     /// Colour weight of the reference view's pixels inside the mask (GScream's release: 20). Outside the mask every
     /// view weighs 1; inside the mask other views weigh 0.
     pub reference_inside_weight: f64,
@@ -60,7 +63,7 @@ pub struct DepthGradient {
 
 impl Default for Config {
     fn default() -> Self {
-        Self { ssim_weight: 0.2, reference_inside_weight: 20.0, depth: Depth::default() }
+        Self { ssim_weight: 0.2, ssim_across_masks: false, reference_inside_weight: 20.0, depth: Depth::default() }
     }
 }
 

@@ -3,18 +3,26 @@
 use crate::gpu::kernels::losses::{frame, frame_masked, frame_masked_depth};
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 
-/// A word of a resident picture.
-pub fn pack([r, g, b]: [u8; 3], masked: bool) -> u32 {
-    u32::from_le_bytes([r, g, b, if masked { 255 } else { 0 }])
+/// A word of a resident picture. `mask` is 0 outside and up to 255 inside, see [`Weights`].
+pub fn pack([r, g, b]: [u8; 3], mask: u8) -> u32 {
+    u32::from_le_bytes([r, g, b, mask])
 }
 
-/// A weight outside the mask and one inside.
+/// At or below this a prior has no value at a pixel. Priors count in their own range, so that theirs are about 0 to 1.
+pub const NO_PRIOR: f32 = -1e4;
+
+/// A weight outside the mask and one inside; in proportion where the mask is between 0 and 255.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Weights {
     /// Of pixels outside the mask.
     pub outside: f32,
     /// Of pixels inside the mask.
     pub inside: f32,
+}
+
+/// The weight where the mask is `share` of 255.
+fn mix(outside: f32, inside: f32, share: f64) -> f32 {
+    (f64::from(outside) * (1.0 - share) + f64::from(inside) * share) as f32
 }
 
 /// A rectangle of pixels in which a weight is added.
@@ -35,14 +43,14 @@ fn target(picture: &[u32], target: &mut [[f32; 3]], pixels: u32) {
     }
 }
 
-fn choose(picture: &[u32], out: &mut [f32], pixels: u32, value: impl Fn(u32, bool) -> f32) {
+fn choose(picture: &[u32], out: &mut [f32], pixels: u32, value: impl Fn(usize, f64) -> f32) {
     for (pixel, (out, word)) in out.iter_mut().zip(picture).enumerate().take(pixels as usize) {
-        *out = value(pixel as u32, word >> 24 != 0);
+        *out = value(pixel, f64::from(word >> 24) / 255.0);
     }
 }
 
-/// One division; weights are copied or are one sum.
-const CHECK: Check = Check { relative: 3e-7, absolute: 0.0, band: 0.0 };
+/// A division, two products and two sums of positive terms.
+const CHECK: Check = Check { relative: 5e-7, absolute: 0.0, band: 0.0 };
 
 impl Reference for frame::Kernel {
     fn reference(host: frame::Host<'_>, push: frame::Push, (): ()) {
@@ -56,7 +64,7 @@ impl Reference for frame::Kernel {
 impl Reference for frame_masked::Kernel {
     fn reference(host: frame_masked::Host<'_>, push: frame_masked::Push, (): ()) {
         target(host.picture, host.target, push.pixels);
-        choose(host.picture, host.weight, push.pixels, |_, inside| if inside { push.inside } else { push.outside });
+        choose(host.picture, host.weight, push.pixels, |_, share| mix(push.outside, push.inside, share));
     }
     fn check(_binding: &'static str) -> Check {
         CHECK
@@ -66,12 +74,16 @@ impl Reference for frame_masked::Kernel {
 impl Reference for frame_masked_depth::Kernel {
     fn reference(host: frame_masked_depth::Host<'_>, push: frame_masked_depth::Push, (): ()) {
         target(host.picture, host.target, push.pixels);
-        choose(host.picture, host.weight, push.pixels, |_, inside| if inside { push.inside } else { push.outside });
-        choose(host.picture, host.valid, push.pixels, |_, inside| if inside { 0.0 } else { 1.0 });
-        choose(host.picture, host.depth_weight, push.pixels, |pixel, inside| {
-            let at = [pixel % push.width, pixel / push.width];
+        choose(host.picture, host.weight, push.pixels, |_, share| mix(push.outside, push.inside, share));
+        let has = |pixel: usize| host.prior[pixel] > NO_PRIOR;
+        choose(host.picture, host.given, push.pixels, |pixel, _| if has(pixel) { 1.0 } else { 0.0 });
+        let valid = |pixel, share| if has(pixel) && share == 0.0 { 1.0 } else { 0.0 };
+        choose(host.picture, host.valid, push.pixels, valid);
+        choose(host.picture, host.depth_weight, push.pixels, |pixel, share| {
+            let at = [pixel as u32 % push.width, pixel as u32 / push.width];
             let added = (0..2).all(|i| (push.low[i]..push.high[i]).contains(&at[i]));
-            (if inside { push.depth_inside } else { push.depth_outside }) + if added { push.depth_added } else { 0.0 }
+            let weight = mix(push.depth_outside, push.depth_inside, share) + if added { push.depth_added } else { 0.0 };
+            if has(pixel) { weight } else { 0.0 }
         });
     }
     fn check(_binding: &'static str) -> Check {
@@ -96,6 +108,7 @@ struct Masked {
 #[derive(Debug)]
 struct MaskedDepth {
     valid: Buffer<f32>,
+    given: Buffer<f32>,
     weight: Buffer<f32>,
 }
 
@@ -107,7 +120,11 @@ impl Frame {
     pub fn new(gpu: &Gpu, size: [u32; 2], masks: bool, depth: bool) -> Result<Self, Error> {
         let pixels = size[0] as usize * size[1] as usize;
         let masked_depth = || -> Result<MaskedDepth, Error> {
-            Ok(MaskedDepth { valid: gpu.buffer("valid", pixels)?, weight: gpu.buffer("depth_weight", pixels)? })
+            Ok(MaskedDepth {
+                valid: gpu.buffer("valid", pixels)?,
+                given: gpu.buffer("given", pixels)?,
+                weight: gpu.buffer("depth_weight", pixels)?,
+            })
         };
         let masked = || -> Result<Masked, Error> {
             Ok(Masked {
@@ -118,13 +135,14 @@ impl Frame {
         Ok(Self { size, target: gpu.buffer("target", pixels)?, masked: if masks { Some(masked()?) } else { None } })
     }
 
-    /// Records the expansion of `picture` \[pixel\], see [`pack`]. The depth's arrays are written with `depth` only.
+    /// Records the expansion of `picture` \[pixel\], see [`pack`]. The depth's arrays are written with `depth` only: the
+    /// weights of its L1 loss, where they are larger, and the prior \[pixel\].
     pub fn forward(
         &self,
         rec: &mut Recorder<'_>,
         picture: &Buffer<u32>,
         weights: Weights,
-        depth: Option<(Weights, Option<Rectangle>)>,
+        depth: Option<(Weights, Option<Rectangle>, &Buffer<f32>)>,
     ) {
         let Self { size: [width, height], target, masked } = self;
         let pixels = width * height;
@@ -132,7 +150,7 @@ impl Frame {
         let Some(Masked { weight, depth: arrays }) = masked else {
             return rec.run(frame::Kernel, frame::Buffers { picture, target }, frame::Push { pixels }, pixels);
         };
-        let (Some(arrays), Some((depth, rectangle))) = (arrays, depth) else {
+        let (Some(arrays), Some((depth, rectangle, prior))) = (arrays, depth) else {
             let buffers = frame_masked::Buffers { picture, target, weight };
             return rec.run(frame_masked::Kernel, buffers, frame_masked::Push { pixels, outside, inside }, pixels);
         };
@@ -148,8 +166,8 @@ impl Frame {
             low,
             high,
         };
-        let MaskedDepth { valid, weight: depth_weight } = arrays;
-        let buffers = frame_masked_depth::Buffers { picture, target, weight, valid, depth_weight };
+        let MaskedDepth { valid, given, weight: depth_weight } = arrays;
+        let buffers = frame_masked_depth::Buffers { picture, target, weight, valid, depth_weight, prior, given };
         rec.run(frame_masked_depth::Kernel, buffers, push, pixels);
     }
 
@@ -163,7 +181,12 @@ impl Frame {
         self.masked.as_ref().map(|m| &m.weight)
     }
 
-    /// 1 outside the mask, 0 inside \[pixel\], with masks and depth.
+    /// 1 where there is a prior, 0 elsewhere \[pixel\], with masks and depth.
+    pub fn given(&self) -> Option<&Buffer<f32>> {
+        self.masked.as_ref()?.depth.as_ref().map(|d| &d.given)
+    }
+
+    /// 1 outside the mask where there is a prior, 0 elsewhere \[pixel\], with masks and depth.
     pub fn valid(&self) -> Option<&Buffer<f32>> {
         self.masked.as_ref()?.depth.as_ref().map(|d| &d.valid)
     }
@@ -187,8 +210,9 @@ mod tests {
         for (width, pixels) in [(1, 0), (1, 1), (17, 17), (9, 63), (8, 64), (5, 65), (53, 53 * 37), (252, 252 * 142)] {
             // One pixel more than the picture has: left alone.
             let n = pixels as usize + 1;
-            let picture: Vec<u32> =
-                (0..n).map(|_| pack(std::array::from_fn(|_| rng.random()), rng.random::<f32>() < 0.3)).collect();
+            let picture: Vec<u32> = (0..n)
+                .map(|_| pack(std::array::from_fn(|_| rng.random()), [0, 255, 0, 7, 200][rng.random_range(0..5)]))
+                .collect();
             let target = vec![[UNWRITTEN; 3]; n];
             let unwritten = vec![UNWRITTEN; n];
             let case = frame::Arrays { picture: picture.clone(), target: target.clone() };
@@ -202,7 +226,9 @@ mod tests {
                 target,
                 weight: unwritten.clone(),
                 valid: unwritten.clone(),
+                given: unwritten.clone(),
                 depth_weight: unwritten,
+                prior: (0..n).map(|_| if rng.random::<f32>() < 0.2 { NO_PRIOR } else { rng.random() }).collect(),
             };
             let push = frame_masked_depth::Push {
                 pixels,
@@ -223,12 +249,12 @@ mod tests {
     fn every_byte_comes_back() {
         let gpu = testing::gpu();
         let bytes: Vec<u8> = (0..=255).collect();
-        let picture = bytes.iter().map(|&v| pack([v, 255 - v, v ^ 0x55], v % 2 == 0)).collect();
+        let picture = bytes.iter().map(|&v| pack([v, 255 - v, v ^ 0x55], 255 * (v % 2))).collect();
         let case = frame::Arrays { picture, target: vec![[UNWRITTEN; 3]; 256] };
         let got = testing::run_once::<frame::Kernel>(&gpu, &case, frame::Push { pixels: 256 }, 256u32).target;
         for (v, got) in bytes.iter().zip(got) {
             assert_eq!(got.map(|c| (c * 255.0).round() as u8), [*v, 255 - v, v ^ 0x55]);
         }
-        assert_eq!(pack([0, 0, 255], true), 0xFFFF_0000);
+        assert_eq!(pack([0, 0, 255], 255), 0xFFFF_0000);
     }
 }

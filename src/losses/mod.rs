@@ -17,7 +17,7 @@ use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::stage;
 
 pub use align::Quantity;
-pub use frame::{Rectangle, Weights, pack};
+pub use frame::{NO_PRIOR, Rectangle, Weights, pack};
 
 /// The terms of the loss, by their place in [`Losses::terms`]. Their sum is what a step minimises: each carries its weight.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -51,8 +51,10 @@ pub struct Plan {
     pub size: [u32; 2],
     /// Share of 1 - SSIM in the photometric loss, the rest is L1.
     pub ssim_weight: f32,
-    /// Whether any view has a mask.
+    /// Whether pixels have weights: a view has a mask, or a prior that is not everywhere.
     pub masks: bool,
+    /// Whether SSIM's windows compare what lies inside the masks of views whose weight there is 0.
+    pub ssim_across_masks: bool,
     /// Whether any view has a depth prior.
     pub depth: bool,
     /// Scales of the depth gradient, 1 to 8; 0 without that loss.
@@ -85,6 +87,8 @@ pub struct DepthView<'a> {
     pub gradient: f32,
     /// Whether the depth gradient looks inside the mask too.
     pub gradient_inside: bool,
+    /// Whether the prior lacks pixels ([`NO_PRIOR`]); with masks only.
+    pub gaps: bool,
 }
 
 /// Gradients of all losses by what was rendered.
@@ -131,7 +135,7 @@ impl Losses {
         gpu.stage(stage::PHOTOMETRIC, || {
             Ok(Self {
                 frame: frame::Frame::new(gpu, size, masks, plan.depth)?,
-                photometric: photometric::Photometric::new(gpu, size, plan.ssim_weight)?,
+                photometric: photometric::Photometric::new(gpu, size, plan.ssim_weight, plan.ssim_across_masks)?,
                 depth: if plan.depth { Some(gpu.stage(stage::DEPTH, depth)?) } else { None },
                 terms: gpu.buffer("losses", Term::ALL.len())?,
             })
@@ -149,7 +153,7 @@ impl Losses {
         depth: Option<&Buffer<f32>>,
     ) -> Gradients<'_> {
         rec.stage(stage::PHOTOMETRIC);
-        self.frame.forward(rec, view.picture, view.weights, view.depth.map(|d| (d.weights, d.rectangle)));
+        self.frame.forward(rec, view.picture, view.weights, view.depth.map(|d| (d.weights, d.rectangle, d.prior)));
         self.compare(rec, view.depth, rgb, depth)
     }
 
@@ -181,7 +185,7 @@ impl Losses {
             let slot = Term::DepthL1 as u32;
             let (difference, grad_aligned) = l1.forward_backward(rec, depth, prior, fit, weight, terms, slot);
             if let Some(gradient) = gradient.as_ref().filter(|_| view.gradient != 0.0) {
-                let valid = frame.valid().filter(|_| !view.gradient_inside);
+                let valid = if view.gradient_inside { frame.given().filter(|_| view.gaps) } else { frame.valid() };
                 let slot = Term::DepthGradient as u32;
                 rec.stage(stage::DEPTH_GRADIENT);
                 gradient.forward_backward(rec, difference, grad_aligned, valid, view.gradient, terms, slot);

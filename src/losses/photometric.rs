@@ -7,7 +7,8 @@ use crate::gpu::kernels::losses::{
     photometric_adjoint as adjoint, photometric_columns as columns, photometric_columns_weighted as columns_weighted,
     photometric_gradient as gradient, photometric_gradient_l1 as gradient_l1,
     photometric_gradient_l1_weighted as gradient_l1_weighted, photometric_gradient_weighted as gradient_weighted,
-    photometric_rows as rows,
+    photometric_gradient_weighted_outside as gradient_outside, photometric_rows as rows,
+    photometric_rows_outside as rows_outside,
 };
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::math::ssim;
@@ -17,29 +18,52 @@ use super::sum;
 /// Pixels that a thread makes along the blur's direction; RUN in the kernels.
 const RUN: usize = 8;
 
-impl Reference for rows::Kernel {
-    fn reference(host: rows::Host<'_>, push: rows::Push, (): ()) {
-        let [width, height] = push.size.map(|v| v as usize);
-        for y in 0..height {
-            for x in 0..width {
-                for c in 0..3 {
-                    let a = |x: usize| f64::from(host.rendered[y * width + x][c]);
-                    let b = |x: usize| f64::from(host.target[y * width + x][c]);
-                    let blur = |value: &dyn Fn(usize) -> f64| ssim::blur(x, width, value);
-                    let e = |x| a(x) - b(x);
-                    let (ma, mb, me) = (blur(&a), blur(&b), blur(&e));
-                    let sum = blur(&|x| a(x) * a(x) + b(x) * b(x)) - ma * ma - mb * mb;
-                    let variance = blur(&|x| e(x) * e(x)) - me * me;
-                    let moments = [ma, me, sum.max(0.0), variance.max(0.0)];
-                    host.moments[(y * width + x) * 3 + c] = moments.map(|v| v as f32);
-                }
+/// With `weight` both pictures agree where it is 0.
+fn rows_reference(
+    [rendered, target]: [&[[f32; 3]]; 2],
+    weight: Option<&[f32]>,
+    moments: &mut [[f32; 4]],
+    push: rows::Push,
+) {
+    let [width, height] = push.size.map(|v| v as usize);
+    for y in 0..height {
+        for x in 0..width {
+            for c in 0..3 {
+                let a = |x: usize| f64::from(rendered[y * width + x][c]);
+                let b = |x: usize| match weight {
+                    Some(weight) if weight[y * width + x] == 0.0 => a(x),
+                    _ => f64::from(target[y * width + x][c]),
+                };
+                let blur = |value: &dyn Fn(usize) -> f64| ssim::blur(x, width, value);
+                let e = |x| a(x) - b(x);
+                let (ma, mb, me) = (blur(&a), blur(&b), blur(&e));
+                let sum = blur(&|x| a(x) * a(x) + b(x) * b(x)) - ma * ma - mb * mb;
+                let variance = blur(&|x| e(x) * e(x)) - me * me;
+                moments[(y * width + x) * 3 + c] = [ma, me, sum.max(0.0), variance.max(0.0)].map(|v| v as f32);
             }
         }
     }
+}
 
+/// At most 18 roundings of 6e-8 each of terms no larger than the squared contrast of the run's surroundings.
+const ROWS: Check = Check { relative: 1e-5, absolute: 2e-6, band: 0.0 };
+
+impl Reference for rows::Kernel {
+    fn reference(host: rows::Host<'_>, push: rows::Push, (): ()) {
+        rows_reference([host.rendered, host.target], None, host.moments, push);
+    }
     fn check(_binding: &'static str) -> Check {
-        // At most 18 roundings of 6e-8 each of terms no larger than the squared contrast of the run's surroundings.
-        Check { relative: 1e-5, absolute: 2e-6, band: 0.0 }
+        ROWS
+    }
+}
+
+impl Reference for rows_outside::Kernel {
+    fn reference(host: rows_outside::Host<'_>, push: rows_outside::Push, (): ()) {
+        let push = bytemuck::cast(push);
+        rows_reference([host.rendered, host.target], Some(host.weight), host.moments, push);
+    }
+    fn check(_binding: &'static str) -> Check {
+        ROWS
     }
 }
 
@@ -125,6 +149,8 @@ struct Pictures<'a> {
     rendered: &'a [[f32; 3]],
     target: &'a [[f32; 3]],
     weight: Option<&'a [f32]>,
+    /// No gradient where the weight is 0.
+    outside: bool,
 }
 
 fn gradient_reference(from: &Pictures<'_>, grad_rendered: &mut [[f32; 3]], partial: &mut [f32], push: gradient::Push) {
@@ -142,6 +168,10 @@ fn gradient_reference(from: &Pictures<'_>, grad_rendered: &mut [[f32; 3]], parti
                 });
                 losses[(y / RUN * width + x) / 64] += scale * (a - b).abs();
                 let sign = if a == b { 0.0 } else { (a - b).signum() };
+                if from.outside && scale == 0.0 {
+                    *grad = 0.0;
+                    continue;
+                }
                 let value = s[0] + 2.0 * ((a - 0.5) * s[1] + (a - b) * s[2]) + scale * sign;
                 *grad = value as f32;
             }
@@ -163,8 +193,13 @@ fn gradient_check(binding: &str) -> Check {
 
 impl Reference for gradient::Kernel {
     fn reference(host: gradient::Host<'_>, push: gradient::Push, (): ()) {
-        let from =
-            Pictures { grad_rows: Some(host.grad_rows), rendered: host.rendered, target: host.target, weight: None };
+        let from = Pictures {
+            grad_rows: Some(host.grad_rows),
+            rendered: host.rendered,
+            target: host.target,
+            weight: None,
+            outside: false,
+        };
         gradient_reference(&from, host.grad_rendered, host.partial, push);
     }
     fn check(binding: &'static str) -> Check {
@@ -175,7 +210,24 @@ impl Reference for gradient::Kernel {
 impl Reference for gradient_weighted::Kernel {
     fn reference(host: gradient_weighted::Host<'_>, push: gradient_weighted::Push, (): ()) {
         let weight = Some(host.weight);
-        let from = Pictures { grad_rows: Some(host.grad_rows), rendered: host.rendered, target: host.target, weight };
+        let from = Pictures {
+            grad_rows: Some(host.grad_rows),
+            rendered: host.rendered,
+            target: host.target,
+            weight,
+            outside: false,
+        };
+        gradient_reference(&from, host.grad_rendered, host.partial, bytemuck::cast(push));
+    }
+    fn check(binding: &'static str) -> Check {
+        gradient_check(binding)
+    }
+}
+
+impl Reference for gradient_outside::Kernel {
+    fn reference(host: gradient_outside::Host<'_>, push: gradient_outside::Push, (): ()) {
+        let (grad_rows, weight) = (Some(host.grad_rows), Some(host.weight));
+        let from = Pictures { grad_rows, rendered: host.rendered, target: host.target, weight, outside: true };
         gradient_reference(&from, host.grad_rendered, host.partial, bytemuck::cast(push));
     }
     fn check(binding: &'static str) -> Check {
@@ -185,7 +237,8 @@ impl Reference for gradient_weighted::Kernel {
 
 impl Reference for gradient_l1::Kernel {
     fn reference(host: gradient_l1::Host<'_>, push: gradient_l1::Push, (): ()) {
-        let from = Pictures { grad_rows: None, rendered: host.rendered, target: host.target, weight: None };
+        let from =
+            Pictures { grad_rows: None, rendered: host.rendered, target: host.target, weight: None, outside: false };
         gradient_reference(&from, host.grad_rendered, host.partial, bytemuck::cast(push));
     }
     fn check(binding: &'static str) -> Check {
@@ -196,7 +249,7 @@ impl Reference for gradient_l1::Kernel {
 impl Reference for gradient_l1_weighted::Kernel {
     fn reference(host: gradient_l1_weighted::Host<'_>, push: gradient_l1_weighted::Push, (): ()) {
         let weight = Some(host.weight);
-        let from = Pictures { grad_rows: None, rendered: host.rendered, target: host.target, weight };
+        let from = Pictures { grad_rows: None, rendered: host.rendered, target: host.target, weight, outside: false };
         gradient_reference(&from, host.grad_rendered, host.partial, bytemuck::cast(push));
     }
     fn check(binding: &'static str) -> Check {
@@ -225,6 +278,7 @@ fn column_groups(size: [u32; 2]) -> [usize; 2] {
 pub struct Photometric {
     size: [u32; 2],
     ssim_weight: f32,
+    across: bool,
     ssim: Option<Ssim>,
     grad_rendered: Buffer<[f32; 3]>,
     partial: Buffer<f32>,
@@ -241,9 +295,13 @@ impl Photometric {
     /// For pictures of `size` = width, height. `ssim_weight` is the share of 1 - SSIM, the rest is L1; at 0 there is
     /// nothing for SSIM.
     ///
+    /// Pixels of weight 0 have no term of their own, but windows of others reach them. With `across` the windows compare
+    /// both pictures there (GScream's release weights the finished map of SSIM). Without, the pictures count as equal there,
+    /// and the pixel has no gradient.
+    ///
     /// # Errors
     /// As [`Gpu::buffer`].
-    pub fn new(gpu: &Gpu, size: [u32; 2], ssim_weight: f32) -> Result<Self, Error> {
+    pub fn new(gpu: &Gpu, size: [u32; 2], ssim_weight: f32, across: bool) -> Result<Self, Error> {
         let pixels = size[0] as usize * size[1] as usize;
         let ssim = || -> Result<Ssim, Error> {
             Ok(Ssim {
@@ -255,6 +313,7 @@ impl Photometric {
         Ok(Self {
             size,
             ssim_weight,
+            across,
             ssim: if ssim_weight > 0.0 { Some(ssim()?) } else { None },
             grad_rendered: gpu.buffer("grad_rgb", pixels)?,
             partial: gpu.buffer("photometric_partial", column_groups(size).iter().sum())?,
@@ -297,7 +356,14 @@ impl Photometric {
             sum::record(rec, partial, last, 1, losses, slot);
             return grad_rendered;
         };
-        rec.run(rows::Kernel, rows::Buffers { rendered, target, moments }, rows::Push { size }, across);
+        let outside = weight.filter(|_| !self.across);
+        match outside {
+            None => rec.run(rows::Kernel, rows::Buffers { rendered, target, moments }, rows::Push { size }, across),
+            Some(weight) => {
+                let buffers = rows_outside::Buffers { rendered, target, moments, weight };
+                rec.run(rows_outside::Kernel, buffers, rows_outside::Push { size }, across);
+            }
+        }
         match weight {
             None => {
                 let push = columns::Push { size, factor: of_ssim };
@@ -315,6 +381,11 @@ impl Photometric {
                 let push = gradient::Push { size, factor: of_l1, first };
                 let buffers = gradient::Buffers { grad_rows, rendered, target, grad_rendered, partial };
                 rec.run(gradient::Kernel, buffers, push, down);
+            }
+            Some(weight) if outside.is_some() => {
+                let push = gradient_outside::Push { size, factor: of_l1, first };
+                let buffers = gradient_outside::Buffers { grad_rows, rendered, target, grad_rendered, partial, weight };
+                rec.run(gradient_outside::Kernel, buffers, push, down);
             }
             Some(weight) => {
                 let push = gradient_weighted::Push { size, factor: of_l1, first };
@@ -456,7 +527,7 @@ mod tests {
         target: &[[f32; 3]],
         weight: Option<&[f32]>,
     ) -> (f32, Vec<f32>) {
-        let stage = Photometric::new(gpu, size, 0.2).expect("buffers");
+        let stage = Photometric::new(gpu, size, 0.2, true).expect("buffers");
         let rendered = gpu.upload("rgb", rendered).expect("upload");
         let target = gpu.upload("target", target).expect("upload");
         let weight = weight.map(|w| gpu.upload("weight", w).expect("upload"));

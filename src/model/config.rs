@@ -11,6 +11,9 @@ pub struct Config {
     /// Edge of the grid to which points are snapped to become anchors, in scene units (Scaffold-GS: 0.001 in general,
     /// GScream: 0.005 for SPIn-NeRF scenes). Zero or less means the median nearest-neighbour distance of the points.
     pub voxel: f64,
+    /// Edge in pixels of the training pictures at the median depth of the points, where `voxel` is 0; 0 derives it from
+    /// the points' spacing.
+    pub voxel_pixels: f64,
     /// Multiplies a voxel that is derived from the points: above 1 for fewer anchors.
     pub voxel_factor: f64,
     /// Gaussians per anchor (Scaffold-GS: 10).
@@ -42,7 +45,7 @@ pub struct Attention {
 
 impl Default for Config {
     fn default() -> Self {
-        Self { voxel: 0.001, voxel_factor: 1.0, offsets: 10, attention: Attention::default() }
+        Self { voxel: 0.001, voxel_pixels: 0.0, voxel_factor: 1.0, offsets: 10, attention: Attention::default() }
     }
 }
 
@@ -56,6 +59,8 @@ impl Config {
     /// Refuses values that no run could use.
     pub fn validate(&self) -> Result<(), Invalid> {
         ensure(self.voxel.is_finite(), "voxel", self.voxel, "must be finite (0 derives it from the points)")?;
+        let pixels = self.voxel_pixels;
+        ensure((0.0..=1e6).contains(&pixels), "voxel_pixels", pixels, "must be a number of pixels, or 0")?;
         let factor = self.voxel_factor;
         ensure(factor.is_finite() && factor > 0.0, "voxel_factor", factor, "must be positive")?;
         ensure((1..=32).contains(&self.offsets), "offsets", self.offsets, "must be between 1 and 32")?;

@@ -163,6 +163,27 @@ pub fn weight_shapes(offsets_per_anchor: usize, attention: bool) -> Vec<(String,
     shapes
 }
 
+/// Counts the model's lengths in units of which `unit` make one of those they are counted in now, and leaves what it
+/// shows as it is: positions and scales are multiplied, and what the decoders make of a distance is divided. Offsets are
+/// in units of the scales.
+pub fn rescale(anchors: &mut Anchors, weights: &mut Weights, unit: f64) {
+    if unit == 1.0 {
+        return;
+    }
+    let scaled = |x: f32| (f64::from(x) * unit) as f32;
+    anchors.position.iter_mut().for_each(|p| *p = p.map(scaled));
+    let log = unit.ln();
+    anchors.log_scaling.iter_mut().flatten().for_each(|s| *s = (f64::from(*s) + log) as f32);
+    for head in ["opacity", "cov", "color"] {
+        let Some(first) = weights.tensors.get_mut(&format!("mlp_{head}.0.weight")) else { continue };
+        for row in first.data.chunks_exact_mut(DECODER_INPUTS) {
+            if let Some(distance) = row.last_mut() {
+                *distance = (f64::from(*distance) / unit) as f32;
+            }
+        }
+    }
+}
+
 /// Why a model cannot be saved or loaded.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {

@@ -19,6 +19,7 @@
 
 mod camera;
 pub mod colmap;
+mod condition;
 mod layout;
 pub mod path;
 mod priors;
@@ -32,10 +33,13 @@ use image::{DynamicImage, GrayImage, RgbImage};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use crate::config::{Invalid, ensure};
+
 pub use camera::{Camera, distort, undistort};
+pub use condition::{condition, footprint};
 
 /// How a scene is read.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default, expecting = "a table")]
 pub struct Config {
     /// Train at 1 / `downscale` of the pictures' size, each side rounded to the nearest pixel. At least 1.
@@ -53,6 +57,49 @@ pub struct Config {
     pub priors: bool,
     /// Use the inpainted reference view.
     pub reference: bool,
+    /// Length of the model's that counts as one wherever a setting means a length; 0 takes a third of the median depth of
+    /// the points, so that the unit of the capture changes nothing (GScream: 1).
+    pub unit: f64,
+    /// Leave out points that fall into the mask in more than this share of the views that have them in the picture: they
+    /// stand on the object. 1 keeps all (GScream).
+    pub object_point_share: f64,
+    /// Hold each prior against the points of the model: one that does not follow them is not used, and disparity is
+    /// turned into depth.
+    pub check_priors: bool,
+    /// Guess the depth of a reference picture without prior from the points around its hole.
+    pub guess_reference_prior: bool,
+    /// Add points in the hole, at the depth of the reference's prior.
+    pub seed_hole: bool,
+    /// Let the train masks fall off over so many pixels around the object, at the training size: its antialiased edge and
+    /// shadow reach beyond the mask. 0: masks are hard (GScream).
+    pub rim: u32,
+    /// Use the inpainted picture outside its hole too (GScream), instead of the photograph.
+    pub whole_reference: bool,
+    /// So many other views that see a part of the hole past the object outrank the painted picture there, fewer in
+    /// proportion; 0: the painted picture counts everywhere alike (GScream).
+    pub outrank_guess: u32,
+}
+
+impl Config {
+    /// Refuses values that no scene could be read with.
+    pub fn validate(&self) -> Result<(), Invalid> {
+        ensure(self.downscale > 0, "downscale", self.downscale, "must be at least 1")?;
+        let unit = self.unit;
+        ensure(
+            unit == 0.0 || (1e-30..=1e30).contains(&unit),
+            "unit",
+            unit,
+            "must be a positive length, or 0 to find it",
+        )?;
+        let share = self.object_point_share;
+        ensure(
+            (0.0..=1.0).contains(&share),
+            "object_point_share",
+            share,
+            "must be between 0 and 1 (1 keeps all points)",
+        )?;
+        ensure(self.rim <= 64, "rim", self.rim, "must be at most 64 pixels")
+    }
 }
 
 impl Default for Config {
@@ -65,6 +112,14 @@ impl Default for Config {
             masks: true,
             priors: true,
             reference: true,
+            unit: 0.0,
+            object_point_share: 0.9,
+            check_priors: true,
+            guess_reference_prior: true,
+            seed_hole: true,
+            rim: 1,
+            whole_reference: false,
+            outrank_guess: 5,
         }
     }
 }
@@ -106,8 +161,38 @@ impl PriorKind {
 pub struct Prior {
     /// Depth or disparity.
     pub kind: PriorKind,
-    /// [row-major pixel], height x width of its view, finite.
+    /// [row-major pixel], height x width of its view; NaN where there is none.
     pub values: Vec<f32>,
+}
+
+impl Prior {
+    /// Whether some pixels have no value.
+    pub fn has_gaps(&self) -> bool {
+        self.values.iter().any(|v| v.is_nan())
+    }
+
+    /// The values in the prior's own range, from the 2nd to the 98th hundredth of them, NaN where there is none: about 0 to
+    /// 1, whatever its unit. The depth losses' weights mean that range; it is the unit of the priors that GScream's weights
+    /// were chosen for, and of no other.
+    pub fn in_own_range(&self) -> Vec<f32> {
+        let mut sorted: Vec<f32> = self.values.iter().copied().filter(|v| v.is_finite()).collect();
+        if sorted.is_empty() {
+            return self.values.clone();
+        }
+        sorted.sort_unstable_by(f32::total_cmp);
+        let at = |share: f64| f64::from(sorted[((sorted.len() - 1) as f64 * share).round() as usize]);
+        let range = |low: f64, high: f64| (high > low).then_some((low, high - low));
+        // A map that is flat but for a few pixels still has a range.
+        let (low, width) = range(at(0.02), at(0.98)).or_else(|| range(at(0.0), at(1.0))).unwrap_or((at(0.0), 1.0));
+        self.values.iter().map(|v| ((f64::from(*v) - low) / width) as f32).collect()
+    }
+
+    /// Whether it has one value only, or none.
+    fn is_flat(&self) -> bool {
+        let mut values = self.values.iter().filter(|v| v.is_finite());
+        let first = values.next();
+        values.all(|v| Some(v) == first)
+    }
 }
 
 /// A photograph at the training resolution and what is known about it.
@@ -119,7 +204,8 @@ pub struct View {
     pub camera: Camera,
     /// Stored values, 8 bits per channel.
     pub image: RgbImage,
-    /// 255 on the object, 0 elsewhere, as large as `image`. Empty masks are allowed: the object is out of view.
+    /// 255 on the object, 0 elsewhere, as large as `image`. Empty masks are allowed: the object is out of view. After
+    /// [`condition`] it falls off around the object, and on the reference view is lower where other views see the hole.
     pub mask: Option<GrayImage>,
     /// Prior of `image`; never there for test views.
     pub prior: Option<Prior>,
@@ -158,6 +244,8 @@ pub struct Scene {
     pub points: Vec<Point>,
     /// 1.1 x the largest distance of a train camera from the mean train camera, world units; 1 if that is zero.
     pub radius: f32,
+    /// Lengths of the model's per world unit of this scene: 1 as read, see [`condition`].
+    pub unit: f64,
     /// One line each: the layout found, scales worked out, what is absent and what follows.
     pub notes: Vec<String>,
 }
@@ -240,8 +328,11 @@ pub enum Error {
         path.display(), size[0], size[1], picture[0], picture[1]
     )]
     PriorSize { path: PathBuf, size: [u32; 2], picture: [u32; 2] },
-    /// NaN or infinity in a prior.
-    #[error("{}: the value at row {row}, column {column} is {value}; a prior must be finite everywhere", path.display())]
+    /// Infinity in a prior.
+    #[error(
+        "{}: the value at row {row}, column {column} is {value}; write NaN where there is no prior",
+        path.display()
+    )]
     NotFinite { path: PathBuf, value: f32, row: usize, column: usize },
 }
 
@@ -369,9 +460,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
             "{stretched} test masks are not as tall as their pictures and are resampled, as SPIn-NeRF's data needs it"
         ));
     }
-    let flat = loaded_train
-        .iter()
-        .filter(|l| l.view.prior.as_ref().is_some_and(|p| p.values.iter().all(|v| *v == p.values[0])));
+    let flat = loaded_train.iter().filter(|l| l.view.prior.as_ref().is_some_and(Prior::is_flat));
     if let Some(first) = flat.clone().next() {
         notes.push(format!(
             "{} priors hold one value only, so no depth can be fitted to them (first: {})",
@@ -400,7 +489,21 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     if radius.is_none() {
         notes.push("all train cameras stand at one place: the scene radius is taken as 1".into());
     }
-    Ok(Scene { train, test, reference, points: model.points, radius: radius.unwrap_or(1.0), notes })
+    Ok(Scene { train, test, reference, points: model.points, radius: radius.unwrap_or(1.0), unit: 1.0, notes })
+}
+
+impl Scene {
+    /// Counts all lengths in units of `unit` of those they are counted in now.
+    fn rescale(&mut self, unit: f64) {
+        for view in self.train.iter_mut().chain(&mut self.test) {
+            view.camera.translation = view.camera.translation.map(|t| t / unit);
+        }
+        for point in &mut self.points {
+            point.position = point.position.map(|x| (f64::from(x) / unit) as f32);
+        }
+        self.radius = (f64::from(self.radius) / unit) as f32;
+        self.unit *= unit;
+    }
 }
 
 /// 1.1 x the largest distance of a camera from the mean camera; `None` if they all coincide.
@@ -681,9 +784,11 @@ fn read_reference(
         Some(layout::ReferencePrior { path, kind: None }) => {
             let assumed = kind.unwrap_or(PriorKind::Depth);
             let mut prior = priors::read(path, assumed, picture, size)?;
-            let outside = |i: usize| mask.as_raw()[i] == 0;
             let own = view.prior.as_ref();
-            let correlation = own.and_then(|own| priors::rank_correlation(&prior.values, &own.values, outside));
+            let correlation = own.and_then(|own| {
+                let both = |i: usize| mask.as_raw()[i] == 0 && prior.values[i].is_finite() && own.values[i].is_finite();
+                priors::rank_correlation(&prior.values, &own.values, both)
+            });
             let file = layout::relative(dir, path);
             match (own, correlation) {
                 (Some(own), Some(r)) if r.abs() >= RELATED => {

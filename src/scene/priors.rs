@@ -21,10 +21,10 @@ struct Map {
 ///
 /// Priors often come at a depth network's resolution: any size is accepted whose proportions are those of the picture
 /// within 1 %, and resampled by area (shrinking) or linearly (growing). 8- and 16-bit PNG is scaled to [0, 1]; NumPy and
-/// OpenEXR values are taken as they are.
+/// OpenEXR values are taken as they are; NaN means that there is no prior at that pixel.
 ///
 /// # Errors
-/// Unreadable files, NaN or infinite values, other proportions than the picture's.
+/// Unreadable files, infinite values, other proportions than the picture's.
 pub(super) fn read(path: &Path, kind: PriorKind, picture: [u32; 2], size: [u32; 2]) -> Result<Prior, Error> {
     let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
     let map = match extension.as_str() {
@@ -32,7 +32,7 @@ pub(super) fn read(path: &Path, kind: PriorKind, picture: [u32; 2], size: [u32; 
         "exr" => exr(path),
         _ => png(path),
     }?;
-    if let Some(at) = map.values.iter().position(|v| !v.is_finite()) {
+    if let Some(at) = map.values.iter().position(|v| v.is_infinite()) {
         let (row, column) = (at / map.size[0] as usize, at % map.size[0] as usize);
         return Err(Error::NotFinite { path: path.to_path_buf(), value: map.values[at], row, column });
     }

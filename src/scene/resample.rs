@@ -91,23 +91,28 @@ pub fn photograph(image: &RgbImage, to: [u32; 2]) -> RgbImage {
     RgbImage::from_raw(to[0], to[1], bytes).expect("three bytes per output pixel were written")
 }
 
-/// A float map at another size: area average when shrinking, linear when growing, per axis.
+/// A float map at another size: area average when shrinking, linear when growing, per axis. NaN counts for nothing; it
+/// stays where less than half of what a pixel covers has a value.
 pub fn map(values: &[f32], from: [u32; 2], to: [u32; 2]) -> Vec<f32> {
     if from == to {
         return values.to_vec();
     }
     let w = from[0] as usize;
-    separable::<1>(
-        |y, line| line.iter_mut().zip(&values[y * w..(y + 1) * w]).for_each(|(l, v)| *l = f64::from(*v)),
-        from.map(|v| v as usize),
-        to.map(|v| v as usize),
-    )
-    .iter()
-    .map(|v| v[0] as f32)
-    .collect()
+    let line = |y: usize, line: &mut [f64]| {
+        for (l, v) in line.chunks_exact_mut(2).zip(&values[y * w..(y + 1) * w]) {
+            l.copy_from_slice(&if v.is_nan() { [0.0, 0.0] } else { [f64::from(*v), 1.0] });
+        }
+    };
+    let mean = |[sum, share]: &[f64; 2]| {
+        // Shares of 1 add up to 1 but for their rounding, which the division must not bring into whole maps.
+        let share = if (share - 1.0).abs() < 1e-9 { 1.0 } else { *share };
+        if share < 0.5 { f32::NAN } else { (sum / share) as f32 }
+    };
+    separable::<2>(line, from.map(|v| v as usize), to.map(|v| v as usize)).iter().map(mean).collect()
 }
 
-/// A mask at a smaller size: a pixel is object (255) if any input pixel it covers, even in part, is not 0.
+/// A mask at a smaller size: a pixel has the largest value of the input pixels it covers, even in part: it is object (255)
+/// if any of them is.
 pub fn mask(mask: &GrayImage, to: [u32; 2]) -> GrayImage {
     let (w, h) = mask.dimensions();
     let covered = |i: u32, from: u32, to: u32| -> Range<u32> {
@@ -115,8 +120,8 @@ pub fn mask(mask: &GrayImage, to: [u32; 2]) -> GrayImage {
         (low / u64::from(to)) as u32..high.div_ceil(u64::from(to)) as u32
     };
     GrayImage::from_fn(to[0], to[1], |x, y| {
-        let hit = covered(y, h, to[1]).any(|v| covered(x, w, to[0]).any(|u| mask.get_pixel(u, v).0[0] != 0));
-        image::Luma([if hit { 255 } else { 0 }])
+        let row = |v| covered(x, w, to[0]).map(|u| mask.get_pixel(u, v).0[0]).max().unwrap_or(0);
+        image::Luma([covered(y, h, to[1]).map(row).max().unwrap_or(0)])
     })
 }
 

@@ -181,7 +181,8 @@ impl Model {
             step.attention_weights = None;
         }
         if self.arrays.contains_key("visits") {
-            step.statistics = Some(Statistics::new(gpu, step.anchors.capacity, self.offsets)?);
+            step.statistics =
+                Some(Statistics::new(gpu, step.anchors.capacity, self.offsets, settings.densify.count_touched)?);
         }
         for (buffer, _) in floats(&step) {
             gpu.write(&buffer, self.float(buffer.name()))?;

@@ -12,6 +12,9 @@ pub struct Config {
     pub seed: u64,
     /// How the next view is drawn.
     pub view_order: ViewOrder,
+    /// Share of the steps that see the reference view, evenly spread; 0 visits it as often as any other view (GScream).
+    /// What only it shows is trained in its steps alone.
+    pub reference_share: f64,
     /// Colour behind the scene, RGB in \[0, 1\] (GScream: black).
     pub background: [f64; 3],
     /// Steps between two lines of the JSON log.
@@ -70,6 +73,7 @@ impl Default for Config {
             iterations: 30_000,
             seed: 0,
             view_order: ViewOrder::Shuffled,
+            reference_share: 0.18,
             background: [0.0; 3],
             log_interval: 100,
             eval_interval: 5_000,
@@ -97,6 +101,8 @@ impl Config {
             format_args!("{:?}", self.background),
             "must be three numbers between 0 and 1",
         )?;
+        let share = self.reference_share;
+        ensure((0.0..=0.9).contains(&share), "reference_share", share, "must be between 0 and 0.9")?;
         ensure(self.log_interval > 0, "log_interval", self.log_interval, "must be at least 1")?;
         let factor = self.coarse.factor;
         ensure((2..=16).contains(&factor), "coarse.factor", factor, "must be between 2 and 16")

@@ -126,7 +126,7 @@ pub fn expected_anchors(gpu: &Gpu, plan: &Plan, settings: &Settings, initial: &I
     let count = initial.anchors.position.len() as u32;
     let Some(rounds) = plan.rounds else { return count };
     let config = &settings.densify;
-    let side = initial.voxel * f64::from(config.coarsest_cell);
+    let side = initial.voxel * config.coarsest_cell;
     let cells: BTreeSet<[i64; 3]> =
         initial.anchors.position.iter().map(|p| p.map(|x| (f64::from(x) / side).round_ties_even() as i64)).collect();
     let rounds = f64::from((rounds.last - rounds.first) / config.every + 1);
@@ -386,6 +386,7 @@ fn resized(scene: &Scene, from: u32, to: u32) -> Scene {
         reference,
         points: scene.points.clone(),
         radius: scene.radius,
+        unit: scene.unit,
         notes: vec![],
     }
 }

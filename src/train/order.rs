@@ -4,13 +4,27 @@ use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_pcg::Pcg64;
 
-use super::config::ViewOrder;
+use super::config::{Config, ViewOrder};
+use crate::scene::Scene;
+
+/// A view that is visited more often than the others.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Favorite {
+    /// Which.
+    pub view: usize,
+    /// Its share of all steps, from 0 (like the others) to below 1.
+    pub share: f64,
+}
 
 /// Views without replacement: every view once per round, in an order of its own. The order of a round depends on the
-/// seed and the round alone, so that any step's view is known without the steps before it.
+/// seed and the round alone, so that any step's view is known without the steps before it. A favourite has steps of its
+/// own, evenly spread; the rounds of the others fill those between.
 #[derive(Clone, Debug)]
 pub struct Order {
     views: usize,
+    favorite: Option<Favorite>,
+    /// Where between two of its steps the favourite's first one lies.
+    phase: f64,
     seed: u64,
     order: ViewOrder,
     round: Option<(u32, Vec<usize>)>,
@@ -21,22 +35,41 @@ impl Order {
     ///
     /// # Panics
     /// Without a view.
-    pub fn new(views: usize, seed: u64, order: ViewOrder) -> Self {
+    pub fn new(views: usize, favorite: Option<Favorite>, seed: u64, order: ViewOrder) -> Self {
         assert!(views > 0, "a scene has at least one training view");
-        Self { views, seed, order, round: None }
+        let favorite = favorite.filter(|f| f.share > 0.0 && views > 1);
+        let phase = rand::RngExt::random::<f64>(&mut random(seed, Stream::Favorite, 0));
+        Self { views, favorite, phase, seed, order, round: None }
+    }
+
+    /// Of a scene's views, the reference among them.
+    pub fn of(scene: &Scene, config: &Config) -> Self {
+        let favorite = scene.reference.as_ref().map(|r| Favorite { view: r.view, share: config.reference_share });
+        Self::new(scene.train.len(), favorite, config.seed, config.view_order)
     }
 
     /// The view of `step` (counted from 1).
     pub fn view(&mut self, step: u32) -> usize {
-        let index = (step - 1) as usize;
-        let (round, place) = ((index / self.views) as u32, index % self.views);
+        let index = u64::from(step - 1);
+        let Some(Favorite { view, share }) = self.favorite else { return self.in_round(index, self.views) };
+        let visits = |steps: u64| (steps as f64 * share + self.phase).floor() as u64;
+        let before = visits(index);
+        if visits(index + 1) > before {
+            return view;
+        }
+        let other = self.in_round(index - before, self.views - 1);
+        other + usize::from(other >= view)
+    }
+
+    fn in_round(&mut self, index: u64, views: usize) -> usize {
+        let (round, place) = ((index / views as u64) as u32, (index % views as u64) as usize);
         if self.order == ViewOrder::Sequential {
             return place;
         }
         if self.round.as_ref().is_none_or(|(r, _)| *r != round) {
-            let mut views: Vec<usize> = (0..self.views).collect();
-            views.shuffle(&mut random(self.seed, Stream::Views, round));
-            self.round = Some((round, views));
+            let mut order: Vec<usize> = (0..views).collect();
+            order.shuffle(&mut random(self.seed, Stream::Views, round));
+            self.round = Some((round, order));
         }
         self.round.as_ref().map_or(place, |(_, views)| views[place])
     }
@@ -51,6 +84,8 @@ pub enum Stream {
     Patch = 2,
     /// Rectangles of the depth weight, by step.
     Rectangle = 3,
+    /// Where a favourite view's steps lie.
+    Favorite = 4,
 }
 
 /// The generator of a stream at a round or step.
@@ -70,7 +105,7 @@ mod tests {
     #[test]
     fn every_round_has_every_view_once() {
         for views in [1, 2, 7, 60] {
-            let mut order = Order::new(views, 5, ViewOrder::Shuffled);
+            let mut order = Order::new(views, None, 5, ViewOrder::Shuffled);
             let rounds: Vec<Vec<usize>> =
                 (0..3).map(|r| (0..views).map(|i| order.view((r * views + i) as u32 + 1)).collect()).collect();
             for round in &rounds {
@@ -79,8 +114,36 @@ mod tests {
                 assert_eq!(sorted, (0..views).collect::<Vec<_>>());
             }
             assert!(views < 7 || rounds[0] != rounds[1], "rounds differ");
-            assert_eq!(Order::new(views, 5, ViewOrder::Shuffled).view(2 * views as u32 + 1), rounds[2][0]);
+            assert_eq!(Order::new(views, None, 5, ViewOrder::Shuffled).view(2 * views as u32 + 1), rounds[2][0]);
         }
+    }
+
+    #[test]
+    fn a_favorite_has_its_share_and_the_others_their_rounds() {
+        for (views, view, share) in [(2, 0, 0.5), (7, 6, 0.18), (60, 29, 0.18), (60, 0, 0.9), (5, 2, 1e-3)] {
+            let favorite = Some(Favorite { view, share });
+            let mut order = Order::new(views, favorite, 3, ViewOrder::Shuffled);
+            let steps = 40 * views as u32;
+            let all: Vec<usize> = (1..=steps).map(|s| order.view(s)).collect();
+            let visits: Vec<usize> = (0..all.len()).filter(|i| all[*i] == view).collect();
+            assert!((visits.len() as f64 - share * f64::from(steps)).abs() <= 1.0, "{visits:?}");
+            // Evenly: gaps differ by one at most.
+            let gaps: Vec<usize> = visits.windows(2).map(|w| w[1] - w[0]).collect();
+            assert!(gaps.iter().max().zip(gaps.iter().min()).is_none_or(|(a, b)| a - b <= 1), "{gaps:?}");
+            let others: Vec<usize> = all.iter().copied().filter(|v| *v != view).collect();
+            for round in others.chunks_exact(views - 1) {
+                let mut sorted = round.to_vec();
+                sorted.sort_unstable();
+                assert_eq!(sorted, (0..views).filter(|v| *v != view).collect::<Vec<_>>());
+            }
+            assert_eq!(Order::new(views, favorite, 3, ViewOrder::Shuffled).view(steps), all[all.len() - 1]);
+        }
+        // Nobody else is there, or it has no share of its own.
+        assert_eq!(Order::new(1, Some(Favorite { view: 0, share: 0.5 }), 0, ViewOrder::Shuffled).view(3), 0);
+        let none = Some(Favorite { view: 1, share: 0.0 });
+        let mut plain = Order::new(4, None, 1, ViewOrder::Shuffled);
+        let mut same = Order::new(4, none, 1, ViewOrder::Shuffled);
+        assert!((1..30).all(|s| plain.view(s) == same.view(s)));
     }
 
     #[test]

@@ -10,7 +10,7 @@ use image::{GrayImage, RgbImage};
 use super::plan::Plan;
 use crate::gpu::{Buffer, Error, Gpu};
 use crate::losses;
-use crate::scene::{Camera, Prior, PriorKind, Scene, reduced, resample};
+use crate::scene::{Camera, PriorKind, Scene, reduced, resample};
 use crate::stage;
 
 /// One training view on the device.
@@ -25,15 +25,25 @@ pub struct Photograph {
     pub reference: bool,
     /// `[pixel]` red | green << 8 | blue << 16 | mask << 24.
     pub picture: Buffer<u32>,
-    /// `[pixel]` depth or disparity, where the view has a prior.
-    pub prior: Option<(PriorKind, Buffer<f32>)>,
+    /// Where the view has a prior.
+    pub prior: Option<PriorMap>,
     /// Bounding box of the mask, (x0, y0) and one past (x1, y1), where there is one.
     pub mask_box: Option<[u32; 4]>,
 }
 
+/// A prior on the device.
+pub struct PriorMap {
+    /// Depth or disparity.
+    pub kind: PriorKind,
+    /// `[pixel]` in its own range, [`losses::NO_PRIOR`] where there is none.
+    pub values: Buffer<f32>,
+    /// Whether there is none somewhere.
+    pub gaps: bool,
+}
+
 /// One word per pixel.
 pub fn pack(picture: &RgbImage, mask: Option<&GrayImage>) -> Vec<u32> {
-    let masked = |i: usize| mask.is_some_and(|m| m.as_raw()[i] != 0);
+    let masked = |i: usize| mask.map_or(0, |m| m.as_raw()[i]);
     picture.pixels().enumerate().map(|(i, p)| losses::pack(p.0, masked(i))).collect()
 }
 
@@ -73,10 +83,15 @@ pub fn upload(gpu: &Gpu, scene: &Scene, plan: &Plan, reduction: u32) -> Result<V
         };
         let mask = mask.as_deref();
         let prior = match prior.filter(|_| plan.depth_losses(reference.is_some()).any()) {
-            Some(Prior { kind, values }) => {
-                let values =
-                    if smaller { Cow::Owned(resample::map(values, full, size)) } else { Cow::Borrowed(values) };
-                Some((*kind, gpu.stage(stage::PICTURES, || gpu.upload("prior", &values))?))
+            Some(prior) => {
+                let mut values = prior.in_own_range();
+                if smaller {
+                    values = resample::map(&values, full, size);
+                }
+                let gaps = values.iter().any(|v| v.is_nan());
+                values.iter_mut().filter(|v| v.is_nan()).for_each(|v| *v = losses::NO_PRIOR);
+                let values = gpu.stage(stage::PICTURES, || gpu.upload("prior", &values))?;
+                Some(PriorMap { kind: prior.kind, values, gaps })
             }
             None => None,
         };
@@ -104,7 +119,7 @@ mod tests {
         let mut mask = GrayImage::new(3, 2);
         assert_eq!(mask_box(&mask), None);
         assert_eq!(pack(&picture, None), [0x00ff_0201; 6]);
-        mask.put_pixel(2, 1, image::Luma([1]));
+        mask.put_pixel(2, 1, image::Luma([255]));
         assert_eq!(pack(&picture, Some(&mask))[5], 0xffff_0201);
         assert_eq!(mask_box(&mask), Some([2, 1, 3, 2]));
         mask.put_pixel(0, 1, image::Luma([255]));

@@ -4,7 +4,7 @@ use super::photographs::reduced_size;
 use crate::config::Settings;
 use crate::losses;
 use crate::render::rasterize::Outputs;
-use crate::scene::Scene;
+use crate::scene::{Prior, Scene};
 use crate::stage;
 
 /// Something a scene does not need.
@@ -71,7 +71,7 @@ impl Default for Trained {
 /// The stages of a run.
 #[derive(Clone, Debug, Default, serde::Serialize)]
 pub struct Plan {
-    /// Pixels have weights: some view has a mask.
+    /// Pixels have weights: some view has a mask, or a prior that is not everywhere.
     pub masks: bool,
     /// Depth losses: some view has a prior that they look at.
     pub depth: bool,
@@ -135,7 +135,9 @@ impl Plan {
         let mut leave = |what, why: &str| left_out.push(LeftOut { what, why: why.to_owned() });
         let iterations = settings.train.iterations;
         let masks = scene.train.iter().any(|v| v.mask.is_some());
-        if !masks {
+        let reference_gaps = scene.reference.iter().filter_map(|r| r.prior.as_ref());
+        let gaps = scene.train.iter().filter_map(|v| v.prior.as_ref()).chain(reference_gaps).any(Prior::has_gaps);
+        if !masks && !gaps {
             leave("pixel weights", "no view has a mask");
         }
         if scene.reference.is_none() {
@@ -231,7 +233,7 @@ impl Plan {
         }
         let sizes = Self::reduced_sizes(scene, settings.train.coarse.reduction(1));
         Self {
-            masks,
+            masks: masks || gaps && depth,
             depth,
             depth_gradient,
             reference_depth,
@@ -263,7 +265,8 @@ impl Plan {
     pub fn losses(&self, size: [u32; 2], settings: &Settings) -> losses::Plan {
         let gradient_scales = if self.depth_gradient { settings.losses.depth.gradient.scales } else { 0 };
         let ssim_weight = settings.losses.ssim_weight as f32;
-        losses::Plan { size, ssim_weight, masks: self.masks, depth: self.depth, gradient_scales }
+        let ssim_across_masks = settings.losses.ssim_across_masks;
+        losses::Plan { size, ssim_weight, masks: self.masks, ssim_across_masks, depth: self.depth, gradient_scales }
     }
 
     /// The losses that look at the depth of the reference view, or of the others.

@@ -411,7 +411,7 @@ impl<'a> Run<'a> {
                 })
             })
             .collect::<Result<_, gpu::Error>>()?;
-        let order = Order::new(scene.train.len(), settings.train.seed, settings.train.view_order);
+        let order = Order::of(scene, &settings.train);
         Ok(Self {
             gpu,
             scene,
@@ -874,7 +874,8 @@ impl<'a> Run<'a> {
     /// # Errors
     /// When it cannot be read back or written.
     pub fn save(&self, folder: &Path) -> Result<(), Error> {
-        let (anchors, weights) = self.step.model()?;
+        let (mut anchors, mut weights) = self.step.model()?;
+        files::rescale(&mut anchors, &mut weights, self.scene.unit);
         Ok(files::save(&folder.join("model"), &anchors, &weights)?)
     }
 

@@ -25,7 +25,7 @@ use crate::stage;
 
 use super::attend::{Attend, Attended};
 use super::order::{Stream, random};
-use super::photographs::Photograph;
+use super::photographs::{Photograph, PriorMap};
 use super::plan::{Plan, Trained};
 
 /// Where the gradients of what is trained go, zeroed at the beginning of every step.
@@ -223,6 +223,7 @@ impl Step {
                 beta1: settings.optimizer.betas[0],
                 beta2: settings.optimizer.betas[1],
                 epsilon: settings.optimizer.epsilon,
+                lazy: false,
             },
             near: settings.render.near as f32,
             background: settings.train.background.map(|c| c as f32),
@@ -398,7 +399,7 @@ impl Step {
         let (reference, near) = (photograph.reference, self.near);
         let inside = |on_reference: f64| if reference { on_reference as f32 } else { 0.0 };
         let looked_at = self.plan.depth_losses(reference).any();
-        let depth = photograph.prior.as_ref().filter(|_| looked_at).map(|(kind, prior)| {
+        let depth = photograph.prior.as_ref().filter(|_| looked_at).map(|PriorMap { kind, values: prior, gaps }| {
             let depth = &config.depth;
             let gradient = &depth.gradient;
             let outside = if reference { depth.reference_weight } else { depth.other_weight };
@@ -420,6 +421,7 @@ impl Step {
                 rectangle,
                 gradient: (gradient.weight * factor) as f32,
                 gradient_inside: reference,
+                gaps: *gaps,
             }
         });
         let weights = Weights { outside: 1.0, inside: inside(config.reference_inside_weight) };
@@ -574,7 +576,9 @@ impl Step {
         let mut update = |parameter: &Parameter, gradient: Option<&Buffer<f32>>, range: (u32, u32), rate: f64| {
             let Some(gradient) = gradient.filter(|_| rate != 0.0) else { return };
             let tensors = Tensors { value: &parameter.value, gradient, first: &parameter.first, root: &parameter.root };
-            adam::record(rec, &self.adam, tensors, overflow, range, (step, rate));
+            // Networks have a gradient in every step.
+            let adam = adam::Config { lazy: self.config.optimizer.lazy, ..self.adam };
+            adam::record(rec, &adam, tensors, overflow, range, (step, rate));
         };
         let all = |parameter: &Parameter| (0, anchors.count * parameter.width);
         update(&anchors.feature, gradients.feature.as_ref(), all(&anchors.feature), rates.feature);
@@ -612,7 +616,8 @@ impl Step {
         let counting = self.plan.counted.is_some_and(|c| c.contain(step));
         if counting && self.statistics.is_none() {
             let (anchors, offsets) = (self.anchors.capacity, self.anchors.offsets);
-            let statistics = || Statistics::new(&self.gpu, anchors, offsets);
+            let touched = self.config.densify.count_touched;
+            let statistics = || Statistics::new(&self.gpu, anchors, offsets, touched);
             self.statistics = Some(self.gpu.stage(stage::STATISTICS, statistics)?);
         } else if !counting {
             self.statistics = None;

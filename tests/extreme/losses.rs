@@ -132,7 +132,7 @@ impl Pictures {
 
     /// Loss and gradient, every pass beside its float64 twin if `checked`.
     fn run(&self, gpu: &Gpu, checked: bool) -> (f64, Vec<f32>) {
-        let stage = Photometric::new(gpu, self.size, SSIM).expect("buffers");
+        let stage = Photometric::new(gpu, self.size, SSIM, true).expect("buffers");
         let [rendered, target] =
             [&self.rendered, &self.target].map(|picture| gpu.upload("picture", picture).expect("upload"));
         let weight = self.weight.as_ref().map(|weight| gpu.upload("weight", weight).expect("upload"));

@@ -12,7 +12,7 @@ fn photometric() {
     for case in cases("photometric") {
         let shape = case.shape("rendered");
         let size = [shape[1] as u32, shape[0] as u32];
-        let stage = Photometric::new(&gpu, size, 0.2).expect("buffers");
+        let stage = Photometric::new(&gpu, size, 0.2, true).expect("buffers");
         let rendered = gpu.upload("rgb", &case.vectors::<3>("rendered")).expect("upload");
         let target = gpu.upload("target", &case.vectors::<3>("target")).expect("upload");
         let weight = gpu.upload("weight", &case.f32("weight")).expect("upload");

@@ -47,6 +47,7 @@ fn step() {
         let mut settings = Settings::default();
         settings.train.iterations = 30_000;
         settings.render.cull = false;
+        settings.losses.ssim_across_masks = true;
         let plan = Plan {
             masks: true,
             depth: true,
@@ -81,6 +82,7 @@ fn step() {
                 rectangle: None,
                 gradient: if reference { 0.5 } else { 0.05 },
                 gradient_inside: reference,
+                gaps: false,
             };
             let rates = Rates::at(&settings, 1.0, number as u32);
             let mut rec = gpu.recorder().unwrap();

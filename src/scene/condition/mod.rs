@@ -1,0 +1,43 @@
+//! A capture as read, made ready for training: what of it contradicts the removal is mended here, once, before the model
+//! is made.
+//!
+//! - [`unit`]: lengths are counted in a unit that the scene itself gives, so that the user's unit changes nothing.
+//! - [`sparse`]: each prior is held against the points of the sparse model. One that does not follow them is not used, and
+//!   disparity becomes depth.
+//! - [`points`]: points on the object are left out, and the hole gets points from the reference view's prior.
+//! - [`reference`](mod@reference): the inpainted picture counts in its hole alone, and less where other views see past the
+//!   object.
+//!
+//! Each has a setting in [`Config`], and with all of them off the capture stays as it was read.
+
+mod points;
+mod reference;
+mod sparse;
+mod unit;
+
+use super::{Config, Scene};
+
+pub use unit::footprint;
+
+/// Makes a scene that was read ready for training, and adds what was done to its notes.
+pub fn condition(scene: &mut Scene, config: &Config) {
+    unit::normalize(scene, config.unit);
+    points::drop_object(scene, config.object_point_share);
+    if config.check_priors {
+        sparse::check_priors(scene);
+    }
+    if config.guess_reference_prior {
+        reference::guess_prior(scene);
+    }
+    let depth = reference::hole_depth(scene);
+    if config.seed_hole {
+        points::seed_hole(scene, depth.as_deref());
+    }
+    reference::soften_masks(scene, config.rim);
+    if !config.whole_reference {
+        reference::composite(scene);
+    }
+    if config.outrank_guess > 0 {
+        reference::outrank(scene, depth.as_deref(), config.outrank_guess);
+    }
+}
