@@ -429,6 +429,82 @@ fn views_are_held_out_only_where_the_layout_has_no_test_views() {
     assert!(refused.contains("no view is left to train on"), "{refused}");
 }
 
+/// A second test view u, and t as the reference: its photograph, its test mask, the prior under its name.
+#[test]
+fn a_clean_test_view_can_be_the_reference() {
+    let dir = plain();
+    let at = |name: &str| dir.path().join(name);
+    Colmap::new(&["a.jpg", "b.JPG", "c.png", "t.jpeg", "u.png"], SIZE).binary(&at("sparse/0"));
+    let clean = RgbImage::from_pixel(SIZE[0], SIZE[1], Rgb([9, 8, 7]));
+    save(at("test_images/t.png"), &clean);
+    save(at("test_images/u.png"), &picture(SIZE));
+    save(at("test_masks/u.png"), &mask(SIZE, 255));
+    let with = |name: &str, prior: &str| Config {
+        truth_reference: name.into(),
+        truth_prior: prior.into(),
+        ..Config::default()
+    };
+    let names = |views: &[scene::View]| views.iter().map(|v| v.name.clone()).collect::<Vec<_>>().concat();
+    for name in ["t", "t.png"] {
+        let scene = scene::load(dir.path(), &with(name, "")).unwrap();
+        assert_eq!((names(&scene.train), names(&scene.test)), ("abct".into(), "u".into()));
+        let reference = scene.reference.as_ref().unwrap();
+        assert_eq!((reference.view, reference.prior.is_none()), (3, true));
+        assert_eq!(reference.image.as_raw(), clean.as_raw());
+        assert_eq!(scene.train[3].image.as_raw(), clean.as_raw());
+        assert_eq!(scene.train[3].mask.as_ref().unwrap().as_raw(), mask(SIZE, 255).as_raw());
+        assert!(scene.train[1].mask.is_some() && scene.train[1].prior.is_some(), "b trains as any other view");
+        assert_note!(scene, "test view t is trained on as the reference: its photograph shows the truth");
+        assert_note!(scene, "reference/b.png is set aside; its view trains as any other with a mask");
+    }
+
+    // Its prior: under its name, a given file, or none.
+    let kind = |config: &Config| {
+        scene::load(dir.path(), config).unwrap().reference.unwrap().prior.map(|p| (p.kind, p.values[0]))
+    };
+    save_npy(at("depth/t.npy"), &Array2::from_elem((SIZE[1] as usize, SIZE[0] as usize), 3.0f32));
+    save_npy(at("other_disparity.npy"), &Array2::from_elem((SIZE[1] as usize, SIZE[0] as usize), 4.0f32));
+    assert_eq!(kind(&with("t", "")), Some((PriorKind::Depth, 3.0)));
+    assert_eq!(kind(&with("t", "other_disparity.npy")), Some((PriorKind::Disparity, 4.0)));
+    assert_eq!(kind(&with("t", at("other_disparity.npy").to_str().unwrap())), Some((PriorKind::Disparity, 4.0)));
+    assert_eq!(kind(&with("t", "none")), None);
+    assert!(load(&dir).test.iter().all(|v| v.prior.is_none()), "no prior is asked of a test view");
+    assert!(!has_note(&load(&dir), "belong to no picture"));
+
+    // Its mask is the train masks' equal in all that is done to them.
+    let dilated = scene::load(dir.path(), &Config { dilate_masks: 2, ..with("t", "") }).unwrap();
+    assert_eq!(dilated.train[3].mask, dilated.train[0].mask);
+    // Without a reference the same views are tested.
+    for config in [Config { reference: false, ..with("t", "") }, Config { masks: false, ..with("t", "") }] {
+        let scene = scene::load(dir.path(), &config).unwrap();
+        assert_eq!((names(&scene.train), names(&scene.test)), ("abc".into(), "u".into()));
+        assert!(scene.reference.is_none());
+        assert_note!(scene, "t is neither trained on nor tested");
+    }
+    // Views are not held out in the place of test views that are gone.
+    fs::remove_file(at("test_images/u.png")).unwrap();
+    let alone = scene::load(dir.path(), &Config { test_every: 2, ..with("t", "") }).unwrap();
+    assert_eq!((names(&alone.train), names(&alone.test)), ("abct".into(), String::new()));
+
+    let refused = |config: &Config| refusal_with(&dir, config);
+    let mut all = vec![refused(&with("a", "")), refused(&with("", "other_disparity.npy"))];
+    all.push(refused(&with("t", "gone.npy")));
+    save(at("test_masks/t.png"), &mask(SIZE, 0));
+    all.push(refused(&with("t", "")));
+    fs::remove_file(at("test_masks/t.png")).unwrap();
+    all.push(refused(&with("t", "")));
+    fs::remove_dir_all(at("test_images")).unwrap();
+    all.push(refused(&Config { test_every: 2, ..with("a", "") }));
+    insta::assert_snapshot!(all.join("\n"), @"
+    scene.truth_reference is a, but SCENE has only the test view t; name a test view, which shows the place without the object
+    scene.truth_prior is set without scene.truth_reference; name the test view that it belongs to
+    gone.npy: No such file or directory (os error 2)
+    test_masks/t.png: the mask of the reference view is empty, so nothing was inpainted there; is it inverted?
+    test_images/t.png: scene.truth_reference names this test view, and it has no test mask to say where the object stood
+    scene.truth_reference is a, but SCENE has no test views; name a test view, which shows the place without the object
+    ");
+}
+
 #[test]
 fn contradictions_are_refused() {
     let with = |change: &dyn Fn(&Path)| {

@@ -32,6 +32,16 @@ pub struct SettingsArgs {
     /// Reduce images to 1/N of their size [same as --set scene.downscale=N]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub downscale: Option<u32>,
+    /// Train on this test view as the reference, and test on the others [same as --set scene.truth_reference=NAME]
+    ///
+    /// A test view shows the place without the object, so that its photograph is what a perfect inpainting of it would
+    /// be: figures inside the mask then judge the method and not the inpainting. Its hole is its test mask; a delivered
+    /// reference is set aside. The built-in scene needs none of this: its reference is exact.
+    #[arg(long, value_name = "NAME")]
+    pub truth_reference: Option<String>,
+    /// Depth prior of that view, or `none` [default: the one under its name, if the scene has one]
+    #[arg(long, value_name = "FILE", requires = "truth_reference")]
+    pub truth_prior: Option<PathBuf>,
 }
 
 impl SettingsArgs {
@@ -40,6 +50,15 @@ impl SettingsArgs {
         let flag = |flag, key, value: Option<i64>| {
             value.map(|value| Source::Flag { flag, key, value: toml::Value::Integer(value) })
         };
+        let text = |flag, key, value: Option<String>| {
+            value.map(|value| Source::Flag { flag, key, value: toml::Value::String(value) })
+        };
+        // A run is evaluated from elsewhere, and the settings file knows the scene's folder only.
+        let place = |path: &PathBuf| {
+            let word = path.as_os_str() == "none";
+            let path = if word { path.clone() } else { std::path::absolute(path).unwrap_or_else(|_| path.clone()) };
+            path.to_string_lossy().into_owned()
+        };
         let preset = self.preset.iter().cloned().map(Source::Preset);
         let file = self.config.iter().cloned().map(Source::File);
         let set = self.set.iter().cloned().map(Source::Set);
@@ -47,6 +66,8 @@ impl SettingsArgs {
             flag("--iterations", "train.iterations", self.iterations.map(i64::from)),
             flag("--seed", "train.seed", self.seed),
             flag("--downscale", "scene.downscale", self.downscale.map(i64::from)),
+            text("--truth-reference", "scene.truth_reference", self.truth_reference.clone()),
+            text("--truth-prior", "scene.truth_prior", self.truth_prior.as_ref().map(place)),
         ];
         preset.chain(file).chain(set).chain(flags.into_iter().flatten()).collect()
     }

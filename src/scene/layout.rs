@@ -49,6 +49,7 @@ pub(super) struct Layout {
     /// One clause: which layout and by what it was recognised.
     pub found: String,
     pub train: Vec<Entry>,
+    /// Their priors, if there are any, are of pictures without the object.
     pub test: Vec<Entry>,
     pub reference: Option<ReferenceFiles>,
     /// The kind of prior that this layout has, if it has any.
@@ -109,13 +110,15 @@ fn plain(scene: &Path) -> Result<Layout, Error> {
         None => Index::new(),
     };
     let train = entries(&images, |name| masks.get(name).cloned(), |name| Some((priors.get(name)?.clone(), kind?)));
-    let test = entries(&test_images, |name| test_masks.get(name).cloned(), |_| None);
+    let prior = |name: &String| Some((priors.get(name)?.clone(), kind?));
+    let test = entries(&test_images, |name| test_masks.get(name).cloned(), prior);
     let mut notes = Vec::new();
     for (what, files, pictures) in [("masks", &masks, &images), ("test_masks", &test_masks, &test_images)] {
         notes.extend(strays(what, files, pictures));
     }
     if let Some(kind) = kind {
-        notes.extend(strays(kind.folder(), &priors, &images));
+        let all: Index = images.into_iter().chain(test_images).collect();
+        notes.extend(strays(kind.folder(), &priors, &all));
     }
     let reference = reference(&scene.join("reference"), &train)?;
     let found = format!("plain layout: pictures in {folder}/");
@@ -180,7 +183,7 @@ fn gscream_copy(scene: &Path, by: &str) -> Result<Layout, Error> {
     let position: BTreeMap<&String, usize> = split.test.keys().enumerate().map(|(i, name)| (name, i + 1)).collect();
     let test_mask =
         |name: &String| test_masks.get(name).or_else(|| numbered.get(&format!("out_{:05}", position[name]))).cloned();
-    let test = entries(&split.test, test_mask, |_| None);
+    let test = entries(&split.test, test_mask, prior);
     let (mut reference, note) = spin_reference(scene, &images, &train, split.reference.as_deref())?;
     let mut notes: Vec<String> = split.notes.into_iter().chain(note).collect();
     if let Some(files) = &mut reference
@@ -316,6 +319,12 @@ fn reference(folder: &Path, train: &[Entry]) -> Result<Option<ReferenceFiles>, E
     }
     let prior = found.into_iter().next().map(|(path, kind)| ReferencePrior { path, kind });
     Ok(Some(ReferenceFiles { name, image, prior }))
+}
+
+/// What kind of prior a file's name says it is, by NAME_depth or NAME_disparity.
+pub(super) fn said_kind(path: &Path) -> Option<PriorKind> {
+    let name = path.file_name()?.to_str()?;
+    [PriorKind::Depth, PriorKind::Disparity].into_iter().find(|kind| stem(name).ends_with(kind.suffix()))
 }
 
 /// Adds an extension to a name that may contain dots.

@@ -78,6 +78,12 @@ pub struct Config {
     /// So many other views that see a part of the hole past the object outrank the painted picture there, fewer in
     /// proportion; 0: the painted picture counts everywhere alike (GScream).
     pub outrank_guess: u32,
+    /// Name of a test view, which shows the place without the object, to train on as the reference in place of the
+    /// delivered one: what was inpainted is then the truth. Its hole is its test mask. Empty for the delivered reference.
+    pub truth_reference: String,
+    /// Depth prior of that view: a file, in the scene's folder unless the path is absolute. Empty for the one under the
+    /// view's name among the scene's priors, if there is one; `none` for no prior.
+    pub truth_prior: String,
 }
 
 impl Config {
@@ -102,6 +108,9 @@ impl Config {
     }
 }
 
+/// What [`Config::truth_prior`] says for no prior.
+const NO_PRIOR: &str = "none";
+
 impl Default for Config {
     fn default() -> Self {
         Config {
@@ -120,6 +129,8 @@ impl Default for Config {
             rim: 1,
             whole_reference: false,
             outrank_guess: 5,
+            truth_reference: String::new(),
+            truth_prior: String::new(),
         }
     }
 }
@@ -211,7 +222,7 @@ pub struct View {
     pub prior: Option<Prior>,
 }
 
-/// The train view whose hole was inpainted.
+/// The train view whose hole was inpainted, or a view that never had one ([`Config::truth_reference`]).
 #[derive(Clone, Debug)]
 pub struct Reference {
     /// Index into [`Scene::train`]; that view has a mask that is not empty.
@@ -316,6 +327,15 @@ pub enum Error {
     /// An inpainted picture for no train view.
     #[error("{}: no train view has this name; name the inpainted picture after the view it replaces", path.display())]
     ReferenceWithoutView { path: PathBuf },
+    /// A clean view asked for as the reference that the scene does not have.
+    #[error(
+        "scene.truth_reference is {name}, but {} has {}; name a test view, which shows the place without the object",
+        scene.display(), known(names)
+    )]
+    NoTruth { scene: PathBuf, name: String, names: Vec<String> },
+    /// A clean view without a mask, whose hole is not known.
+    #[error("{}: scene.truth_reference names this test view, and it has no test mask to say where the object stood", path.display())]
+    TruthWithoutMask { path: PathBuf },
     /// A reference view whose mask is missing although other views have one.
     #[error("{}: the inpainted view has no mask; add the mask of {name}, or remove the picture", path.display())]
     ReferenceWithoutMask { path: PathBuf, name: String },
@@ -334,6 +354,15 @@ pub enum Error {
         path.display()
     )]
     NotFinite { path: PathBuf, value: f32, row: usize, column: usize },
+}
+
+/// The test views there are, for a message.
+fn known(names: &[String]) -> String {
+    match names {
+        [] => "no test views".to_owned(),
+        [one] => format!("only the test view {one}"),
+        [first, .., last] => format!("no such test view ({} of them: {first} to {last})", names.len()),
+    }
 }
 
 /// At most this many pictures are decoded at once: decoding holds a full-size picture, mask and prior per thread.
@@ -357,6 +386,16 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     notes.append(&mut layout.notes);
 
     let no_masks = layout.train.iter().all(|e| e.mask.is_none());
+    let clean_views = !layout.test.is_empty();
+    let mut truth = None;
+    if !config.truth_reference.is_empty() {
+        truth = Some(take_truth(dir, config, &mut layout, &mut notes)?);
+    } else if !config.truth_prior.is_empty() {
+        let what = "scene.truth_prior is set without scene.truth_reference; name the test view that it belongs to";
+        return Err(Error::Setting(what.into()));
+    }
+    // Only the reference needs the prior of a picture without the object.
+    layout.test.iter_mut().for_each(|e| e.prior = None);
     let mut reference = layout.reference.take();
     if let (Some(files), true) = (&reference, no_masks) {
         let file = layout::relative(dir, &files.image);
@@ -372,6 +411,10 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
         if entry.mask.is_none() {
             return Err(Error::ReferenceWithoutMask { path: files.image.clone(), name: files.name.clone() });
         }
+    }
+    if let (None, Some(name)) = (&reference, &truth) {
+        layout.train.retain(|e| e.name != *name);
+        notes.push(format!("{name} is neither trained on nor tested, so that the figures are of the same views"));
     }
     if !config.masks && !no_masks {
         layout.train.iter_mut().for_each(|e| e.mask = None);
@@ -416,8 +459,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
         let what = "the model has no pose for the view of this inpainted picture".into();
         return Err(Error::File { path: files.image.clone(), what });
     }
-    let held_out = test.is_empty() && config.test_every > 0;
-    if held_out {
+    if !clean_views && config.test_every > 0 {
         let kept = reference.as_ref().map(|r| r.name.clone());
         let mut position = 0;
         (test, train) = train.into_iter().partition(|e| {
@@ -448,13 +490,14 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
             pool.install(|| entries.par_iter().map(|e| reader.view(e, &poses)).collect());
         results.into_iter().collect()
     };
-    let reader = Reader { config, dilate: config.dilate_masks, tall_mask: None };
+    let tall_of = |e: &layout::Entry| layout.tall_test_mask.filter(|_| truth.as_ref() == Some(&e.name));
+    let reader = Reader { config, dilate: config.dilate_masks, tall_mask: &tall_of };
     let loaded_train = read(&train, &reader)?;
-    let reader = Reader { config, dilate: 0, tall_mask: layout.tall_test_mask };
+    let reader = Reader { config, dilate: 0, tall_mask: &|_| layout.tall_test_mask };
     let loaded_test = read(&test, &reader)?;
 
     notes.extend(scale_note(loaded_train.iter().chain(&loaded_test)));
-    let stretched = loaded_test.iter().filter(|l| l.stretched_mask).count();
+    let stretched = loaded_train.iter().chain(&loaded_test).filter(|l| l.stretched_mask).count();
     if stretched > 0 {
         notes.push(format!(
             "{stretched} test masks are not as tall as their pictures and are resampled, as SPIn-NeRF's data needs it"
@@ -504,6 +547,55 @@ impl Scene {
         self.radius = (f64::from(self.radius) / unit) as f32;
         self.unit *= unit;
     }
+}
+
+/// Moves the test view that [`Config::truth_reference`] names to the train views and makes it the reference: its
+/// photograph is what a perfect inpainting would be. The view of the delivered reference stays, as a masked train view.
+/// Returns the view's name.
+fn take_truth(
+    dir: &Path,
+    config: &Config,
+    layout: &mut layout::Layout,
+    notes: &mut Vec<String>,
+) -> Result<String, Error> {
+    let wanted = layout::stem(&config.truth_reference);
+    let Some(at) = layout.test.iter().position(|e| e.name == wanted) else {
+        return Err(Error::NoTruth {
+            scene: dir.to_path_buf(),
+            name: config.truth_reference.clone(),
+            names: layout.test.iter().map(|e| e.name.clone()).collect(),
+        });
+    };
+    let mut entry = layout.test.remove(at);
+    if entry.mask.is_none() {
+        return Err(Error::TruthWithoutMask { path: entry.image });
+    }
+    if let Some(twin) = layout.train.iter().find(|e| e.name == entry.name) {
+        let what = format!("{} has the same name, and both would be trained on; rename one", twin.image.display());
+        return Err(Error::File { path: entry.image, what });
+    }
+    let prior = match config.truth_prior.as_str() {
+        "" => entry.prior.clone().map(|(path, kind)| layout::ReferencePrior { path, kind: Some(kind) }),
+        NO_PRIOR => None,
+        file => {
+            let path = dir.join(file);
+            let kind = layout::said_kind(&path);
+            Some(layout::ReferencePrior { path, kind })
+        }
+    };
+    // The prior is the reference's: two of them for one picture say no more than one.
+    entry.prior = None;
+    let name = entry.name.clone();
+    notes.push(format!("test view {name} is trained on as the reference: its photograph shows the truth"));
+    if let Some(delivered) =
+        layout.reference.replace(layout::ReferenceFiles { name: name.clone(), image: entry.image.clone(), prior })
+    {
+        let file = layout::relative(dir, &delivered.image);
+        notes.push(format!("{file} is set aside; its view trains as any other with a mask"));
+    }
+    layout.train.push(entry);
+    layout.train.sort_by(|a, b| a.name.cmp(&b.name));
+    Ok(name)
 }
 
 /// 1.1 x the largest distance of a camera from the mean camera; `None` if they all coincide.
@@ -636,7 +728,8 @@ struct Loaded {
 struct Reader<'a> {
     config: &'a Config,
     dilate: u32,
-    tall_mask: Option<([u32; 2], [u32; 2])>,
+    /// Sizes of the entry's mask and picture that may differ as stated.
+    tall_mask: &'a (dyn Fn(&layout::Entry) -> Option<([u32; 2], [u32; 2])> + Sync),
 }
 
 impl Reader<'_> {
@@ -656,7 +749,7 @@ impl Reader<'_> {
                 let mut mask = object_mask(path, self.config.invert_masks)?;
                 let found = [mask.width(), mask.height()];
                 if found != picture {
-                    if self.tall_mask != Some((found, picture)) {
+                    if (self.tall_mask)(entry) != Some((found, picture)) {
                         return Err(Error::MaskSize { path: path.clone(), size: found, picture });
                     }
                     mask = resample::nearest(&mask, picture);
