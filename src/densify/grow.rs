@@ -736,7 +736,7 @@ mod tests {
         }
 
         fn upload(&self, gpu: &Gpu, capacity: u32, offsets: u32) -> Statistics {
-            let statistics = Statistics::new(gpu, capacity, offsets).unwrap();
+            let statistics = Statistics::new(gpu, capacity, offsets, false).unwrap();
             gpu.write(&statistics.gradient, &self.gradient).unwrap();
             gpu.write(&statistics.seen, &self.seen).unwrap();
             gpu.write(&statistics.opacity_sum, &self.opacity_sum).unwrap();

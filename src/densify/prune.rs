@@ -200,7 +200,7 @@ mod tests {
                 gpu.write(&parameter.first, &random(n * parameter.width as usize)).unwrap();
                 gpu.write(&parameter.root, &random(n * parameter.width as usize)).unwrap();
             }
-            let mut statistics = Statistics::new(&gpu, anchors.capacity, offsets as u32).unwrap();
+            let mut statistics = Statistics::new(&gpu, anchors.capacity, offsets as u32, false).unwrap();
             gpu.write(&statistics.gradient, &random(n * offsets)).unwrap();
             gpu.write(&statistics.seen, &(0..(n * offsets) as u32).collect::<Vec<_>>()).unwrap();
             let always = all_or_none.is_some();
@@ -249,7 +249,7 @@ mod tests {
             log_scaling: vec![[7.0; 6]],
         };
         let mut anchors = Anchors::upload(&gpu, &model, 0).unwrap();
-        let mut statistics = Statistics::new(&gpu, 1, 10).unwrap();
+        let mut statistics = Statistics::new(&gpu, 1, 10, false).unwrap();
         let config = Config { max_log_scaling: f64::INFINITY, ..Config::default() };
         assert_eq!(run(&gpu, &mut anchors, &mut statistics, &config).unwrap(), 0);
         assert_eq!(anchors.read(&gpu).unwrap(), model);

@@ -446,7 +446,10 @@ mod tests {
         (0..size[0] * size[1])
             .map(|p| {
                 let inside = masks && (3..9).contains(&(p % size[0])) && (2..30).contains(&(p / size[0]));
-                (pack(std::array::from_fn(|_| rng.random()), inside), std::array::from_fn(|_| rng.random()))
+                (
+                    pack(std::array::from_fn(|_| rng.random()), if inside { 255 } else { 0 }),
+                    std::array::from_fn(|_| rng.random()),
+                )
             })
             .unzip()
     }
@@ -455,13 +458,16 @@ mod tests {
     fn all_losses_of_a_step_match_their_twins() {
         let gpu = testing::gpu();
         for size in SIZES {
-            for masks in [false, true] {
-                let plan = Plan { size, ssim_weight: 0.2, masks, depth: true, gradient_scales: 4 };
+            for (masks, ssim_across_masks, gaps) in [(false, true, false), (true, true, false), (true, false, true)] {
+                let plan = Plan { size, ssim_weight: 0.2, masks, ssim_across_masks, depth: true, gradient_scales: 4 };
                 let losses = Losses::new(&gpu, &plan).expect("buffers");
                 let (picture, rgb) = random_view(size, masks);
                 let picture = gpu.upload("picture", &picture).expect("upload");
                 let rgb = gpu.upload("rgb", &rgb).expect("upload");
-                let maps = Maps::new(size, 13, 0.2, DISPARITY);
+                let mut maps = Maps::new(size, 13, 0.2, DISPARITY);
+                if gaps {
+                    maps.prior.iter_mut().skip(1).step_by(3).for_each(|p| *p = NO_PRIOR);
+                }
                 let depth = gpu.upload("depth", &maps.rendered).expect("upload");
                 let prior = gpu.upload("prior", &maps.prior).expect("upload");
                 let rectangle = Some(Rectangle { low: [1, 1], high: [20, 20], added: 99.0 });
@@ -472,6 +478,7 @@ mod tests {
                     rectangle,
                     gradient: 0.5,
                     gradient_inside: true,
+                    gaps,
                 };
                 let reference =
                     View { picture: &picture, weights: Weights { outside: 1.0, inside: 20.0 }, depth: Some(of_depth) };
@@ -500,10 +507,92 @@ mod tests {
         }
     }
 
+    /// A prior's values where there is none are as good as any: nothing changes with them.
+    #[test]
+    fn what_a_prior_lacks_has_no_part() {
+        let gpu = testing::gpu();
+        let size = [53, 37];
+        let plan =
+            Plan { size, ssim_weight: 0.2, masks: true, ssim_across_masks: false, depth: true, gradient_scales: 4 };
+        let (picture, rgb) = random_view(size, true);
+        let picture = gpu.upload("picture", &picture).expect("upload");
+        let rgb = gpu.upload("rgb", &rgb).expect("upload");
+        let maps = Maps::new(size, 21, 0.2, Quantity::Depth);
+        let depth = gpu.upload("depth", &maps.rendered).expect("upload");
+        let mut results = vec![];
+        for filler in [NO_PRIOR, 3.0 * NO_PRIOR] {
+            let with_gaps = |(i, p): (usize, &f32)| if i % 5 == 2 { filler } else { *p };
+            let values: Vec<f32> = maps.prior.iter().enumerate().map(with_gaps).collect();
+            let prior = gpu.upload("prior", &values).expect("upload");
+            let view = View {
+                picture: &picture,
+                weights: Weights { outside: 1.0, inside: 20.0 },
+                depth: Some(DepthView {
+                    prior: &prior,
+                    quantity: Quantity::Depth,
+                    weights: Weights { outside: 1.0, inside: 100.0 },
+                    rectangle: None,
+                    gradient: 0.5,
+                    gradient_inside: true,
+                    gaps: true,
+                }),
+            };
+            let losses = Losses::new(&gpu, &plan).expect("buffers");
+            let mut rec = gpu.recorder().expect("recorder");
+            let gradients = losses.forward_backward(&mut rec, &view, &rgb, Some(&depth));
+            finish(rec);
+            let grad = gpu.read(gradients.depth.expect("there is a prior")).expect("read");
+            assert!(grad.iter().skip(2).step_by(5).all(|g| *g == 0.0), "no gradient where there is no prior");
+            assert!(grad.iter().any(|g| *g != 0.0));
+            results.push((gpu.read(losses.terms()).expect("read"), grad));
+        }
+        assert_eq!(results[0], results[1]);
+    }
+
+    /// A prior in any unit: its values count in their own range.
+    #[test]
+    fn depth_losses_do_not_know_a_priors_unit() {
+        let gpu = testing::gpu();
+        let size = [53, 37];
+        let maps = Maps::new(size, 22, 0.2, Quantity::Depth);
+        let of = |scale: f64, shift: f64| {
+            let values = maps.prior.iter().map(|p| (scale * (f64::from(*p) + shift)) as f32).collect();
+            let prior = crate::scene::Prior { kind: crate::scene::PriorKind::Depth, values };
+            let maps = Maps {
+                prior: prior.in_own_range(),
+                rendered: maps.rendered.clone(),
+                size,
+                valid: maps.valid.clone(),
+                weight: maps.weight.clone(),
+            };
+            maps.run(&gpu, Quantity::Depth, true, false)
+        };
+        let (_, terms, grad) = of(1.0, 0.0);
+        let largest = grad.iter().fold(0.0_f32, |m, g| m.max(g.abs()));
+        for (scale, shift) in [(1e-6, 0.0), (1e-3, 0.3), (7.0, -2.0), (1e3, 0.0), (1e6, 0.5)] {
+            let (_, other, other_grad) = of(scale, shift);
+            // The prior is rounded once more, to 6e-8 of at most three times its range, before it is compared at a
+            // fiftieth of that range.
+            for (a, b) in terms.iter().zip(other) {
+                assert!((a - b).abs() < 2e-5 * a, "{scale} {shift}: {terms:?} {other:?}");
+            }
+            // Single signs flip where the difference is within that rounding of zero.
+            let off = grad.iter().zip(&other_grad).filter(|(a, b)| (*a - *b).abs() > 1e-4 * largest).count();
+            assert!(off * 100 < grad.len(), "{scale} {shift}: {off} of {} gradients differ", grad.len());
+        }
+    }
+
     #[test]
     fn what_is_not_planned_has_no_buffer() {
         let gpu = testing::gpu();
-        let plan = Plan { size: [8, 8], ssim_weight: 0.2, masks: false, depth: false, gradient_scales: 4 };
+        let plan = Plan {
+            size: [8, 8],
+            ssim_weight: 0.2,
+            masks: false,
+            ssim_across_masks: false,
+            depth: false,
+            gradient_scales: 4,
+        };
         let losses = Losses::new(&gpu, &plan).expect("buffers");
         assert!(losses.depth.is_none() && losses.frame.weight().is_none() && losses.frame.valid().is_none());
         let masks = Plan { masks: true, ..plan };

@@ -501,7 +501,18 @@ mod tests {
                 let weight = weights(size);
                 let case = gradient_weighted::Arrays { grad_rows, rendered, target, grad_rendered, partial, weight };
                 let push = gradient_weighted::Push { size, factor: 0.7, first };
-                testing::assert_twin(gradient_weighted::Kernel, &gpu, case, push, down);
+                testing::assert_twin(gradient_weighted::Kernel, &gpu, case.clone(), push, down);
+                let gradient_weighted::Arrays { grad_rows, rendered, target, grad_rendered, partial, weight } = case;
+                let outside = rows_outside::Arrays {
+                    rendered: rendered.clone(),
+                    target: target.clone(),
+                    moments: vec![[UNWRITTEN; 4]; 3 * rendered.len()],
+                    weight: weight.clone(),
+                };
+                testing::assert_twin(rows_outside::Kernel, &gpu, outside, rows_outside::Push { size }, row_runs(size));
+                let case = gradient_outside::Arrays { grad_rows, rendered, target, grad_rendered, partial, weight };
+                let push = gradient_outside::Push { size, factor: 0.7, first };
+                testing::assert_twin(gradient_outside::Kernel, &gpu, case, push, down);
             }
         }
     }
@@ -527,7 +538,18 @@ mod tests {
         target: &[[f32; 3]],
         weight: Option<&[f32]>,
     ) -> (f32, Vec<f32>) {
-        let stage = Photometric::new(gpu, size, 0.2, true).expect("buffers");
+        run_with(gpu, size, rendered, target, weight, true)
+    }
+
+    fn run_with(
+        gpu: &Gpu,
+        size: [u32; 2],
+        rendered: &[[f32; 3]],
+        target: &[[f32; 3]],
+        weight: Option<&[f32]>,
+        across: bool,
+    ) -> (f32, Vec<f32>) {
+        let stage = Photometric::new(gpu, size, 0.2, across).expect("buffers");
         let rendered = gpu.upload("rgb", rendered).expect("upload");
         let target = gpu.upload("target", target).expect("upload");
         let weight = weight.map(|w| gpu.upload("weight", w).expect("upload"));
@@ -542,6 +564,43 @@ mod tests {
         let terms = gpu.read(&losses).expect("read");
         assert!(terms[0].is_nan() && terms[2].is_nan(), "other slots are not touched");
         (terms[1], gpu.read(grad).expect("read").into_flattened())
+    }
+
+    /// Where nothing weighs, what is behind the object must not be drawn to the object: not by its own pixels, and not by
+    /// the windows of those beside them. In GScream's form the windows do it.
+    #[test]
+    fn windows_do_not_reach_into_the_mask() {
+        let gpu = testing::gpu();
+        let size = [19, 14];
+        let inside = |p: usize| (6..13).contains(&(p % 19)) && (4..10).contains(&(p / 19));
+        let weight: Vec<f32> = (0..19 * 14).map(|p| if inside(p) { 0.0 } else { 1.0 }).collect();
+        let [rendered, target] = pictures(size)[0].clone();
+        let (value, grad) = run_with(&gpu, size, &rendered, &target, Some(&weight), false);
+        let reaches_in = |grad: &[f32]| grad.iter().enumerate().any(|(i, g)| inside(i / 3) && *g != 0.0);
+        assert!(!reaches_in(&grad));
+        assert!(reaches_in(&run_with(&gpu, size, &rendered, &target, Some(&weight), true).1));
+        // Outside it is the slope of the loss against a photograph that shows inside what is drawn there.
+        let double = |v: &[[f32; 3]]| -> Vec<[f64; 3]> { v.iter().map(|v| v.map(f64::from)).collect() };
+        let (mut a, mut b) = (double(&rendered), double(&target));
+        (0..a.len()).filter(|p| inside(*p)).for_each(|p| b[p] = a[p]);
+        let sizes = size.map(|v| v as usize);
+        let want = loss(&a, &b, &weight, sizes);
+        assert!((f64::from(value) - want).abs() < 3e-6 * want, "{value} instead of {want}");
+        let scale = grad.iter().fold(0.0_f32, |m, g| m.max(g.abs()));
+        for p in (0..a.len()).filter(|p| !inside(*p)).step_by(5) {
+            let (old, step) = (a[p][1], 1e-5);
+            if (old - b[p][1]).abs() < 2.0 * step {
+                continue;
+            }
+            let mut at = |v: f64| {
+                a[p][1] = v;
+                loss(&a, &b, &weight, sizes)
+            };
+            let slope = (at(old + step) - at(old - step)) / (2.0 * step);
+            at(old);
+            // The central difference is good to step^2 times the third derivative, some 1 / C2^2 of SSIM's share.
+            assert!((f64::from(grad[3 * p + 1]) - slope).abs() < 2e-3 * f64::from(scale), "{p}: {slope}");
+        }
     }
 
     #[test]

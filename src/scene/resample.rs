@@ -111,9 +111,15 @@ pub fn map(values: &[f32], from: [u32; 2], to: [u32; 2]) -> Vec<f32> {
     separable::<2>(line, from.map(|v| v as usize), to.map(|v| v as usize)).iter().map(mean).collect()
 }
 
-/// A mask at a smaller size: a pixel has the largest value of the input pixels it covers, even in part: it is object (255)
-/// if any of them is.
+/// A mask at a smaller size: a pixel is object (255) if any input pixel it covers, even in part, is not 0.
 pub fn mask(mask: &GrayImage, to: [u32; 2]) -> GrayImage {
+    let mut out = largest(mask, to);
+    out.iter_mut().filter(|v| **v != 0).for_each(|v| *v = 255);
+    out
+}
+
+/// A mask that falls off at a smaller size: a pixel has the largest value of those it covers, even in part.
+pub fn largest(mask: &GrayImage, to: [u32; 2]) -> GrayImage {
     let (w, h) = mask.dimensions();
     let covered = |i: u32, from: u32, to: u32| -> Range<u32> {
         let (low, high) = (u64::from(i) * u64::from(from), u64::from(i + 1) * u64::from(from));

@@ -78,7 +78,7 @@ pub fn upload(gpu: &Gpu, scene: &Scene, plan: &Plan, reduction: u32) -> Result<V
         let smaller = size != full;
         let picture = if smaller { Cow::Owned(resample::photograph(picture, size)) } else { Cow::Borrowed(picture) };
         let mask = match &view.mask {
-            Some(mask) if smaller => Some(Cow::Owned(resample::mask(mask, size))),
+            Some(mask) if smaller => Some(Cow::Owned(resample::largest(mask, size))),
             mask => mask.as_ref().map(Cow::Borrowed),
         };
         let mask = mask.as_deref();

@@ -70,7 +70,7 @@ struct Scene {
 impl Scene {
     fn new(gpu: &Gpu, model: &files::Anchors) -> Self {
         let anchors = Anchors::upload(gpu, model, 0).expect("upload");
-        let statistics = Statistics::new(gpu, anchors.capacity, OFFSETS).expect("buffers");
+        let statistics = Statistics::new(gpu, anchors.capacity, OFFSETS, false).expect("buffers");
         Self { anchors, statistics }
     }
 

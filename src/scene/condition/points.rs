@@ -47,13 +47,13 @@ pub(super) fn drop_object(scene: &mut Scene, share: f64) {
     if count == 0 {
         return;
     }
-    if count == scene.points.len() {
-        scene.notes.push(
-            "every point of the model falls into the masks: none is left out; are the masks inverted?".to_owned(),
-        );
+    let all = scene.points.len();
+    if 10 * count > 9 * all {
+        scene.notes.push(format!(
+            "{count} of {all} points fall into the masks, so that none is left out; are the masks inverted?"
+        ));
         return;
     }
-    let all = scene.points.len();
     let mut at = dropped.iter();
     scene.points.retain(|_| !at.next().is_some_and(|d| *d));
     scene
