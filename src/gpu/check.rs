@@ -52,6 +52,8 @@ pub struct Difference {
     pub exceeded: usize,
     /// Components that may be: the boundary band.
     pub allowed: usize,
+    /// Components that are a number on one side only: no boundary explains one.
+    pub broken: usize,
     /// Where the worst of them is, and the two values.
     pub worst: Option<(usize, f64, f64)>,
 }
@@ -59,7 +61,7 @@ pub struct Difference {
 impl Difference {
     /// True when no more components disagree than the boundary band allows.
     pub fn ok(&self) -> bool {
-        self.exceeded <= self.allowed
+        self.exceeded <= self.allowed && self.broken == 0
     }
 
     /// Compares float64 values.
@@ -67,6 +69,7 @@ impl Difference {
         assert_eq!(got.len(), want.len(), "{pass}: {tensor} has another length than its reference");
         let scale = want.iter().filter(|w| w.is_finite()).fold(0.0, |m: f64, w| m.max(w.abs()));
         let (mut error, mut exceeded, mut worst, mut worst_excess): (f64, _, _, f64) = (0.0, 0, None, 0.0);
+        let mut broken = 0;
         let (mut dot, mut gg, mut ww, mut dd) = (0.0, 0.0, 0.0, 0.0);
         for (i, (&g, &w)) in got.iter().zip(want).enumerate() {
             if g == w || (g.is_nan() && w.is_nan()) {
@@ -83,6 +86,7 @@ impl Difference {
             gg += g * g;
             ww += w * w;
             dd += distance * distance;
+            broken += usize::from(g.is_nan() != w.is_nan());
             error = if distance.is_nan() { f64::INFINITY } else { error.max(distance) };
             if distance.is_nan() || distance > limit {
                 exceeded += 1;
@@ -105,6 +109,7 @@ impl Difference {
             relative: if both_zero { 0.0 } else { (dd / ww).sqrt() },
             discrete: false,
             exceeded,
+            broken,
             allowed: (check.band * got.len() as f64).ceil() as usize,
             worst,
         }
@@ -173,5 +178,7 @@ mod tests {
         assert!(!Difference::of("p", "t", &[0.0, 0.0, 0.0], &want, check).ok(), "a gradient that is wrongly zero");
         let band = Check { band: 0.3, ..check };
         assert!(Difference::of("p", "t", &[5.0, -2.0, 0.0], &want, band).ok());
+        assert!(!Difference::of("p", "t", &[1.0, f64::NAN, 0.0], &want, band).ok(), "no band explains a NaN");
+        assert!(!Difference::of("p", "t", &[1.0, 2.0, 0.0], &[1.0, f64::NAN, 0.0], band).ok());
     }
 }

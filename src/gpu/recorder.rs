@@ -147,6 +147,8 @@ struct Trace {
 pub struct Submission<'g> {
     gpu: &'g Gpu,
     context: Option<Context>,
+    /// The queue has taken it.
+    submitted: bool,
     rehearsal: Option<Arc<Rehearsal>>,
     passes: Vec<&'static str>,
     /// What was recorded.
@@ -631,9 +633,10 @@ impl<'g> Recorder<'g> {
         if let Some(error) = self.error.take() {
             return Err(error);
         }
-        let submission = Submission {
+        let mut submission = Submission {
             gpu: self.gpu,
             context: self.context.take(),
+            submitted: false,
             rehearsal: self.rehearsal.take(),
             passes: std::mem::take(&mut self.passes),
             schedule: std::mem::take(&mut self.schedule),
@@ -652,9 +655,10 @@ impl<'g> Recorder<'g> {
     fn flush(&mut self) -> Result<(), Error> {
         let context = self.context.take().expect("flush comes before submit");
         let passes = std::mem::take(&mut self.passes);
-        let submission = Submission {
+        let mut submission = Submission {
             gpu: self.gpu,
             context: Some(context),
+            submitted: false,
             rehearsal: None,
             passes,
             schedule: Schedule::default(),
@@ -702,7 +706,7 @@ fn barrier(inner: &Inner, commands: vk::CommandBuffer) {
 }
 
 impl Submission<'_> {
-    fn start(&self) -> Result<(), Error> {
+    fn start(&mut self) -> Result<(), Error> {
         if self.rehearsal.is_some() {
             return Ok(());
         }
@@ -721,6 +725,7 @@ impl Submission<'_> {
             inner.device.end_command_buffer(context.commands).named("ending a command buffer")?;
             inner.device.queue_submit2(inner.queue, &submit, context.fence)
         };
+        self.submitted = result.is_ok();
         self.lost(result)
     }
 
@@ -796,10 +801,13 @@ impl Drop for Submission<'_> {
         }
         if let Some(context) = self.context.take() {
             let inner = self.gpu.inner();
-            // SAFETY: given to the queue in `start`; a failure here means the device is lost and nothing runs any more.
-            unsafe {
-                let _ = inner.device.wait_for_fences(&[context.fence], true, u64::MAX);
-                let _ = inner.device.reset_fences(&[context.fence]);
+            // What never reached the queue signals no fence: waiting for it would not end.
+            if self.submitted {
+                // SAFETY: given to the queue in `start`; a failure here means the device is lost and nothing runs any more.
+                unsafe {
+                    let _ = inner.device.wait_for_fences(&[context.fence], true, u64::MAX);
+                    let _ = inner.device.reset_fences(&[context.fence]);
+                }
             }
             lock(&inner.contexts).push(context);
             inner.ended();

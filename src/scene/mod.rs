@@ -706,8 +706,10 @@ impl<'a> Poses<'a> {
     }
 
     fn find(&self, name: &str) -> Option<(&'a colmap::Image, &'a colmap::Intrinsics)> {
-        let at = self.by_name.get(name).copied().or_else(|| *self.by_file.get(file_part(name))?)?;
-        let image = &self.model.images[at];
+        // The file's name alone will do where one side has no folders; in another folder it is another photograph.
+        let bare = |at: usize| !name.contains('/') || !self.model.images[at].name.contains('/');
+        let by_file = || self.by_file.get(file_part(name)).copied().flatten().filter(|at| bare(*at));
+        let image = &self.model.images[self.by_name.get(name).copied().or_else(by_file)?];
         Some((image, &self.model.cameras[&image.camera]))
     }
 }

@@ -122,7 +122,7 @@ impl Attend {
         let mut rng = random(self.seed, Stream::Patch, step);
         let side = (self.config.patch / photograph.reduction).max(1);
         let patch = patch_position(&mut rng, ([x0, y0], [x1, y1]), side, camera.size);
-        let draw = Draw { patch, seed: self.seed as u32, step };
+        let draw = Draw { patch, seed: (self.seed ^ (self.seed >> 32)) as u32, step };
         let Room { select, sort, blended } = self.room();
         let listed = (&visible.list, &visible.count, anchors.count);
         let candidates = select.candidates(rec, listed, &anchors.position, &photograph.picture, &view, draw);

@@ -122,7 +122,8 @@ fn depth_losses(config: &losses::config::Depth, reference: bool, masks: bool) ->
 /// The rounds of growing and pruning that come to pass; none behind the last step, whose anchors nobody would train.
 fn rounds(settings: &Settings) -> Option<Steps> {
     let config = &settings.densify;
-    let first = config.from.max(1).next_multiple_of(config.every);
+    // No multiple fits behind the largest steps.
+    let first = config.from.max(1).checked_next_multiple_of(config.every)?;
     let until = config.until.min(settings.train.iterations.saturating_sub(1));
     let last = until - until % config.every;
     (config.enabled && first <= last).then_some(Steps { first, last })

@@ -581,7 +581,11 @@ impl Step {
             adam::record(rec, &adam, tensors, overflow, range, (step, rate));
         };
         let all = |parameter: &Parameter| (0, anchors.count * parameter.width);
-        update(&anchors.feature, gradients.feature.as_ref(), all(&anchors.feature), rates.feature);
+        // What the release writes back it does not train any further.
+        let config = &self.config.model.attention;
+        let written_back = config.write_back && self.plan.attention && step >= config.start;
+        let rate = if written_back { 0.0 } else { rates.feature };
+        update(&anchors.feature, gradients.feature.as_ref(), all(&anchors.feature), rate);
         update(&anchors.offset, gradients.offset.as_ref(), all(&anchors.offset), rates.offset);
         update(&anchors.log_scaling, gradients.log_scaling.as_ref(), all(&anchors.log_scaling), rates.log_scaling);
         let layout = Layout { offsets: anchors.offsets as usize };

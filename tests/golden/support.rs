@@ -35,7 +35,9 @@ pub fn cases(kind: &str) -> Vec<Case> {
         })
         .collect();
     if found.is_empty() {
-        println!("no {kind} case in {}", folder.display());
+        // Another folder may hold some kinds only; our own holds all.
+        assert!(std::env::var_os("GSCREAM_GOLDEN").is_some(), "{}: no {kind} case here", folder.display());
+        println!("skipped: no {kind} case in {}", folder.display());
     }
     found
 }
