@@ -373,6 +373,7 @@ fn resized(scene: &Scene, from: u32, to: u32) -> Scene {
             image: RgbImage::new(w, h),
             mask: view.mask.as_ref().map(|_| GrayImage::from_pixel(w, h, fill)),
             prior: view.prior.as_ref().map(|p| blank(p, size)),
+            depth: None,
         }
     };
     let reference = scene.reference.as_ref().map(|r| {
