@@ -632,9 +632,9 @@ fn the_table_has_a_block_by_region_where_there_are_more_than_three() {
     let metrics = judging.add("a", &rendered, &truth, Some(&inside), Some(&seen)).unwrap();
     metrics.geometry = Some(evaluate::Geometry { relative_error: Some(0.0123), completeness: 0.875 });
     let residue = |name: &str, residue| evaluate::Residue { name: name.into(), residue };
-    let report = judging.report().with_residues(vec![residue("x", 0.01), residue("y", 0.05)]);
+    let report = judging.report().with_residues(vec![residue("x", 0.25), residue("y", 0.75)]);
     insta::assert_snapshot!("table_by_region", report.table());
-    assert_eq!(report.mean.unwrap().residue, Some(0.03));
+    assert_eq!(report.mean.unwrap().residue, Some(0.5));
 }
 
 /// A tenth of 10 pixels on every side, within the picture.

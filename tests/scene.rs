@@ -545,7 +545,13 @@ fn other_priors_and_another_reference_take_the_place_of_the_delivered() {
     all.push(refusal_with(&dir, &Config { truth_reference: "t".into(), ..reference("lama.png") }));
     fs::remove_dir_all(at("reference")).unwrap();
     all.push(refusal_with(&dir, &reference("lama.png")));
-    insta::assert_snapshot!(all.join("\n"), @"");
+    insta::assert_snapshot!(all.join("\n"), @"
+    gone: there is no such folder
+    empty: no prior has the name of a train view; name them after the photographs
+    gone.png: No such file or directory (os error 2)
+    scene.reference_file and scene.truth_reference are both set; a scene has one reference
+    lama.png: no train view has this name; name the inpainted picture after the view it replaces
+    ");
 }
 
 /// True depth of test views: nearest of its pixels, unknown where it is not positive.

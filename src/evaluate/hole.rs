@@ -168,7 +168,7 @@ mod tests {
         (0..SIZE * SIZE)
             .map(|i| {
                 let (x, y) = (f64::from(i % SIZE), f64::from(i / SIZE));
-                let wave: f64 = waves.iter().map(|w| 0.04 * (w[0] * x + w[1] * y + w[3]).sin()).sum();
+                let wave: f64 = waves.iter().map(|w| 0.025 * (w[0] * x + w[1] * y + w[3]).sin()).sum();
                 base.map(|b| b + wave)
             })
             .collect()
@@ -200,7 +200,7 @@ mod tests {
 
     #[test]
     fn the_residue_is_the_opacity_of_what_is_left() {
-        let (object, background) = (texture(1, [0.8, 0.3, 0.2]), texture(2, [0.4, 0.45, 0.5]));
+        let (object, background) = (texture(1, [0.7, 0.35, 0.3]), texture(2, [0.4, 0.45, 0.5]));
         let known: Vec<_> = background.iter().map(|b| Some(*b)).collect();
         let of = |shown: &[[f64; 3]]| residue(&picture(shown), &picture(&object), &known, &mask()).expect("an object");
         for left in [0.0, 0.03, 0.25, 1.0] {
@@ -237,7 +237,7 @@ mod tests {
         let shown = picture(&background);
         let known: Vec<_> = background.iter().map(|b| Some(*b)).collect();
         assert_eq!(residue(&shown, &shown, &known, &mask()), None, "the photograph shows no object");
-        let object = picture(&texture(1, [0.8, 0.3, 0.2]));
+        let object = picture(&texture(1, [0.7, 0.35, 0.3]));
         assert_eq!(residue(&shown, &object, &known, &GrayImage::new(SIZE, SIZE)), None, "an empty mask");
         assert_eq!(residue(&shown, &object, &vec![None; 4096], &mask()), None, "no background is known");
         let grey = vec![Some([0.5; 3]); 4096];
