@@ -310,13 +310,15 @@ fn train_writes_a_run_and_never_over_another() {
         "model/point_cloud.ply",
         "model/weights.safetensors",
         "run.json",
+        "seen/test_000.png",
+        "seen/test_001.png",
         "settings.toml",
         "test/test_000.png",
         "test/test_001.png",
     ];
     assert_eq!(files_below(&folder.join("run")), expected);
     let last = outcome.stdout.lines().last().expect("lines");
-    assert_eq!(last, "wrote model, log.jsonl, settings.toml, run.json, test, metrics.json in run");
+    assert_eq!(last, "wrote model, log.jsonl, settings.toml, run.json, test, metrics.json, seen in run");
     assert_eq!(fs::read_to_string(folder.join("run/log.jsonl")).expect("a log").lines().count(), 2);
     let model = |run: &str| fs::read(folder.join(run).join("model/point_cloud.ply")).expect("a model");
     let before = model("run");
@@ -401,4 +403,87 @@ fn plan_and_verify_of_a_scene() {
     // A step before the attention's, although the warm-up went past it.
     let early = succeeds(folder, &format!("verify scene --warm-up 3 --step 1 {few}")).stdout;
     assert!(early.starts_with("step 1, view ") && !early.contains("model/attention"), "{early}");
+}
+
+/// A clean test view as the reference, and what its run is judged by, now and later.
+#[test]
+fn a_run_with_the_truth_as_reference_is_judged_and_judged_again() {
+    let folder = with_scene();
+    let folder = folder.path();
+    succeeds(folder, &format!("train scene --out run --truth-reference test_000 --validate {FEW_STEPS}"));
+    let read = |name: &str| -> serde_json::Value {
+        serde_json::from_str(&fs::read_to_string(folder.join(name)).expect("written")).expect("JSON")
+    };
+    let trained = read("run/metrics.json");
+    assert_eq!(trained["views"].as_array().map(Vec::len), Some(1), "the other test view");
+    assert_eq!(trained["views"][0]["name"], "test_001");
+    for key in ["outside", "rim", "full_seen", "geometry", "seen_share"] {
+        assert!(!trained["mean"][key].is_null(), "{key}: {trained:#}");
+    }
+    assert!(trained["mean"].get("lpips").is_none() && trained["mean"].get("fid").is_none(), "absent without weights");
+    let outcome = succeeds(folder, "eval run --json again.json --validate");
+    assert_eq!(read("again.json"), trained, "the same device draws the same pictures");
+    for part in ["outside mask", "mask's rim", "seen pixels", "depth inside the mask: off by", "protocol plain: "] {
+        assert!(outcome.stdout.contains(part), "no {part:?} in {}", outcome.stdout);
+    }
+    // Stored pictures know what was seen, but neither depth nor the train views.
+    succeeds(folder, "eval run --pictures --json stored.json");
+    let stored = read("stored.json");
+    assert_eq!(stored["mean"]["outside_seen"], trained["mean"]["outside_seen"]);
+    assert!(stored["mean"].get("geometry").is_none() && stored.get("residues").is_none());
+    // Depth maps in another unit, in a folder of the user's.
+    fs::create_dir(folder.join("millimetres")).expect("writable");
+    let path = folder.join("scene/test_depth/test_001.npy");
+    let depth: ndarray::Array2<f32> = ndarray_npy::read_npy(path).expect("a depth map");
+    ndarray_npy::write_npy(folder.join("millimetres/test_001.npy"), &(depth * 1000.0)).expect("writable");
+    succeeds(folder, "eval run --depth-truth millimetres --json millimetres.json");
+    let millimetres = read("millimetres.json");
+    assert!(!millimetres["mean"]["geometry"].is_null(), "{millimetres:#}");
+
+    for (code, arguments, part) in [
+        (1, "train scene --out other --truth-reference nobody", "but scene has no such test view (2 of them: test_000"),
+        (2, "train scene --out other --truth-prior none", "--truth-reference <NAME>"),
+        (1, "eval run --depth-truth nowhere", "nowhere: there is no such folder"),
+        (1, "eval run --depth-truth scene/masks", "no depth map has the name of a test view (like test_001)"),
+        (1, "eval run --lpips-weights scene/images/train_000.png", "not a safetensors file"),
+        (1, "eval run --fid-weights gone.safetensors", "gone.safetensors: "),
+        (2, "eval run --protocol spin", "invalid value 'spin' for '--protocol <NAME>'"),
+    ] {
+        let outcome = run(folder, arguments);
+        assert_eq!(outcome.code, code, "{arguments}: {}", outcome.stderr);
+        assert!(outcome.stderr.contains(part), "{arguments}: {}", outcome.stderr);
+    }
+}
+
+#[test]
+fn ablate_compares_over_seeds_and_scenes() {
+    let folder = with_scene();
+    let folder = folder.path();
+    let options = synthetic::Options { seed: 4, width: 32, height: 24, train_views: 3, test_views: 1, points: 50 };
+    synthetic::write(&folder.join("other"), &options).expect("a writable folder");
+    let few = format!("--iterations 2 {}", FEW_STEPS.trim_start_matches("--iterations 4 "));
+    let command = "ablate scene other --out runs --seeds 2 --only neither,priors-same --priors same=depth --validate";
+    let outcome = succeeds(folder, &format!("{command} {few}"));
+    for run in ["scene/neither/seed-0", "scene/priors-same/seed-1", "other/neither/seed-1"] {
+        assert!(folder.join("runs").join(run).join("metrics.json").is_file(), "{run}");
+    }
+    for part in
+        ["| variant | PSNR | masked PSNR | SSIM |", "| priors-same - neither | ", "(p ", "| SPIn-NeRF | 20.18 |"]
+    {
+        assert!(outcome.stdout.contains(part), "no {part:?} in {}", outcome.stdout);
+    }
+    let read = |name: &str| -> serde_json::Value {
+        serde_json::from_str(&fs::read_to_string(folder.join("runs").join(name)).expect("written")).expect("JSON")
+    };
+    assert_eq!(read("ablation.json").as_array().map(Vec::len), Some(8), "two variants, scenes and seeds");
+    let comparison = read("comparison.json");
+    assert_eq!(comparison["seeds"], serde_json::json!([0, 1]));
+    let psnr = &comparison["variants"][0]["figures"]["psnr"];
+    assert!(psnr["mean"].is_f64() && psnr["deviation"].is_f64(), "{comparison:#}");
+    assert!(comparison["differences"][0]["figures"]["psnr"]["p"].is_f64());
+
+    let one = succeeds(folder, &format!("ablate scene --out one --only neither {few}"));
+    assert!(folder.join("one/neither/run.json").is_file() && !one.stdout.contains('±'), "{}", one.stdout);
+    let refused = run(folder, "ablate scene --only all");
+    assert_eq!(refused.code, 1, "{}", refused.stderr);
 }

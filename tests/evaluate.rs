@@ -2,7 +2,9 @@
 
 use std::path::Path;
 
-use gscream_vk::evaluate::{self, Error, Figures, Metrics, Report, ViewMetrics};
+use gscream_vk::evaluate::fid::Inception;
+use gscream_vk::evaluate::lpips::Lpips;
+use gscream_vk::evaluate::{self, Error, Figures, Judge, Metrics, Report, ViewMetrics};
 use image::{GrayImage, Luma, Rgb, Rgb32FImage, RgbImage};
 use rand::RngExt;
 use rand_pcg::Pcg64;
@@ -201,7 +203,7 @@ fn masks_of_one_pixel_none_and_all() {
     let all = evaluate::compare(&rendered, &truth, Some(&mask(19, 13, |_, _| true))).unwrap();
     assert_eq!((all.mask, all.bounding_box), (Some(all.full), Some(all.full)));
     let unmasked = evaluate::compare(&rendered, &truth, None).unwrap();
-    assert_eq!(unmasked, Metrics { full: all.full, mask: None, bounding_box: None });
+    assert_eq!(unmasked, Metrics::new(all.full));
 }
 
 #[test]
@@ -241,7 +243,7 @@ fn figures(psnr: f64, ssim: f64, flip: f64) -> Figures {
 fn report() -> Report {
     let view = |name: &str, full, mask, bounding_box| ViewMetrics {
         name: name.to_owned(),
-        metrics: Metrics { full, mask, bounding_box },
+        metrics: Metrics { mask, bounding_box, ..Metrics::new(full) },
     };
     Report::new(vec![
         view("a", figures(20.0, 0.5, 0.25), Some(figures(10.0, 0.125, 0.5)), Some(figures(12.0, 0.25, 0.5))),
@@ -271,10 +273,7 @@ mean               27.00  0.7500  0.1250    12.00  0.1875  0.3750      inf  0.62
 mean over 3 views, of the mask over the 2 views that have one; mean PSNR is the mean of the views' PSNR
 ";
     assert_eq!(report().table(), expected);
-    let unmasked = Report::new(vec![ViewMetrics {
-        name: "x".into(),
-        metrics: Metrics { full: figures(1.0, 0.5, 0.5), mask: None, bounding_box: None },
-    }]);
+    let unmasked = Report::new(vec![ViewMetrics { name: "x".into(), metrics: Metrics::new(figures(1.0, 0.5, 0.5)) }]);
     let expected = "                   full image
 view     PSNR    SSIM    FLIP
 x        1.00  0.5000  0.5000
@@ -299,4 +298,363 @@ fn the_json_holds_the_report() {
     assert!(json["views"][1].get("mask").is_none(), "absent means absent");
     let refused = report().write_json(&folder.path().join("no/such/folder/metrics.json"));
     assert!(matches!(refused, Err(Error::Write { .. })));
+}
+
+// ---------------------------------------------------------------- networks
+
+/// Float32 numbers in [0, 1) of 24 bits that follow from a tensor's name, as tests/networks/networks.py makes them.
+fn uniform(name: &str, count: usize) -> impl Iterator<Item = f32> {
+    let seed = name.bytes().fold(2_166_136_261u32, |seed, byte| (seed ^ u32::from(byte)).wrapping_mul(16_777_619));
+    (0..count as u32).map(move |i| {
+        let mut h = i.wrapping_mul(2_654_435_761).wrapping_add(seed);
+        h = (h ^ (h >> 16)).wrapping_mul(0x7feb_352d);
+        h = (h ^ (h >> 15)).wrapping_mul(0x846c_a68b);
+        h ^= h >> 16;
+        (h >> 8) as f32 * 2f32.powi(-24)
+    })
+}
+
+/// A made-up tensor, likewise, as bytes.
+fn tensor(name: &str, shape: &[usize]) -> Vec<u8> {
+    let values = uniform(name, shape.iter().product());
+    let bound = (6.0 / shape[1..].iter().product::<usize>() as f64).sqrt() as f32;
+    let value = |v: f32| {
+        if name.starts_with("lin") || name.ends_with("running_var") {
+            v + 0.5
+        } else if name.ends_with("bn.weight") {
+            v * 0.25 + 1.0
+        } else if shape.len() == 4 {
+            (v * 2.0 - 1.0) * bound
+        } else {
+            (v * 2.0 - 1.0) * 0.125
+        }
+    };
+    values.flat_map(|v| value(v).to_le_bytes()).collect()
+}
+
+/// Writes made-up tensors of these names and shapes.
+fn write_weights(path: &Path, tensors: &[(String, Vec<usize>)]) {
+    let bytes: Vec<Vec<u8>> = tensors.iter().map(|(name, shape)| tensor(name, shape)).collect();
+    let views = tensors.iter().zip(&bytes).map(|((name, shape), bytes)| {
+        (name, safetensors::tensor::TensorView::new(safetensors::Dtype::F32, shape.clone(), bytes).unwrap())
+    });
+    std::fs::write(path, safetensors::serialize(views, None).unwrap()).unwrap();
+}
+
+fn picture(k: u32) -> RgbImage {
+    RgbImage::from_fn(75, 53, |x, y| {
+        Rgb([0, 1, 2].map(|c| ((x * 7 + y * 13 + c * 50 + (x * y) % 31 * 5 + k * 37 + k * x / 3) % 256) as u8))
+    })
+}
+
+/// (index, outputs, inputs, window) of the convolutions, channels of the taps.
+type Topology = (&'static [(usize, usize, usize, usize)], [usize; 5]);
+
+const VGG: Topology = (
+    &[
+        (0, 64, 3, 3),
+        (2, 64, 64, 3),
+        (5, 128, 64, 3),
+        (7, 128, 128, 3),
+        (10, 256, 128, 3),
+        (12, 256, 256, 3),
+        (14, 256, 256, 3),
+        (17, 512, 256, 3),
+        (19, 512, 512, 3),
+        (21, 512, 512, 3),
+        (24, 512, 512, 3),
+        (26, 512, 512, 3),
+        (28, 512, 512, 3),
+    ],
+    [64, 128, 256, 512, 512],
+);
+const ALEX: Topology = (
+    &[(0, 64, 3, 11), (3, 192, 64, 5), (6, 384, 192, 3), (8, 256, 384, 3), (10, 256, 256, 3)],
+    [64, 192, 384, 256, 256],
+);
+
+fn lpips_tensors((layers, taps): Topology) -> Vec<(String, Vec<usize>)> {
+    let of = |&(i, outputs, inputs, window): &(usize, usize, usize, usize)| {
+        [
+            (format!("features.{i}.weight"), vec![outputs, inputs, window, window]),
+            (format!("features.{i}.bias"), vec![outputs]),
+        ]
+    };
+    let taps =
+        taps.iter().enumerate().map(|(i, channels)| (format!("lin{i}.model.1.weight"), vec![1, *channels, 1, 1]));
+    layers.iter().flat_map(of).chain(taps).collect()
+}
+
+fn stored() -> serde_json::Value {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/networks/values.json");
+    serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
+}
+
+/// Float32 sums of up to 4,608 products in another order, through 13 layers: each is off by some 1e-6 of the layer's
+/// size, and distances are differences of features brought to length 1.
+const NETWORK_TOLERANCE: f64 = 2e-4;
+
+#[test]
+fn lpips_is_that_of_pytorch() {
+    let folder = tempfile::tempdir().unwrap();
+    let inside = mask(75, 53, |x, y| (20..62).contains(&x) && (10..45).contains(&y) && !(x < 30 && y < 20));
+    for (name, topology) in [("vgg", VGG), ("alex", ALEX)] {
+        let path = folder.path().join(name);
+        write_weights(&path, &lpips_tensors(topology));
+        let judge = Judge { lpips: vec![Lpips::read(&path).unwrap()], ..Judge::default() };
+        let (a, b) = (picture(1), picture(2));
+        let found = judge.compare(&a, &b, Some(&inside), None).unwrap().lpips.unwrap();
+        let (signed, unit) = if name == "vgg" { (found.vgg, found.vgg_unit) } else { (found.alex, found.alex_unit) };
+        assert_eq!(found.vgg.is_some(), name == "vgg");
+        for (range, distance) in [("signed", signed.unwrap()), ("unit", unit.unwrap())] {
+            let wanted = &stored()[name][range];
+            for (region, value) in
+                [("full", Some(distance.full)), ("mask", distance.mask), ("box", distance.bounding_box)]
+            {
+                let (value, wanted) = (value.unwrap(), wanted[region].as_f64().unwrap());
+                assert!((value / wanted - 1.0).abs() < NETWORK_TOLERANCE, "{name} {range} {region}: {value} {wanted}");
+            }
+        }
+        let same = judge.compare(&a, &a, None, None).unwrap().lpips.unwrap();
+        let same = same.vgg.or(same.alex).unwrap();
+        assert_eq!((same.full, same.mask, same.bounding_box), (0.0, None, None));
+    }
+    let none = Judge::default().compare(&picture(1), &picture(2), None, None).unwrap();
+    assert!(none.lpips.is_none() && !serde_json::to_string(&none).unwrap().contains("lpips"), "absent, not zero");
+}
+
+#[test]
+fn weights_of_other_names_or_shapes_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("weights.safetensors");
+    let refusal = |tensors: &[(String, Vec<usize>)]| {
+        write_weights(&path, tensors);
+        Lpips::read(&path).err().unwrap().to_string().replace(path.to_str().unwrap(), "FILE")
+    };
+    let mut tensors = lpips_tensors(ALEX);
+    tensors.retain(|(name, _)| name != "lin3.model.1.weight");
+    let missing = refusal(&tensors);
+    tensors = lpips_tensors(ALEX);
+    tensors[2].1 = vec![192, 64, 3, 3];
+    let mut all =
+        vec![missing, refusal(&tensors), refusal(&[]), refusal(&[("features.0.weight".into(), vec![8, 3, 3, 3])])];
+    std::fs::write(&path, "no weights").unwrap();
+    let error =
+        |error: Option<evaluate::network::Error>| error.unwrap().to_string().replace(path.to_str().unwrap(), "FILE");
+    all.push(error(Lpips::read(&path).err()));
+    std::fs::remove_file(&path).unwrap();
+    all.push(error(Inception::read(&path).err()));
+    write_weights(&path, &lpips_tensors(ALEX));
+    all.push(error(Inception::read(&path).err()));
+    insta::assert_snapshot!("weights_errors", all.join("\n"));
+}
+
+/// (block, name, outputs, inputs, rows, columns) of pytorch-fid's Inception.
+fn inception_tensors() -> Vec<(String, Vec<usize>)> {
+    let mut all: Vec<(String, [usize; 4])> = vec![];
+    let mut put = |block: &str, layers: &[(&str, usize, usize, usize, usize)]| {
+        for (name, outputs, inputs, rows, columns) in layers {
+            let name = if block.is_empty() { (*name).to_owned() } else { format!("{block}.{name}") };
+            all.push((name, [*outputs, *inputs, *rows, *columns]));
+        }
+    };
+    put(
+        "",
+        &[
+            ("Conv2d_1a_3x3", 32, 3, 3, 3),
+            ("Conv2d_2a_3x3", 32, 32, 3, 3),
+            ("Conv2d_2b_3x3", 64, 32, 3, 3),
+            ("Conv2d_3b_1x1", 80, 64, 1, 1),
+            ("Conv2d_4a_3x3", 192, 80, 3, 3),
+        ],
+    );
+    for (block, n, pool) in [("Mixed_5b", 192, 32), ("Mixed_5c", 256, 64), ("Mixed_5d", 288, 64)] {
+        put(
+            block,
+            &[
+                ("branch1x1", 64, n, 1, 1),
+                ("branch5x5_1", 48, n, 1, 1),
+                ("branch5x5_2", 64, 48, 5, 5),
+                ("branch3x3dbl_1", 64, n, 1, 1),
+                ("branch3x3dbl_2", 96, 64, 3, 3),
+                ("branch3x3dbl_3", 96, 96, 3, 3),
+                ("branch_pool", pool, n, 1, 1),
+            ],
+        );
+    }
+    put(
+        "Mixed_6a",
+        &[
+            ("branch3x3", 384, 288, 3, 3),
+            ("branch3x3dbl_1", 64, 288, 1, 1),
+            ("branch3x3dbl_2", 96, 64, 3, 3),
+            ("branch3x3dbl_3", 96, 96, 3, 3),
+        ],
+    );
+    for (block, c) in [("Mixed_6b", 128), ("Mixed_6c", 160), ("Mixed_6d", 160), ("Mixed_6e", 192)] {
+        put(
+            block,
+            &[
+                ("branch1x1", 192, 768, 1, 1),
+                ("branch7x7_1", c, 768, 1, 1),
+                ("branch7x7_2", c, c, 1, 7),
+                ("branch7x7_3", 192, c, 7, 1),
+                ("branch7x7dbl_1", c, 768, 1, 1),
+                ("branch7x7dbl_2", c, c, 7, 1),
+                ("branch7x7dbl_3", c, c, 1, 7),
+                ("branch7x7dbl_4", c, c, 7, 1),
+                ("branch7x7dbl_5", 192, c, 1, 7),
+                ("branch_pool", 192, 768, 1, 1),
+            ],
+        );
+    }
+    put(
+        "Mixed_7a",
+        &[
+            ("branch3x3_1", 192, 768, 1, 1),
+            ("branch3x3_2", 320, 192, 3, 3),
+            ("branch7x7x3_1", 192, 768, 1, 1),
+            ("branch7x7x3_2", 192, 192, 1, 7),
+            ("branch7x7x3_3", 192, 192, 7, 1),
+            ("branch7x7x3_4", 192, 192, 3, 3),
+        ],
+    );
+    for (block, n) in [("Mixed_7b", 1280), ("Mixed_7c", 2048)] {
+        put(
+            block,
+            &[
+                ("branch1x1", 320, n, 1, 1),
+                ("branch3x3_1", 384, n, 1, 1),
+                ("branch3x3_2a", 384, 384, 1, 3),
+                ("branch3x3_2b", 384, 384, 3, 1),
+                ("branch3x3dbl_1", 448, n, 1, 1),
+                ("branch3x3dbl_2", 384, 448, 3, 3),
+                ("branch3x3dbl_3a", 384, 384, 1, 3),
+                ("branch3x3dbl_3b", 384, 384, 3, 1),
+                ("branch_pool", 192, n, 1, 1),
+            ],
+        );
+    }
+    let norms = ["weight", "bias", "running_mean", "running_var"];
+    all.into_iter()
+        .flat_map(|(name, shape)| {
+            let norm = norms.map(|what| (format!("{name}.bn.{what}"), vec![shape[0]]));
+            std::iter::once((format!("{name}.conv.weight"), shape.to_vec())).chain(norm)
+        })
+        .collect()
+}
+
+#[test]
+fn fid_is_that_of_pytorch_fid() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("inception.safetensors");
+    write_weights(&path, &inception_tensors());
+    let judge = Judge { inception: Some(Inception::read(&path).unwrap()), ..Judge::default() };
+    let wanted = &stored()["fid"];
+    let features = judge.inception.as_ref().unwrap().features(&picture(1));
+    assert_eq!(features.len(), evaluate::fid::FEATURES);
+    let largest = features.iter().fold(0f32, |largest, v| largest.max(v.abs()));
+    for (i, wanted) in wanted["features"].as_array().unwrap().iter().enumerate() {
+        let (found, wanted) = (features[64 * i], wanted.as_f64().unwrap());
+        assert!((f64::from(found) - wanted).abs() < NETWORK_TOLERANCE * f64::from(largest), "{i}: {found} {wanted}");
+    }
+    let mut judging = judge.start();
+    for k in [1, 2, 3] {
+        judging.add("view", &picture(k), &picture(k + 3), None, None).unwrap();
+    }
+    let fid = judging.report().mean.unwrap().fid.unwrap();
+    // PyTorch's root of a 2048 x 2048 matrix of rank 2 is the less exact side: it is defined up to what is added to its
+    // diagonal.
+    let (found, wanted) = (fid.full, wanted["distance"].as_f64().unwrap());
+    assert!((found / wanted - 1.0).abs() < 1e-2, "{found} {wanted}");
+    assert_eq!(fid.bounding_box, None);
+}
+
+// ---------------------------------------------------------------- regions
+
+#[test]
+fn regions_by_hand() {
+    // Black against a grey that grows by column: every region has its own error.
+    let truth = RgbImage::new(20, 12);
+    let rendered = RgbImage::from_fn(20, 12, |x, _| Rgb([5 * x as u8; 3]));
+    let inside = mask(20, 12, |x, _| x >= 10);
+    let seen = mask(20, 12, |x, _| x % 2 == 0);
+    let metrics = evaluate::compare_seen(&rendered, &truth, Some(&inside), Some(&seen)).unwrap();
+    let psnr = |columns: &mut dyn Iterator<Item = u32>| {
+        let squares: Vec<f64> = columns.map(|x| (f64::from(5 * x) / 255.0).powi(2)).collect();
+        -10.0 * (squares.iter().sum::<f64>() / squares.len() as f64).log10()
+    };
+    // 3 pixels on either side of the edge between columns 9 and 10.
+    for (figures, columns) in [
+        (Some(metrics.full), 0..20),
+        (metrics.mask, 10..20),
+        (metrics.bounding_box, 10..20),
+        (metrics.outside, 0..10),
+        (metrics.rim, 7..13),
+    ] {
+        assert!(close(figures.unwrap().psnr, psnr(&mut columns.clone()), 1e-12), "{columns:?}: {figures:?}");
+    }
+    for (figures, columns) in [
+        (metrics.full_seen, 0..20),
+        (metrics.mask_seen, 10..20),
+        (metrics.box_seen, 10..20),
+        (metrics.outside_seen, 0..10),
+        (metrics.rim_seen, 8..13),
+    ] {
+        assert!(close(figures.unwrap().psnr, psnr(&mut columns.clone().step_by(2)), 1e-12), "{columns:?}: {figures:?}");
+    }
+    assert_eq!(metrics.seen_share, Some(0.5));
+    // The old figures are those of a comparison without a map.
+    let plain = evaluate::compare(&rendered, &truth, Some(&inside)).unwrap();
+    assert_eq!((plain.full, plain.mask, plain.bounding_box), (metrics.full, metrics.mask, metrics.bounding_box));
+    assert_eq!((plain.outside, plain.rim, plain.outside_seen), (metrics.outside, metrics.rim, None));
+    // An empty mask: outside is everywhere, and there is no edge. Nothing seen: no figures.
+    let none = evaluate::compare_seen(&rendered, &truth, Some(&GrayImage::new(20, 12)), Some(&GrayImage::new(20, 12)));
+    let none = none.unwrap();
+    assert_eq!((none.outside, none.rim, none.full_seen, none.seen_share), (Some(none.full), None, None, Some(0.0)));
+    let text = serde_json::to_value(metrics).unwrap();
+    for key in
+        ["full", "mask", "box", "outside", "rim", "full_seen", "mask_seen", "box_seen", "outside_seen", "rim_seen"]
+    {
+        assert!(text[key]["psnr"].is_f64(), "{key}");
+    }
+    let message = evaluate::compare_seen(&rendered, &truth, None, Some(&GrayImage::new(3, 4))).unwrap_err().to_string();
+    assert_eq!(message, "the map of seen pixels is 3 x 4, but the rendered image is 20 x 12");
+}
+
+#[test]
+fn the_table_has_a_block_by_region_where_there_are_more_than_three() {
+    let (rendered, truth) = (noise(40, 30, 1), noise(40, 30, 2));
+    let inside = mask(40, 30, |x, y| (10..20).contains(&x) && (10..20).contains(&y));
+    let seen = mask(40, 30, |x, _| x < 30);
+    let judge = Judge { protocol: evaluate::Protocol::Spinnerf, ..Judge::default() };
+    let mut judging = judge.start();
+    let metrics = judging.add("a", &rendered, &truth, Some(&inside), Some(&seen)).unwrap();
+    metrics.geometry = Some(evaluate::Geometry { relative_error: Some(0.0123), completeness: 0.875 });
+    let residue = |name: &str, residue| evaluate::Residue { name: name.into(), residue };
+    let report = judging.report().with_residues(vec![residue("x", 0.25), residue("y", 0.75)]);
+    insta::assert_snapshot!("table_by_region", report.table());
+    assert_eq!(report.mean.unwrap().residue, Some(0.5));
+}
+
+/// A tenth of 10 pixels on every side, within the picture.
+#[test]
+fn a_protocols_box_grows_by_its_margin() {
+    let (rendered, truth) = (noise(40, 30, 1), noise(40, 30, 2));
+    let inside = mask(40, 30, |x, y| (10..20).contains(&x) && y < 10);
+    let grown = mask(40, 30, |x, y| (9..21).contains(&x) && y < 11);
+    let of = |protocol, mask: &GrayImage| {
+        let judge = Judge { protocol, ..Judge::default() };
+        judge.compare(&rendered, &truth, Some(mask), None).unwrap()
+    };
+    let (plain, spin) = (of(evaluate::Protocol::Plain, &inside), of(evaluate::Protocol::Spinnerf, &inside));
+    assert_eq!((plain.full, plain.mask), (spin.full, spin.mask));
+    assert_eq!(spin.bounding_box, of(evaluate::Protocol::Plain, &grown).mask);
+    assert_eq!(of(evaluate::Protocol::Mvip, &inside), plain);
+    let departs = evaluate::Protocol::Gscream.departs([252, 142]).unwrap();
+    assert!(departs.contains("252 x 142") && departs.contains("1008 x 567"), "{departs}");
+    assert_eq!(
+        (evaluate::Protocol::Gscream.departs([1008, 567]), evaluate::Protocol::Plain.departs([5, 5])),
+        (None, None)
+    );
 }

@@ -505,6 +505,81 @@ fn a_clean_test_view_can_be_the_reference() {
     ");
 }
 
+/// Another depth model's priors and another inpainted picture, beside the delivered ones.
+#[test]
+fn other_priors_and_another_reference_take_the_place_of_the_delivered() {
+    let dir = plain();
+    let at = |name: &str| dir.path().join(name);
+    let flat = |value: f32| Array2::from_elem((SIZE[1] as usize, SIZE[0] as usize), value);
+    save_npy(at("other-disparity/a.npy"), &flat(2.0));
+    save_npy(at("other-disparity/reference/b.npy"), &flat(3.0));
+    save_npy(at("metric/b.npy"), &flat(4.0));
+    let grey = RgbImage::from_pixel(SIZE[0], SIZE[1], Rgb([5; 3]));
+    save(at("lama.png"), &grey);
+    save(at("lama/c.png"), &grey);
+    let priors = |folder: &str| Config { prior_folder: folder.into(), ..Config::default() };
+    let scene = scene::load(dir.path(), &priors("other-disparity")).unwrap();
+    let prior = scene.train[0].prior.as_ref().unwrap();
+    assert_eq!((prior.kind, prior.values[0]), (PriorKind::Disparity, 2.0));
+    assert!(scene.train[1].prior.is_none() && scene.train[2].prior.is_none(), "no mixture of two models");
+    let prior = scene.reference.as_ref().unwrap().prior.as_ref().unwrap();
+    assert_eq!((prior.kind, prior.values[0]), (PriorKind::Disparity, 3.0));
+    let scene = scene::load(dir.path(), &priors(at("metric").to_str().unwrap())).unwrap();
+    assert_eq!(scene.train[1].prior.as_ref().unwrap().kind, PriorKind::Depth);
+    assert_note!(scene, "the inpainted picture keeps its delivered prior");
+
+    let reference = |file: &str| Config { reference_file: file.into(), ..Config::default() };
+    let view = |file: &str| {
+        let scene = scene::load(dir.path(), &reference(file)).unwrap();
+        let reference = scene.reference.unwrap();
+        assert_eq!(reference.image.as_raw(), grey.as_raw());
+        (scene.train[reference.view].name.clone(), reference.prior.is_some())
+    };
+    assert_eq!(view("lama.png"), ("b".into(), true), "that of the delivered reference's view");
+    assert_eq!(view("lama/c.png"), ("c".into(), false), "that of the view of its name");
+
+    let mut all = vec![refusal_with(&dir, &priors("gone"))];
+    fs::create_dir(at("empty")).unwrap();
+    all.push(refusal_with(&dir, &priors("empty")));
+    all.push(refusal_with(&dir, &reference("gone.png")));
+    all.push(refusal_with(&dir, &Config { truth_reference: "t".into(), ..reference("lama.png") }));
+    fs::remove_dir_all(at("reference")).unwrap();
+    all.push(refusal_with(&dir, &reference("lama.png")));
+    insta::assert_snapshot!(all.join("\n"), @"
+    gone: there is no such folder
+    empty: no prior has the name of a train view; name them after the photographs
+    gone.png: No such file or directory (os error 2)
+    scene.reference_file and scene.truth_reference are both set; a scene has one reference
+    lama.png: no train view has this name; name the inpainted picture after the view it replaces
+    ");
+}
+
+/// True depth of test views: nearest of its pixels, unknown where it is not positive.
+#[test]
+fn true_depth_of_test_views_is_read() {
+    let dir = plain();
+    assert!(load(&dir).test[0].depth.is_none());
+    let values = Array2::from_shape_fn((SIZE[1] as usize, SIZE[0] as usize), |(y, x)| match (x, y) {
+        (0, 0) => f32::NAN,
+        (1, 0) => -1.0,
+        _ => (x + 100 * y) as f32,
+    });
+    save_npy(dir.path().join("test_depth/t.npy"), &values);
+    let depth = load(&dir).test[0].depth.clone().unwrap();
+    assert_eq!((depth[0], depth[1], depth[2], depth[64 + 5]), (0.0, 0.0, 2.0, 105.0));
+    let half = scene::load(dir.path(), &Config { downscale: 2, ..Config::default() }).unwrap();
+    assert_eq!(half.test[0].depth.as_ref().unwrap()[32 + 3], 307.0, "no mean of what lies before and behind");
+    // Without a prior of its own, it is that of a clean reference.
+    let config = Config { truth_reference: "t".into(), ..Config::default() };
+    save_npy(dir.path().join("test_depth/t.npy"), &depth_of_one());
+    let truth = scene::load(dir.path(), &config).unwrap().reference.unwrap().prior.unwrap();
+    assert_eq!((truth.kind, truth.values[9]), (PriorKind::Depth, 1.0));
+}
+
+fn depth_of_one() -> Array2<f32> {
+    Array2::from_elem((SIZE[1] as usize, SIZE[0] as usize), 1.0)
+}
+
 #[test]
 fn contradictions_are_refused() {
     let with = |change: &dyn Fn(&Path)| {

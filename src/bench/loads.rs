@@ -159,6 +159,7 @@ impl Load {
             image: image.clone(),
             mask: Some(mask),
             prior: Some(prior.clone()),
+            depth: None,
         };
         Scene {
             train: vec![view],

@@ -6,6 +6,7 @@
 //! RUN/model/          point_cloud.ply and weights.safetensors
 //! RUN/log.jsonl       losses, counts and speed, a JSON object per line
 //! RUN/test/NAME.png   the test views as rendered at the end
+//! RUN/seen/NAME.png   white where some train view photographed what they show
 //! RUN/metrics.json    their figures
 //! RUN/checkpoints/    until the run is complete: what it goes on from
 //! ```
@@ -28,6 +29,8 @@ pub const SETTINGS: &str = "settings.toml";
 pub const MODEL: &str = "model";
 /// The rendered test views within a run folder.
 pub const TEST: &str = "test";
+/// Which of their pixels some train view photographed, within a run folder.
+pub const SEEN: &str = "seen";
 
 /// Who made a run and of what.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]

@@ -10,6 +10,7 @@ mod bench;
 mod devices;
 mod eval;
 pub mod folders;
+mod instruments;
 pub mod pictures;
 mod plan;
 mod render;

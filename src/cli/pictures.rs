@@ -39,6 +39,16 @@ pub fn write_png(path: &Path, size: [u32; 2], rgb: &[[f32; 3]]) -> Result<(), Er
     encoded.and_then(|()| write(path, bytes.get_ref())).map_err(|source| Error { path: path.to_owned(), source })
 }
 
+/// Writes a grey picture as PNG, making the folder if it is missing. The file appears complete or not at all.
+///
+/// # Errors
+/// A path that cannot be written.
+pub fn write_mask(path: &Path, mask: &image::GrayImage) -> Result<(), Error> {
+    let mut bytes = Cursor::new(Vec::new());
+    let encoded = mask.write_to(&mut bytes, ImageFormat::Png).map_err(io::Error::other);
+    encoded.and_then(|()| write(path, bytes.get_ref())).map_err(|source| Error { path: path.to_owned(), source })
+}
+
 /// Writes an OpenEXR file with two float32 channels, making the folder if it is missing. The file appears complete or not
 /// at all.
 /// - `Z`: the rendered depth, the sum of z alpha T along the pixel's ray in scene units. It is not divided by the

@@ -236,6 +236,28 @@ fn summary(report: &Report) -> String {
                 superfluous(v.dominated_by.as_ref())
             ));
         }
+        if !training.differences.is_empty() {
+            lines.push(format!("{:<28} {:>16} {:>16} {:>18}", "over the seeds", "PSNR", "masked PSNR", "SSIM"));
+            for end in &training.ends {
+                let of = |name, digits| end.figures.get(name).map_or("-".to_owned(), |m| m.text(digits));
+                lines.push(format!(
+                    "{:<28} {:>16} {:>16} {:>18}",
+                    end.variant,
+                    of("psnr", 2),
+                    of("masked_psnr", 2),
+                    of("ssim", 4)
+                ));
+            }
+            for d in &training.differences {
+                let of = |name| {
+                    let tested = d.figures.get(name);
+                    tested.map_or("-".to_owned(), |t| {
+                        format!("{:+.2} ± {:.2} dB (p {:.3})", t.difference, t.standard_error, t.p)
+                    })
+                };
+                lines.push(format!("{} less {}: PSNR {}, masked {}", d.to, d.from, of("psnr"), of("masked_psnr")));
+            }
+        }
     }
     lines.join("\n") + "\n"
 }

@@ -89,10 +89,8 @@ impl SceneArgs {
     /// # Errors
     /// Settings that make no sense; a scene that cannot be read.
     pub fn load(&self) -> anyhow::Result<(Scene, Settings)> {
-        let mut settings = self.settings.resolve()?;
-        let scene = load_scene(&self.scene, &settings)?;
-        settings.fit_pixels(&scene);
-        Ok((scene, settings))
+        let settings = self.settings.resolve()?;
+        Ok((load_scene(&self.scene, &settings)?, settings))
     }
 
     /// The scene as a run's record names it.

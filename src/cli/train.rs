@@ -9,11 +9,11 @@ use anyhow::{Context as _, bail, ensure};
 use atomic_write_file::AtomicWriteFile;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::folders::{MODEL, RECORD, Record, SETTINGS, TEST};
-use super::pictures;
+use super::folders::{MODEL, RECORD, Record, SEEN, SETTINGS, TEST};
 use super::shared::{DeviceArgs, SceneArgs, load_scene, with_gpu};
+use super::{instruments, pictures};
 use crate::config::{Settings, SettingsArgs, Source};
-use crate::evaluate::Report;
+use crate::evaluate::{Judge, Report};
 use crate::gpu::{Gpu, Options, Timing};
 use crate::model::files::{POINT_CLOUD, WEIGHTS};
 use crate::render::view::Rendered;
@@ -95,7 +95,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         let Trained { summary, report, mut written } = if args.resume.is_some() {
             resume(gpu, &scene, &settings, &name, &folder, began)?
         } else {
-            train(gpu, &scene, &settings, &name, &folder, began)?
+            train(gpu, &scene, &settings, &name, &folder, began, &Judge::default())?
         };
         if let Some(report) = report {
             println!("{}", report.table());
@@ -136,6 +136,7 @@ pub(super) fn train(
     name: &str,
     folder: &Path,
     began: Option<Instant>,
+    judge: &Judge,
 ) -> anyhow::Result<Trained> {
     std::fs::create_dir_all(folder).with_context(|| format!("{}: cannot be made", folder.display()))?;
     let run = start(gpu, scene, settings)?;
@@ -147,7 +148,8 @@ pub(super) fn train(
     for left in &run.step().plan.left_out {
         eprintln!("left out: {} ({})", left.what, left.why);
     }
-    finish(run, settings, record, folder, began)
+    let trained = finish(run, settings, record, folder, began)?;
+    judged(gpu, scene, settings, folder, judge, trained)
 }
 
 /// A run from its first step, with room for what it is expected to take; refused where the device has not that much.
@@ -203,7 +205,8 @@ fn resume(
         name.clone_into(&mut record.scene);
         record.write(folder)?;
     }
-    finish(run, settings, record, folder, began)
+    let trained = finish(run, settings, record, folder, began)?;
+    judged(gpu, scene, settings, folder, &Judge::default(), trained)
 }
 
 /// Trains to the end, evaluates, and marks the run as complete.
@@ -234,6 +237,25 @@ fn finish(
     Ok(Trained { summary, report, written })
 }
 
+/// Judges the model of a run that has ended by all that there is to judge it by, in place of the run's own figures.
+fn judged(
+    gpu: &Gpu,
+    scene: &Scene,
+    settings: &Settings,
+    folder: &Path,
+    judge: &Judge,
+    mut trained: Trained,
+) -> anyhow::Result<Trained> {
+    if trained.report.is_some() {
+        let measured = instruments::measure(gpu, &folder.join(MODEL), scene, settings, judge)?;
+        measured.write_seen(scene, &folder.join(SEEN))?;
+        measured.report.write_json(&folder.join(METRICS))?;
+        trained.report = Some(measured.report);
+        trained.written.push(SEEN);
+    }
+    Ok(trained)
+}
+
 /// Removes what an earlier run left in the folder, the record last: until then the folder holds a run.
 fn clear(folder: &Path) -> anyhow::Result<()> {
     sweep(folder);
@@ -247,8 +269,9 @@ fn clear(folder: &Path) -> anyhow::Result<()> {
         }
         _ => Ok(()),
     };
-    let test = folder.join(TEST);
-    gone(test.clone(), std::fs::remove_dir_all(&test))?;
+    for pictures in [TEST, SEEN].map(|name| folder.join(name)) {
+        gone(pictures.clone(), std::fs::remove_dir_all(&pictures))?;
+    }
     let model = folder.join(MODEL);
     let files = [model.join(POINT_CLOUD), model.join(WEIGHTS)];
     for path in files.into_iter().chain([LOG, METRICS, TRACE, SETTINGS, RECORD].map(|name| folder.join(name))) {
@@ -263,6 +286,7 @@ fn sweep(folder: &Path) {
     checkpoint::sweep(&folder.join(checkpoint::FOLDER), |name| name.starts_with("step-"));
     checkpoint::sweep(&folder.join(MODEL), |name| [POINT_CLOUD, WEIGHTS].contains(&name));
     checkpoint::sweep(&folder.join(TEST), |name| name.ends_with(".png"));
+    checkpoint::sweep(&folder.join(SEEN), |name| name.ends_with(".png"));
 }
 
 /// Writes a file that appears complete or not at all.

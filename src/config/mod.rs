@@ -92,19 +92,23 @@ impl Settings {
         self.densify.validate().map_err(|invalid| invalid.inside("densify"))
     }
 
-    /// Turns what is given in pixels into world units of this scene, once it is read and conditioned: the initial grid, the
-    /// growth cells and the cap of the scales. What is said in world units stays.
-    pub fn fit_pixels(&mut self, scene: &crate::scene::Scene) {
-        let Some(pixel) = crate::scene::footprint(scene) else { return };
-        if self.model.voxel <= 0.0 && self.model.voxel_pixels > 0.0 {
-            self.model.voxel = self.model.voxel_pixels * self.model.voxel_factor * pixel;
+    /// These settings with what is given in pixels turned into world units of this scene: the initial grid, the growth cells
+    /// and the cap of the scales. What is said in world units stays.
+    pub fn fitted(&self, scene: &crate::scene::Scene) -> Self {
+        let mut fitted = self.clone();
+        let (model, densify) = (&mut fitted.model, &mut fitted.densify);
+        let asked = model.voxel_pixels > 0.0 || densify.coarsest_pixels > 0.0 || densify.max_pixels > 0.0;
+        let Some(pixel) = asked.then(|| crate::scene::footprint(scene)).flatten() else { return fitted };
+        if model.voxel <= 0.0 && model.voxel_pixels > 0.0 {
+            model.voxel = model.voxel_pixels * model.voxel_factor * pixel;
         }
-        if self.model.voxel > 0.0 && self.densify.coarsest_pixels > 0.0 {
-            self.densify.coarsest_cell = self.densify.coarsest_pixels * pixel / self.model.voxel;
+        if model.voxel > 0.0 && densify.coarsest_pixels > 0.0 {
+            densify.coarsest_cell = densify.coarsest_pixels * pixel / model.voxel;
         }
-        if self.densify.max_pixels > 0.0 {
-            self.densify.max_log_scaling = (self.densify.max_pixels * pixel).ln();
+        if densify.max_pixels > 0.0 {
+            densify.max_log_scaling = (densify.max_pixels * pixel).ln();
         }
+        fitted
     }
 
     /// The settings as TOML, every key written out; [`Settings::resolve`] reads it back to the same value.

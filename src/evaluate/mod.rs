@@ -1,16 +1,32 @@
 //! Image metrics and their report.
 //!
-//! PSNR, SSIM and FLIP of a rendered view against its photograph, each on the full image, inside the mask, and inside the
-//! mask's bounding box. The maps of SSIM and FLIP are computed once on the full image and averaged over the region, so that
-//! a region's border sees its real surroundings.
+//! PSNR, SSIM and FLIP of a rendered view against its photograph, each on the full image, inside the mask, inside the
+//! mask's bounding box, outside the mask and around its edge; and each of these once more over the pixels alone that some
+//! train view photographed ([`seen_map`]). The maps of SSIM and FLIP are computed once on the full image and averaged over
+//! the region, so that a region's border sees its real surroundings.
+//!
+//! What a photograph without the object does not tell is measured in [`hole`]: the geometry behind the object, and how
+//! much of the object is left.
 
+pub mod fid;
+pub mod hole;
+pub mod lpips;
+pub mod network;
+mod protocol;
 mod report;
+mod seen;
 mod ssim;
 
 use image::{GrayImage, ImageBuffer, Pixel, Rgb32FImage, RgbImage};
 use serde::{Deserialize, Serialize};
 
-pub use report::{Mean, Report, ViewMetrics};
+use crate::scene::resample;
+
+pub use hole::Geometry;
+pub use lpips::Perceptual;
+pub use protocol::{Judge, Judging, PUBLISHED_ROWS, Protocol, Published};
+pub use report::{Mean, Report, Residue, ViewMetrics};
+pub use seen::{Shown, Surface, seen_map};
 pub use ssim::ssim_map;
 
 /// Why two images cannot be compared, or a report not be written.
@@ -19,7 +35,7 @@ pub enum Error {
     /// Images, or an image and its mask, of different sizes.
     #[error("the {what} is {} x {}, but the rendered image is {} x {}", found.0, found.1, rendered.0, rendered.1)]
     Size {
-        /// "photograph" or "mask".
+        /// "photograph", "mask" or "map of seen pixels".
         what: &'static str,
         /// Its width and height, pixels.
         found: (u32, u32),
@@ -62,7 +78,11 @@ pub struct Figures {
     pub flip: f64,
 }
 
-/// The metrics of one view by region. Metrics of the mask are absent without a mask, or where it is empty.
+/// Half the width of the rim: pixels on either side of the mask's edge.
+pub const RIM: u32 = 3;
+
+/// The metrics of one view by region. Those of the mask are absent without a mask, or where it is empty; those of seen
+/// pixels are absent where it is not known what was seen, or nothing was.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Metrics {
     /// All pixels.
@@ -73,6 +93,123 @@ pub struct Metrics {
     /// The smallest upright rectangle that holds them.
     #[serde(rename = "box", skip_serializing_if = "Option::is_none", default)]
     pub bounding_box: Option<Figures>,
+    /// Pixels where the mask is zero.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub outside: Option<Figures>,
+    /// Pixels within [`RIM`] pixels of the mask's edge, on both sides of it.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub rim: Option<Figures>,
+    /// Pixels that some train view photographed, of all.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub full_seen: Option<Figures>,
+    /// Of those inside the mask.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub mask_seen: Option<Figures>,
+    /// Of those in its rectangle.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub box_seen: Option<Figures>,
+    /// Of those outside the mask.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub outside_seen: Option<Figures>,
+    /// Of those at its rim.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub rim_seen: Option<Figures>,
+    /// Share of all pixels that some train view photographed.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub seen_share: Option<f64>,
+    /// Depth inside the mask, where the true one is known.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub geometry: Option<Geometry>,
+    /// Distances in the features of networks, where their weights are known.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub lpips: Option<Perceptual>,
+}
+
+/// A part of a picture.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Region {
+    /// All of it.
+    Full,
+    /// Outside the mask.
+    Outside,
+    /// Around the mask's edge.
+    Rim,
+    /// Inside the mask.
+    Mask,
+    /// The mask's bounding box.
+    Box,
+}
+
+impl Region {
+    /// In the order of tables.
+    pub const ALL: [Self; 5] = [Self::Full, Self::Outside, Self::Rim, Self::Mask, Self::Box];
+
+    /// In words.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Full => "full image",
+            Self::Outside => "outside mask",
+            Self::Rim => "mask's rim",
+            Self::Mask => "inside mask",
+            Self::Box => "mask's box",
+        }
+    }
+}
+
+impl Metrics {
+    /// Of a view of which nothing but the full image is judged.
+    pub fn new(full: Figures) -> Self {
+        Self {
+            full,
+            mask: None,
+            bounding_box: None,
+            outside: None,
+            rim: None,
+            full_seen: None,
+            mask_seen: None,
+            box_seen: None,
+            outside_seen: None,
+            rim_seen: None,
+            seen_share: None,
+            geometry: None,
+            lpips: None,
+        }
+    }
+
+    /// The figures of a region, of all its pixels or of the seen ones alone.
+    pub fn of(&self, region: Region, seen: bool) -> Option<Figures> {
+        match (region, seen) {
+            (Region::Full, false) => Some(self.full),
+            (Region::Outside, false) => self.outside,
+            (Region::Rim, false) => self.rim,
+            (Region::Mask, false) => self.mask,
+            (Region::Box, false) => self.bounding_box,
+            (Region::Full, true) => self.full_seen,
+            (Region::Outside, true) => self.outside_seen,
+            (Region::Rim, true) => self.rim_seen,
+            (Region::Mask, true) => self.mask_seen,
+            (Region::Box, true) => self.box_seen,
+        }
+    }
+
+    /// Sets what [`Metrics::of`] returns.
+    fn set(&mut self, region: Region, seen: bool, figures: Option<Figures>) {
+        *match (region, seen) {
+            (Region::Full, false) => {
+                self.full = figures.unwrap_or(self.full);
+                return;
+            }
+            (Region::Outside, false) => &mut self.outside,
+            (Region::Rim, false) => &mut self.rim,
+            (Region::Mask, false) => &mut self.mask,
+            (Region::Box, false) => &mut self.bounding_box,
+            (Region::Full, true) => &mut self.full_seen,
+            (Region::Outside, true) => &mut self.outside_seen,
+            (Region::Rim, true) => &mut self.rim_seen,
+            (Region::Mask, true) => &mut self.mask_seen,
+            (Region::Box, true) => &mut self.box_seen,
+        } = figures;
+    }
 }
 
 /// Compares an 8-bit rendered view with its photograph. `mask` is non-zero inside the object's region.
@@ -80,9 +217,33 @@ pub struct Metrics {
 /// # Errors
 /// Images or mask of different sizes, or without pixels.
 pub fn compare(rendered: &RgbImage, truth: &RgbImage, mask: Option<&GrayImage>) -> Result<Metrics, Error> {
+    compare_seen(rendered, truth, mask, None)
+}
+
+/// [`compare`] with figures of the pixels alone where `seen` is not zero beside those of all ([`seen_map`]).
+///
+/// # Errors
+/// As [`compare`].
+pub fn compare_seen(
+    rendered: &RgbImage,
+    truth: &RgbImage,
+    mask: Option<&GrayImage>,
+    seen: Option<&GrayImage>,
+) -> Result<Metrics, Error> {
+    measure(rendered, truth, mask, seen, Protocol::Plain)
+}
+
+fn measure(
+    rendered: &RgbImage,
+    truth: &RgbImage,
+    mask: Option<&GrayImage>,
+    seen: Option<&GrayImage>,
+    protocol: Protocol,
+) -> Result<Metrics, Error> {
     let unit = |image: &RgbImage| image.as_raw().iter().map(|v| f64::from(*v) / 255.0).collect::<Vec<_>>();
-    check_sizes(rendered, truth, mask)?;
-    Ok(metrics(rendered.dimensions(), &unit(rendered), &unit(truth), &flip_map(rendered, truth), mask))
+    check_sizes(rendered, truth, mask, seen)?;
+    let flip = flip_map(rendered, truth);
+    Ok(metrics(rendered.dimensions(), [&unit(rendered), &unit(truth)], &flip, mask, seen, protocol))
 }
 
 /// Compares float images with values in \[0, 1\]. PSNR and SSIM see the values as they are; FLIP sees them clamped and
@@ -91,7 +252,7 @@ pub fn compare(rendered: &RgbImage, truth: &RgbImage, mask: Option<&GrayImage>) 
 /// # Errors
 /// Images or mask of different sizes, or without pixels; values that are not finite.
 pub fn compare_float(rendered: &Rgb32FImage, truth: &Rgb32FImage, mask: Option<&GrayImage>) -> Result<Metrics, Error> {
-    check_sizes(rendered, truth, mask)?;
+    check_sizes(rendered, truth, mask, None)?;
     for (what, image) in [("rendered image", rendered), ("photograph", truth)] {
         let broken = image.enumerate_pixels().find(|(_, _, pixel)| pixel.0.iter().any(|v| !v.is_finite()));
         if let Some((x, y, _)) = broken {
@@ -100,7 +261,7 @@ pub fn compare_float(rendered: &Rgb32FImage, truth: &Rgb32FImage, mask: Option<&
     }
     let wide = |image: &Rgb32FImage| image.as_raw().iter().map(|v| f64::from(*v)).collect::<Vec<_>>();
     let flip = flip_map(&to_bytes(rendered), &to_bytes(truth));
-    Ok(metrics(rendered.dimensions(), &wide(rendered), &wide(truth), &flip, mask))
+    Ok(metrics(rendered.dimensions(), [&wide(rendered), &wide(truth)], &flip, mask, None, Protocol::Plain))
 }
 
 fn to_bytes(image: &Rgb32FImage) -> RgbImage {
@@ -112,9 +273,14 @@ fn check_sizes<P: Pixel>(
     rendered: &ImageBuffer<P, Vec<P::Subpixel>>,
     truth: &ImageBuffer<P, Vec<P::Subpixel>>,
     mask: Option<&GrayImage>,
+    seen: Option<&GrayImage>,
 ) -> Result<(), Error> {
     let size = rendered.dimensions();
-    let others = [("photograph", Some(truth.dimensions())), ("mask", mask.map(GrayImage::dimensions))];
+    let others = [
+        ("photograph", Some(truth.dimensions())),
+        ("mask", mask.map(GrayImage::dimensions)),
+        ("map of seen pixels", seen.map(GrayImage::dimensions)),
+    ];
     for (what, found) in others {
         if let Some(found) = found.filter(|found| *found != size) {
             return Err(Error::Size { what, found, rendered: size });
@@ -131,16 +297,17 @@ fn flip_map(rendered: &RgbImage, truth: &RgbImage) -> Vec<f32> {
 
 fn metrics(
     (width, height): (u32, u32),
-    rendered: &[f64],
-    truth: &[f64],
+    [rendered, truth]: [&[f64]; 2],
     flip: &[f32],
     mask: Option<&GrayImage>,
+    seen: Option<&GrayImage>,
+    protocol: Protocol,
 ) -> Metrics {
     let (width, height) = (width as usize, height as usize);
     let ssim = ssim_map(rendered, truth, width, height);
-    let measure = |pixels: &mut dyn Iterator<Item = usize>| {
+    let measure = |inside: &dyn Fn(usize) -> bool| {
         let (mut count, mut square, mut similarity, mut difference) = (0usize, 0.0, 0.0, 0.0);
-        for pixel in pixels {
+        for pixel in (0..width * height).filter(|pixel| inside(*pixel)) {
             count += 1;
             let channels = 3 * pixel..3 * pixel + 3;
             square += channels.clone().map(|i| (rendered[i] - truth[i]).powi(2)).sum::<f64>() / 3.0;
@@ -150,14 +317,39 @@ fn metrics(
         let n = count as f64;
         (count > 0).then(|| Figures { psnr: psnr(square / n), ssim: similarity / n, flip: difference / n })
     };
-    let full = measure(&mut (0..width * height)).expect("the image has pixels");
-    let Some(mask) = mask else { return Metrics { full, mask: None, bounding_box: None } };
-    let inside = |pixel: &usize| mask.as_raw()[*pixel] != 0;
-    let masked = measure(&mut (0..width * height).filter(inside));
-    let bounding_box = bounding_box(mask).and_then(|[left, top, right, bottom]| {
-        measure(&mut (top..=bottom).flat_map(|row| (left..=right).map(move |column| row * width + column)))
-    });
-    Metrics { full, mask: masked, bounding_box }
+    let mut metrics = Metrics::new(measure(&|_| true).expect("the image has pixels"));
+    let bounding_box = mask.and_then(|mask| protocol.bounding_box(mask));
+    let rim = mask.map(rim);
+    let was_seen = |pixel: usize| seen.is_none_or(|seen| seen.as_raw()[pixel] != 0);
+    for region in Region::ALL {
+        let inside = |pixel: usize| match (region, mask) {
+            (Region::Full, _) => true,
+            (_, None) => false,
+            (Region::Outside, Some(mask)) => mask.as_raw()[pixel] == 0,
+            (Region::Mask, Some(mask)) => mask.as_raw()[pixel] != 0,
+            (Region::Rim, _) => rim.as_ref().is_some_and(|rim| rim[pixel]),
+            (Region::Box, _) => bounding_box.is_some_and(|[left, top, right, bottom]| {
+                (left..=right).contains(&(pixel % width)) && (top..=bottom).contains(&(pixel / width))
+            }),
+        };
+        if region != Region::Full {
+            metrics.set(region, false, measure(&inside));
+        }
+        if seen.is_some() {
+            metrics.set(region, true, measure(&|pixel| inside(pixel) && was_seen(pixel)));
+        }
+    }
+    metrics.seen_share =
+        seen.map(|seen| seen.as_raw().iter().filter(|value| **value != 0).count() as f64 / (width * height) as f64);
+    metrics
+}
+
+/// Per pixel: whether the nearest pixel on the other side of the mask's edge is at most [`RIM`] pixels away.
+fn rim(mask: &GrayImage) -> Vec<bool> {
+    let mut other = mask.clone();
+    other.iter_mut().for_each(|value| *value = u8::from(*value == 0));
+    let (inner, outer) = (resample::dilate(mask, RIM), resample::dilate(&other, RIM));
+    inner.as_raw().iter().zip(outer.as_raw()).map(|(a, b)| *a != 0 && *b != 0).collect()
 }
 
 /// Left, top, right and bottom pixel of the mask's non-zero region, all inclusive.

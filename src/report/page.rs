@@ -4,8 +4,8 @@ use maud::{DOCTYPE, Markup, PreEscaped, html};
 
 use super::figures;
 use super::kernels::{Distance, Kernels, VariantFigures};
-use super::statistics::Spread;
-use super::training::Training;
+use super::statistics::{Paired, Spread};
+use super::training::{self, Training};
 use super::{Omitted, Report};
 
 /// The drawn figures.
@@ -269,7 +269,7 @@ fn row(v: &VariantFigures) -> Markup {
 }
 
 fn of_training(training: &Training, drawings: &Drawings) -> Markup {
-    let Training { iterations, test_views, variants, omitted, steps } = training;
+    let Training { iterations, test_views, variants, omitted, steps, ends, differences } = training;
     let seeds = variants.first().map_or(0, |v| v.runs.len());
     html! {
         h2 { "Training" }
@@ -304,7 +304,44 @@ fn of_training(training: &Training, drawings: &Drawings) -> Markup {
                 }
             } } }
         } }
+        @if !differences.is_empty() { (over_seeds(ends, differences)) }
         (left_out(omitted))
+    }
+}
+
+/// Means, deviations and paired differences at the ends of all choices.
+fn over_seeds(ends: &[training::End], differences: &[training::Difference]) -> Markup {
+    let columns = [
+        ("psnr", "PSNR, dB", 2),
+        ("masked_psnr", "masked PSNR, dB", 2),
+        ("ssim", "SSIM", 4),
+        ("seconds", "seconds", 1),
+    ];
+    let tested = |d: &training::Difference, name: &str, digits: usize| {
+        d.figures.get(name).map_or("–".to_owned(), |paired| {
+            let Paired { difference, standard_error, p, .. } = paired;
+            format!("{difference:+.digits$} ± {standard_error:.digits$} (p {p:.3})")
+        })
+    };
+    html! {
+        p { "At the end of the runs: mean ± standard deviation of a seed." }
+        div.wide { table {
+            thead { tr { th { "choice" } @for (_, title, _) in columns { th.n { (title) } } } }
+            tbody { @for end in ends { tr {
+                th { (end.variant) }
+                @for (name, _, digits) in columns {
+                    td.n { (end.figures.get(name).map_or("–".to_owned(), |moments| moments.text(digits))) }
+                }
+            } } }
+        } }
+        p { "Differences over the same seeds: mean ± its standard error, and p of a paired t-test." }
+        div.wide { table {
+            thead { tr { th { "difference" } @for (_, title, _) in columns { th.n { (title) } } } }
+            tbody { @for d in differences { tr {
+                th { (d.to) " less " (d.from) }
+                @for (name, _, digits) in columns { td.n { (tested(d, name, digits)) } }
+            } } }
+        } }
     }
 }
 
@@ -450,6 +487,8 @@ mod tests {
                 test_views: 10,
                 variants: vec![run("as set", 0.0, None), run("worse", -1.0, Some("as set"))],
                 omitted,
+                ends: vec![],
+                differences: vec![],
             }),
         }
     }

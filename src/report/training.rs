@@ -4,9 +4,12 @@
 //! step's seconds are those of training alone. All choices are compared with the same held-out photographs at the same
 //! size, whatever size they train at.
 
+use std::collections::BTreeMap;
+
 use serde::Serialize;
 
 use super::pareto;
+use super::statistics::{Moments, Paired};
 use super::variants::Variant;
 use super::{Error, Omitted};
 use crate::config::Settings;
@@ -115,6 +118,70 @@ pub struct Training {
     pub variants: Vec<VariantRuns>,
     /// What was not.
     pub omitted: Vec<Omitted>,
+    /// Each choice at its end, over the seeds.
+    pub ends: Vec<End>,
+    /// Every later choice less every earlier one at their ends, over the same seeds; empty for one seed.
+    pub differences: Vec<Difference>,
+}
+
+/// A choice's last figures.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct End {
+    /// The choice.
+    pub variant: String,
+    /// By name: mean and standard deviation.
+    pub figures: BTreeMap<&'static str, Moments>,
+}
+
+/// How two choices differ at their ends.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Difference {
+    /// What is subtracted.
+    pub from: String,
+    /// From what.
+    pub to: String,
+    /// By name: by a paired t-test.
+    pub figures: BTreeMap<&'static str, Paired>,
+}
+
+/// A figure of a sample, where it has it.
+type Figure = fn(&Sample) -> Option<f64>;
+
+/// Figures of an end, of one value per seed each.
+const FIGURES: [(&str, Figure); 5] = [
+    ("psnr", |s| Some(s.psnr)),
+    ("masked_psnr", |s| s.masked_psnr),
+    ("ssim", |s| Some(s.ssim)),
+    ("loss", |s| Some(s.loss)),
+    ("seconds", |s| Some(s.seconds)),
+];
+
+/// The last samples of a choice, seed by seed.
+fn last(variant: &VariantRuns, figure: Figure) -> Option<Vec<f64>> {
+    variant.runs.iter().map(|run| run.samples.last().and_then(figure)).collect()
+}
+
+/// Means and deviations of the choices' last figures.
+fn ends(variants: &[VariantRuns]) -> Vec<End> {
+    let end = |v: &VariantRuns| {
+        let of = |(name, figure): &(&'static str, _)| Some((*name, Moments::of(&last(v, *figure)?)?));
+        End { variant: v.name.clone(), figures: FIGURES.iter().filter_map(of).collect() }
+    };
+    variants.iter().map(end).collect()
+}
+
+/// Of every pair of choices.
+fn differences(variants: &[VariantRuns]) -> Vec<Difference> {
+    let difference = |from: &VariantRuns, to: &VariantRuns| {
+        let of = |(name, figure): &(&'static str, _)| {
+            let (a, b) = (last(from, *figure)?, last(to, *figure)?);
+            Some((*name, Paired::of(&a, &b)?))
+        };
+        let figures = FIGURES.iter().filter_map(of).collect();
+        Difference { from: from.name.clone(), to: to.name.clone(), figures }
+    };
+    let pairs = (0..variants.len()).flat_map(|j| (0..j).map(move |i| (i, j)));
+    pairs.map(|(i, j)| difference(&variants[i], &variants[j])).filter(|d| !d.figures.is_empty()).collect()
 }
 
 /// Steps at which figures are taken: distinct, ascending, the last is `iterations`.
@@ -172,7 +239,8 @@ pub fn measure<E: From<Error>>(
         measured.push(VariantRuns { name, changes, points: points(&runs), runs, dominated_by: None });
     }
     judge(&mut measured);
-    Ok(Training { iterations, steps, test_views: scene.test.len(), variants: measured, omitted })
+    let (ends, differences) = (ends(&measured), differences(&measured));
+    Ok(Training { iterations, steps, test_views: scene.test.len(), variants: measured, omitted, ends, differences })
 }
 
 /// Compiles the kernels of a run before its clock starts: a few steps in which everything happens that ever does.
@@ -366,6 +434,17 @@ mod tests {
             .map(|(figures, seed)| SeedRun { seed, samples: vec![sample(figures)] })
             .collect();
         VariantRuns { name: name.into(), changes: vec![], points: points(&runs), runs, dominated_by: None }
+    }
+
+    #[test]
+    fn ends_are_compared_seed_by_seed() {
+        let variants = [variant("a", [1.0, 1.0], &[20.0, 30.0]), variant("b", [1.0, 2.0], &[21.0, 33.0])];
+        let (ends, differences) = (ends(&variants), differences(&variants));
+        assert_eq!(ends[1].figures["psnr"], Moments::of(&[21.0, 33.0]).expect("two seeds"));
+        assert!(!ends[1].figures.contains_key("masked_psnr"), "there is no mask");
+        assert_eq!((differences.len(), differences[0].from.as_str(), differences[0].to.as_str()), (1, "a", "b"));
+        assert_eq!(differences[0].figures["psnr"], Paired::of(&[0.0, 0.0], &[1.0, 3.0]).expect("two seeds"));
+        assert!(super::differences(&[variant("a", [1.0, 1.0], &[20.0]), variant("b", [1.0, 1.0], &[20.0])]).is_empty());
     }
 
     #[test]

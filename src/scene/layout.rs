@@ -24,6 +24,8 @@ pub(super) struct Entry {
     pub image: PathBuf,
     pub mask: Option<PathBuf>,
     pub prior: Option<(PathBuf, PriorKind)>,
+    /// True depth z, of test views.
+    pub depth: Option<PathBuf>,
 }
 
 /// The inpainted picture of one train view.
@@ -111,9 +113,13 @@ fn plain(scene: &Path) -> Result<Layout, Error> {
     };
     let train = entries(&images, |name| masks.get(name).cloned(), |name| Some((priors.get(name)?.clone(), kind?)));
     let prior = |name: &String| Some((priors.get(name)?.clone(), kind?));
-    let test = entries(&test_images, |name| test_masks.get(name).cloned(), prior);
+    let mut test = entries(&test_images, |name| test_masks.get(name).cloned(), prior);
+    let depths = index(&scene.join("test_depth"), &priors::EXTENSIONS)?;
+    test.iter_mut().for_each(|entry| entry.depth = depths.get(&entry.name).cloned());
     let mut notes = Vec::new();
-    for (what, files, pictures) in [("masks", &masks, &images), ("test_masks", &test_masks, &test_images)] {
+    let of_test =
+        [("masks", &masks, &images), ("test_masks", &test_masks, &test_images), ("test_depth", &depths, &test_images)];
+    for (what, files, pictures) in of_test {
         notes.extend(strays(what, files, pictures));
     }
     if let Some(kind) = kind {
@@ -342,7 +348,13 @@ fn entries(
 ) -> Vec<Entry> {
     images
         .iter()
-        .map(|(name, image)| Entry { name: name.clone(), image: image.clone(), mask: mask(name), prior: prior(name) })
+        .map(|(name, image)| Entry {
+            name: name.clone(),
+            image: image.clone(),
+            mask: mask(name),
+            prior: prior(name),
+            depth: None,
+        })
         .collect()
 }
 

@@ -11,6 +11,7 @@
 //! SCENE/reference/NAME.png                  the one inpainted photograph, under the name of its view
 //! SCENE/reference/NAME.npy|exr              its prior; NAME_depth.* or NAME_disparity.* says which kind it is
 //! SCENE/test_images/, SCENE/test_masks/     views without the object, and where the object stood
+//! SCENE/test_depth/NAME.npy|exr|png         true depth z of these, not positive where it is unknown
 //! SCENE/sparse/0/                           COLMAP model with poses of all of these
 //! ```
 //!
@@ -82,8 +83,14 @@ pub struct Config {
     /// delivered one: what was inpainted is then the truth. Its hole is its test mask. Empty for the delivered reference.
     pub truth_reference: String,
     /// Depth prior of that view: a file, in the scene's folder unless the path is absolute. Empty for the one under the
-    /// view's name among the scene's priors, if there is one; `none` for no prior.
+    /// view's name among the scene's priors, or its true depth, if there is one; `none` for no prior.
     pub truth_prior: String,
+    /// Depth priors in place of the scene's own: a folder, in the scene's unless the path is absolute. Its name says
+    /// `disparity`, or it is depth; `reference/` in it has the inpainted picture's. Empty for the scene's own.
+    pub prior_folder: String,
+    /// Inpainted picture in place of the delivered one: a file, in the scene's folder unless the path is absolute. It is
+    /// that of the train view whose name it has, or of the delivered picture's view. Empty for the delivered one.
+    pub reference_file: String,
 }
 
 impl Config {
@@ -131,6 +138,8 @@ impl Default for Config {
             outrank_guess: 5,
             truth_reference: String::new(),
             truth_prior: String::new(),
+            prior_folder: String::new(),
+            reference_file: String::new(),
         }
     }
 }
@@ -220,6 +229,9 @@ pub struct View {
     pub mask: Option<GrayImage>,
     /// Prior of `image`; never there for test views.
     pub prior: Option<Prior>,
+    /// True depth z of `image`, where it is known: `[row-major pixel]`, 0 where it is not. Of test views alone: nothing is
+    /// trained on it.
+    pub depth: Option<Vec<f32>>,
 }
 
 /// The train view whose hole was inpainted, or a view that never had one ([`Config::truth_reference`]).
@@ -387,6 +399,12 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
 
     let no_masks = layout.train.iter().all(|e| e.mask.is_none());
     let clean_views = !layout.test.is_empty();
+    if !config.prior_folder.is_empty() {
+        take_priors(dir, config, &mut layout, &mut notes)?;
+    }
+    if !config.reference_file.is_empty() {
+        take_reference(dir, config, &mut layout, &mut notes)?;
+    }
     let mut truth = None;
     if !config.truth_reference.is_empty() {
         truth = Some(take_truth(dir, config, &mut layout, &mut notes)?);
@@ -540,6 +558,7 @@ impl Scene {
     fn rescale(&mut self, unit: f64) {
         for view in self.train.iter_mut().chain(&mut self.test) {
             view.camera.translation = view.camera.translation.map(|t| t / unit);
+            view.depth.iter_mut().flatten().for_each(|z| *z = (f64::from(*z) / unit) as f32);
         }
         for point in &mut self.points {
             point.position = point.position.map(|x| (f64::from(x) / unit) as f32);
@@ -547,6 +566,61 @@ impl Scene {
         self.radius = (f64::from(self.radius) / unit) as f32;
         self.unit *= unit;
     }
+}
+
+/// Replaces the priors of all views by those of [`Config::prior_folder`]: views without one there have none.
+fn take_priors(dir: &Path, config: &Config, layout: &mut layout::Layout, notes: &mut Vec<String>) -> Result<(), Error> {
+    let folder = dir.join(&config.prior_folder);
+    let files = depth_maps(&folder)?;
+    let name = folder.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+    let kind = if name.contains(PriorKind::Disparity.folder()) { PriorKind::Disparity } else { PriorKind::Depth };
+    for entry in layout.train.iter_mut().chain(&mut layout.test) {
+        entry.prior = files.get(&entry.name).map(|path| (path.clone(), kind));
+    }
+    let taken = layout.train.iter().filter(|e| e.prior.is_some()).count();
+    if taken == 0 {
+        let what = "no prior has the name of a train view; name them after the photographs".into();
+        return Err(Error::File { path: folder, what });
+    }
+    layout.kind = Some(kind);
+    notes.push(format!("{taken} priors are those of {}, read as {}", folder.display(), kind.folder()));
+    if let Some(reference) = &mut layout.reference {
+        let own = files.get(&format!("reference/{}", reference.name)).cloned();
+        match (own, &reference.prior) {
+            (Some(path), _) => reference.prior = Some(layout::ReferencePrior { path, kind: Some(kind) }),
+            (None, Some(_)) => notes.push("the inpainted picture keeps its delivered prior: there is no other".into()),
+            (None, None) => {}
+        }
+    }
+    Ok(())
+}
+
+/// Makes [`Config::reference_file`] the inpainted picture. The delivered one's prior stays where both are of one view.
+fn take_reference(
+    dir: &Path,
+    config: &Config,
+    layout: &mut layout::Layout,
+    notes: &mut Vec<String>,
+) -> Result<(), Error> {
+    if !config.truth_reference.is_empty() {
+        let what = "scene.reference_file and scene.truth_reference are both set; a scene has one reference";
+        return Err(Error::Setting(what.into()));
+    }
+    let image = dir.join(&config.reference_file);
+    let file = image.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let stem = layout::stem(&file);
+    let delivered = layout.reference.take();
+    let named = layout.train.iter().find(|e| file_part(&e.name) == stem).map(|e| e.name.clone());
+    let Some(name) = named.or_else(|| delivered.as_ref().map(|d| d.name.clone())) else {
+        return Err(Error::ReferenceWithoutView { path: image });
+    };
+    notes.push(format!("the reference is {}, taken for view {name}", image.display()));
+    let prior = delivered.filter(|d| d.name == name).and_then(|d| d.prior);
+    if prior.is_some() {
+        notes.push("its prior is the delivered picture's".into());
+    }
+    layout.reference = Some(layout::ReferenceFiles { name, image, prior });
+    Ok(())
 }
 
 /// Moves the test view that [`Config::truth_reference`] names to the train views and makes it the reference: its
@@ -575,7 +649,10 @@ fn take_truth(
         return Err(Error::File { path: entry.image, what });
     }
     let prior = match config.truth_prior.as_str() {
-        "" => entry.prior.clone().map(|(path, kind)| layout::ReferencePrior { path, kind: Some(kind) }),
+        "" => {
+            let exact = entry.depth.clone().map(|path| (path, PriorKind::Depth));
+            entry.prior.clone().or(exact).map(|(path, kind)| layout::ReferencePrior { path, kind: Some(kind) })
+        }
         NO_PRIOR => None,
         file => {
             let path = dir.join(file);
@@ -584,7 +661,7 @@ fn take_truth(
         }
     };
     // The prior is the reference's: two of them for one picture say no more than one.
-    entry.prior = None;
+    (entry.prior, entry.depth) = (None, None);
     let name = entry.name.clone();
     notes.push(format!("test view {name} is trained on as the reference: its photograph shows the truth"));
     if let Some(delivered) =
@@ -727,11 +804,13 @@ struct Loaded {
     stretched_mask: bool,
 }
 
+/// Sizes of an entry's mask and picture that may differ as stated.
+type TallMask<'a> = &'a (dyn Fn(&layout::Entry) -> Option<([u32; 2], [u32; 2])> + Sync);
+
 struct Reader<'a> {
     config: &'a Config,
     dilate: u32,
-    /// Sizes of the entry's mask and picture that may differ as stated.
-    tall_mask: &'a (dyn Fn(&layout::Entry) -> Option<([u32; 2], [u32; 2])> + Sync),
+    tall_mask: TallMask<'a>,
 }
 
 impl Reader<'_> {
@@ -777,7 +856,8 @@ impl Reader<'_> {
             distortion: intrinsics.distortion.map(|v| v as f32),
             size,
         };
-        let view = View { name: entry.name.clone(), camera, image, mask, prior };
+        let depth = entry.depth.as_ref().map(|path| depth_map(path, picture, size)).transpose()?;
+        let view = View { name: entry.name.clone(), camera, image, mask, prior, depth };
         Ok(Loaded { view, calibrated: intrinsics.size, picture, stretched_mask })
     }
 }
@@ -828,6 +908,14 @@ pub(crate) fn pictures(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Error
     layout::index(folder, &layout::PICTURES)
 }
 
+/// The depth maps in a folder and in the folders below it, by their path below `folder` without extension.
+pub(crate) fn depth_maps(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Error> {
+    if !folder.is_dir() {
+        return Err(Error::File { path: folder.to_path_buf(), what: "there is no such folder".into() });
+    }
+    layout::index(folder, &priors::EXTENSIONS)
+}
+
 /// A picture at 1 / `downscale` of its size, reduced as [`load`] reduces photographs.
 pub(crate) fn photograph(path: &Path, downscale: u32) -> Result<RgbImage, Error> {
     let image = decode(path)?.into_rgb8();
@@ -840,6 +928,17 @@ pub(crate) fn mask(path: &Path, downscale: u32) -> Result<GrayImage, Error> {
     let mask = object_mask(path, false)?;
     let size = [mask.width(), mask.height()].map(|n| reduced(n, downscale));
     Ok(if downscale == 1 { mask } else { resample::mask(&mask, size) })
+}
+
+/// A true depth map for a picture of `picture`'s size, at `size`: of the nearest of its pixels, since between two surfaces
+/// there is none. 0 where it is unknown (not finite, or not positive).
+///
+/// # Errors
+/// An unreadable file, other proportions than the picture's.
+pub(crate) fn depth_map(path: &Path, picture: [u32; 2], size: [u32; 2]) -> Result<Vec<f32>, Error> {
+    let mut values = priors::nearest(path, picture, size)?;
+    values.iter_mut().filter(|z| !(z.is_finite() && **z > 0.0)).for_each(|z| *z = 0.0);
+    Ok(values)
 }
 
 /// Below this rank correlation, two priors of one view are taken to be unrelated.

@@ -26,22 +26,45 @@ struct Map {
 /// # Errors
 /// Unreadable files, infinite values, other proportions than the picture's.
 pub(super) fn read(path: &Path, kind: PriorKind, picture: [u32; 2], size: [u32; 2]) -> Result<Prior, Error> {
+    let map = stored(path, picture)?;
+    if let Some(at) = map.values.iter().position(|v| v.is_infinite()) {
+        let (row, column) = (at / map.size[0] as usize, at % map.size[0] as usize);
+        return Err(Error::NotFinite { path: path.to_path_buf(), value: map.values[at], row, column });
+    }
+    Ok(Prior { kind, values: resample::map(&map.values, map.size, size) })
+}
+
+/// Reads a map of the same formats as it is and takes the nearest of its pixels for each of `size`.
+///
+/// # Errors
+/// Unreadable files, other proportions than the picture's.
+pub(super) fn nearest(path: &Path, picture: [u32; 2], size: [u32; 2]) -> Result<Vec<f32>, Error> {
+    let map = stored(path, picture)?;
+    let at = |i: u32, axis: usize| {
+        // The pixel of the map that holds the centre of pixel i.
+        ((2 * u64::from(i) + 1) * u64::from(map.size[axis]) / (2 * u64::from(size[axis]))) as usize
+    };
+    let row = |y: u32| at(y, 1) * map.size[0] as usize;
+    Ok((0..size[1])
+        .flat_map(|y| (0..size[0]).map(move |x| (x, y)))
+        .map(|(x, y)| map.values[row(y) + at(x, 0)])
+        .collect())
+}
+
+/// A file's values, whose proportions are those of `picture` within 1 %.
+fn stored(path: &Path, picture: [u32; 2]) -> Result<Map, Error> {
     let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
     let map = match extension.as_str() {
         "npy" => npy(path),
         "exr" => exr(path),
         _ => png(path),
     }?;
-    if let Some(at) = map.values.iter().position(|v| v.is_infinite()) {
-        let (row, column) = (at / map.size[0] as usize, at % map.size[0] as usize);
-        return Err(Error::NotFinite { path: path.to_path_buf(), value: map.values[at], row, column });
-    }
     let [w, h] = map.size.map(f64::from);
     let proportion = (w / h) / (f64::from(picture[0]) / f64::from(picture[1]));
     if (proportion - 1.0).abs() > 0.01 {
         return Err(Error::PriorSize { path: path.to_path_buf(), size: map.size, picture });
     }
-    Ok(Prior { kind, values: resample::map(&map.values, map.size, size) })
+    Ok(map)
 }
 
 fn invalid(path: &Path, what: impl std::fmt::Display) -> Error {

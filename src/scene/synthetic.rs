@@ -57,7 +57,8 @@ const PRIORS: u64 = 4;
 
 /// Writes the scene into `dir` in the plain layout (see [`super`]): `images/` with the object, exact `masks/`, `depth/`
 /// (each view's exact depth under a random affine map, with noise), `reference/` (the exact picture without the object, and
-/// its depth), `test_images/` without the object, `test_masks/` where it would be, and `sparse/0/`.
+/// its depth), `test_images/` without the object, `test_masks/` where it would be, `test_depth/` with their exact depth, and
+/// `sparse/0/`.
 ///
 /// # Errors
 /// Options out of range, a folder that is not empty, a file that cannot be written.
@@ -75,7 +76,7 @@ pub fn write(dir: &Path, options: &Options) -> Result<(), Error> {
         return Err(Error::File { path: dir.to_path_buf(), what: "the folder is not empty; name a new one".into() });
     }
     let folders = ["images", "masks", "depth", "reference", "sparse/0"];
-    let test_folders = ["test_images", "test_masks"];
+    let test_folders = ["test_images", "test_masks", "test_depth"];
     for folder in folders.iter().chain(test_folders.iter().filter(|_| test_views > 0)) {
         let path = dir.join(folder);
         std::fs::create_dir_all(&path).map_err(|source| Error::Io { path, source })?;
@@ -101,7 +102,11 @@ pub fn write(dir: &Path, options: &Options) -> Result<(), Error> {
     test.par_iter().try_for_each(|shot| {
         let name = format!("{}.png", shot.name);
         save(dir.join("test_images").join(&name), |path| room.photograph(shot, false).save(path))?;
-        save(dir.join("test_masks").join(&name), |path| room.mask(shot).save(path))
+        save(dir.join("test_masks").join(&name), |path| room.mask(shot).save(path))?;
+        let [w, h] = shot.size.map(|n| n as usize);
+        let depth = room.depth(shot, false);
+        let depth = Array2::from_shape_fn((h, w), |(y, x)| depth[y * w + x] as f32);
+        write_npy(&dir.join("test_depth").join(format!("{}.npy", shot.name)), &depth)
     })?;
     let cloud = room.points(&train, points, &mut Pcg64::new(seed.into(), POINTS.into()));
     write_model(&dir.join("sparse/0"), &train, &test, &cloud)
@@ -131,7 +136,11 @@ fn save_prior(path: &Path, depth: &[f64], shot: &Shot, rng: &mut Pcg64) -> Resul
         let slow: f64 = waves.iter().map(|[a, b, phase]| (TAU * (a * u + b * v) + phase).sin()).sum();
         (scale * (depth[y * w + x] + noise * (white + slow)) + shift) as f32
     });
-    ndarray_npy::write_npy(path, &values)
+    write_npy(path, &values)
+}
+
+fn write_npy(path: &Path, values: &Array2<f32>) -> Result<(), Error> {
+    ndarray_npy::write_npy(path, values)
         .map_err(|e| Error::Io { path: path.to_path_buf(), source: std::io::Error::other(e) })
 }
 

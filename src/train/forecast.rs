@@ -63,7 +63,7 @@ impl Survey {
 /// Points that make no anchor.
 pub fn initial(scene: &Scene, settings: &Settings) -> Result<Initial, init::Error> {
     let points: Vec<[f32; 3]> = scene.points.iter().map(|p| p.position).collect();
-    init::from_points(&points, &settings.model)
+    init::from_points(&points, &settings.fitted(scene).model)
 }
 
 /// Most cameras that a survey looks through: it comes before the first step, and what they miss the margin of
@@ -373,6 +373,7 @@ fn resized(scene: &Scene, from: u32, to: u32) -> Scene {
             image: RgbImage::new(w, h),
             mask: view.mask.as_ref().map(|_| GrayImage::from_pixel(w, h, fill)),
             prior: view.prior.as_ref().map(|p| blank(p, size)),
+            depth: None,
         }
     };
     let reference = scene.reference.as_ref().map(|r| {
@@ -411,6 +412,7 @@ const VIEWS: usize = 8;
 /// Points that make no anchor; a device that is lost.
 pub fn forecast(gpu: &Gpu, scene: &Scene, settings: &Settings, question: Question) -> Result<Verdict, Error> {
     let available = question.available.unwrap_or_else(|| gpu.available_bytes());
+    let settings = &settings.fitted(scene);
     let plan = Plan::new(scene, settings);
     let first = initial(scene, settings)?;
     let cameras = || scene.train.iter().map(|v| &v.camera);

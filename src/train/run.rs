@@ -350,6 +350,7 @@ const DEPTH: usize = 2;
 
 /// A step of a run that has not begun.
 fn fresh(gpu: &Gpu, scene: &Scene, settings: &Settings) -> Result<Step, Error> {
+    let settings = &settings.fitted(scene);
     let plan = Plan::new(scene, settings);
     let points: Vec<[f32; 3]> = scene.points.iter().map(|p| p.position).collect();
     let offsets = settings.model.offsets as usize;
@@ -388,7 +389,7 @@ impl<'a> Run<'a> {
     /// # Errors
     /// When the device has no room.
     pub fn resume(gpu: &'a Gpu, scene: &'a Scene, settings: &'a Settings, state: State) -> Result<Self, Error> {
-        let step = state.model.restore(gpu, Plan::new(scene, settings), settings)?;
+        let step = state.model.restore(gpu, Plan::new(scene, settings), &settings.fitted(scene))?;
         Self::with(gpu, scene, settings, step, state.history)
     }
 
@@ -798,7 +799,7 @@ impl<'a> Run<'a> {
     /// Repeats the steps from the last good checkpoint, or from the first step, to `noticed`, that one included. Returns
     /// the first whose results are not finite and the state before it; `noticed` and the state behind it if all are.
     fn repeat(&mut self, folder: &Path, noticed: u32) -> Result<(u32, Option<State>), Error> {
-        let settings = self.settings;
+        let settings = &self.settings.fitted(self.scene);
         // The stages' memory goes before a second model is made.
         self.step.resize(Capacity { anchors: 1, visible: 1, pairs: 1 })?;
         let candidates = checkpoint::list(folder).into_iter().filter(|(step, _)| *step < noticed);
@@ -826,7 +827,8 @@ impl<'a> Run<'a> {
     /// Repeats a step pass by pass from the state before it.
     fn first_not_finite(&mut self, before: &State, step: u32) -> Result<Option<NotFinite>, Error> {
         self.step.resize(Capacity { anchors: 1, visible: 1, pairs: 1 })?;
-        self.step = before.model.restore(self.gpu, self.step.plan.clone(), self.settings)?;
+        let settings = self.settings.fitted(self.scene);
+        self.step = before.model.restore(self.gpu, self.step.plan.clone(), &settings)?;
         loop {
             let mut rec = self.gpu.inspected()?;
             self.record(&mut rec, step)?;

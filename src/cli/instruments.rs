@@ -1,0 +1,108 @@
+//! What a trained model is worth, view by view: drawn again from its files, for `train`, `ablate` and `eval`.
+
+use std::path::Path;
+
+use image::{GrayImage, RgbImage};
+
+use super::pictures;
+use crate::config::Settings;
+use crate::evaluate::{Judge, Report, Residue, Shown, Surface, hole, seen_map};
+use crate::gpu::Gpu;
+use crate::model;
+use crate::render::view::{Rendered, Renderer};
+use crate::scene::{Scene, View};
+
+/// A factor between depth maps and the scene within this of 1 is the trained model's own fault, not another unit.
+const SAME_UNIT: f64 = 0.1;
+
+/// What was measured.
+pub(super) struct Measured {
+    /// The figures.
+    pub report: Report,
+    /// By test view: which pixels some train view photographed.
+    pub seen: Vec<GrayImage>,
+}
+
+impl Measured {
+    /// Writes the maps of seen pixels into `folder`, NAME.png each.
+    ///
+    /// # Errors
+    /// A folder that cannot be written.
+    pub(super) fn write_seen(&self, scene: &Scene, folder: &Path) -> Result<(), pictures::Error> {
+        scene
+            .test
+            .iter()
+            .zip(&self.seen)
+            .try_for_each(|(view, map)| pictures::write_mask(&pictures::path(folder, &view.name, "png"), map))
+    }
+}
+
+/// A view as the model draws it.
+struct Drawn {
+    picture: RgbImage,
+    surface: Surface,
+}
+
+impl Drawn {
+    fn new(rendered: &Rendered) -> Self {
+        let surface = Surface::new(rendered.size, &rendered.depth, &rendered.transmittance);
+        Self { picture: rendered.to_rgb8(), surface }
+    }
+
+    fn shown<'a>(&'a self, view: &'a View) -> Shown<'a> {
+        Shown { camera: &view.camera, mask: view.mask.as_ref(), surface: &self.surface }
+    }
+}
+
+/// Draws the train and test views of `scene` from the model in `folder` and judges them.
+///
+/// # Errors
+/// A model that cannot be read; a device without room; pictures that cannot be compared.
+pub(super) fn measure(
+    gpu: &Gpu,
+    folder: &Path,
+    scene: &Scene,
+    settings: &Settings,
+    judge: &Judge,
+) -> anyhow::Result<Measured> {
+    let (mut anchors, mut weights) = model::files::load(folder)?;
+    model::files::rescale(&mut anchors, &mut weights, 1.0 / scene.unit);
+    let background = settings.train.background.map(|channel| channel as f32);
+    let mut renderer = Renderer::new(gpu, &anchors, &weights, &settings.render, background)?;
+    let mut draw = |views: &[View]| -> anyhow::Result<Vec<Drawn>> {
+        views.iter().map(|view| Ok(Drawn::new(&renderer.render(&view.camera)?))).collect()
+    };
+    let (train, test) = (draw(&scene.train)?, draw(&scene.test)?);
+    let shown: Vec<Shown<'_>> = train.iter().zip(&scene.train).map(|(drawn, view)| drawn.shown(view)).collect();
+    let pairs = || test.iter().zip(&scene.test);
+
+    let known = pairs().filter_map(|(drawn, view)| Some((&drawn.surface, view.depth.as_deref()?, view.mask.as_ref())));
+    let factor = hole::unit(known).filter(|factor| (factor - 1.0).abs() > SAME_UNIT);
+    let (mut judging, mut seen) = (judge.start(), vec![]);
+    for (drawn, view) in pairs() {
+        let map = seen_map(drawn.shown(view), &shown);
+        let metrics = judging.add(&view.name, &drawn.picture, &view.image, view.mask.as_ref(), Some(&map))?;
+        if let (Some(depth), Some(mask)) = (&view.depth, &view.mask) {
+            let depth: Vec<f32> = depth.iter().map(|z| z * factor.unwrap_or(1.0) as f32).collect();
+            metrics.geometry = hole::geometry(&drawn.surface, &depth, mask);
+        }
+        seen.push(map);
+    }
+    let mut report = judging.report().with_residues(residues(scene, &train, &shown));
+    report.depth_factor = factor;
+    Ok(Measured { report, seen })
+}
+
+/// Of every train view that shows the object, against the reference's picture as the view would show it.
+fn residues(scene: &Scene, train: &[Drawn], shown: &[Shown<'_>]) -> Vec<Residue> {
+    let Some(reference) = &scene.reference else { return vec![] };
+    let from = shown[reference.view];
+    let of = |at: usize| {
+        let view = &scene.train[at];
+        let mask = view.mask.as_ref()?;
+        let background = hole::warped(shown[at], from, &reference.image);
+        let residue = hole::residue(&train[at].picture, &view.image, &background, mask)?;
+        Some(Residue { name: view.name.clone(), residue })
+    };
+    (0..train.len()).filter_map(of).collect()
+}
