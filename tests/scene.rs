@@ -645,7 +645,7 @@ fn bad_priors_are_refused() {
         refusal(&dir)
     };
     let mut bad = depth(SIZE);
-    bad[[3, 5]] = f32::NAN;
+    bad[[3, 5]] = f32::NEG_INFINITY;
     let mut all = vec![with(&|d| save_npy(d.join("depth/a.npy"), &bad))];
     bad[[3, 5]] = f32::INFINITY;
     all.push(with(&|d| save_npy(d.join("reference/b.npy"), &bad)));
@@ -665,8 +665,8 @@ fn bad_priors_are_refused() {
         fs::write(d.join("depth/a.exr"), "no picture").unwrap();
     }));
     insta::assert_snapshot!(all.join("\n"), @r"
-    depth/a.npy: the value at row 3, column 5 is NaN; a prior must be finite everywhere
-    reference/b.npy: the value at row 3, column 5 is inf; a prior must be finite everywhere
+    depth/a.npy: the value at row 3, column 5 is -inf; write NaN where there is no prior
+    reference/b.npy: the value at row 3, column 5 is inf; write NaN where there is no prior
     depth/a.npy: the prior is 64x40 but its picture is 64x36; their proportions must agree within 1 %
     depth/a.npy: the array's type must be float32, float64, uint8 or uint16; save it with `.astype('float32')`
     depth/a.npy: the array's shape is [2304], it must be rows x columns
@@ -675,6 +675,30 @@ fn bad_priors_are_refused() {
     depth/a.exr: depth/a.npy has the same name; keep one
     depth/a.exr: not a readable OpenEXR picture: invalid: file identifier missing
     ");
+}
+
+/// NaN is where there is no prior: it stays, and counts for nothing where the map is reduced.
+#[test]
+fn priors_may_have_gaps() {
+    let dir = plain();
+    let mut map = depth(SIZE);
+    for y in 0..4 {
+        (0..6).for_each(|x| map[[y, x]] = f32::NAN);
+    }
+    map[[9, 9]] = f32::NAN;
+    save_npy(dir.path().join("depth/a.npy"), &map);
+    let read = |downscale| {
+        let config = Config { downscale, ..Default::default() };
+        load(dir.path(), &config).expect("it loads").train[0].prior.clone().expect("a prior").values
+    };
+    let [w, _] = SIZE.map(|n| n as usize);
+    let (whole, half) = (read(1), read(2));
+    assert_eq!(whole.iter().filter(|v| v.is_nan()).count(), 25);
+    // Of four pixels one is missing: the mean of the other three.
+    let (x, y) = (4, 4);
+    let others: f64 = [(8, 8), (9, 8), (8, 9)].iter().map(|(x, y)| f64::from(whole[y * w + x])).sum();
+    assert!((f64::from(half[y * (w / 2) + x]) - others / 3.0).abs() < 1e-6 * others);
+    assert_eq!(half.iter().filter(|v| v.is_nan()).count(), 6);
 }
 
 #[test]

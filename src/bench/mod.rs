@@ -4,6 +4,8 @@
 //! [`counts`] reads back from a traced step; [`step`] times the step beside it. [`loads`] generates scenes of chosen sizes
 //! and fits how every pass grows; [`tune()`] runs the choices that exist as data. [`compare`] sets one record against
 //! another, [`text`], [`tables`] and [`figures`] write them down.
+//!
+#![doc = include_str!("README.md")]
 
 pub mod ceilings;
 pub mod compare;

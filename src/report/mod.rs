@@ -5,6 +5,8 @@
 //! views against seconds and steps. [`variants`] lists the choices, [`pareto`] says which of them are superfluous.
 //! [`figures`] says what is drawn, [`plots`] draws it, [`page`] lays it out, [`tables`] writes the same numbers as JSON
 //! and CSV.
+//!
+#![doc = include_str!("README.md")]
 
 pub mod figures;
 pub mod kernels;

@@ -1,4 +1,6 @@
 //! What a scene needs, the step, the loop, checkpoints.
+//!
+#![doc = include_str!("README.md")]
 
 pub mod attend;
 pub mod checkpoint;
