@@ -258,13 +258,13 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             made.losses.push((format!("{name}, {}", size(bytes.len())), loss));
             written.push((File { name, bytes: bytes.len(), loss }, bytes));
         }
-        for (file, bytes) in &written {
-            export::write(&folder.join(&file.name), bytes)?;
-        }
-        let files: Vec<File> = written.into_iter().map(|(file, _)| file).collect();
+        let (files, contents): (Vec<File>, Vec<Vec<u8>>) = written.into_iter().unzip();
         let figures = figures(args, gpu.info().name.clone(), &scene, &settings, &made, files, began);
         let text = serde_json::to_string_pretty(&figures)? + "\n";
-        export::write(&folder.join(FIGURES), text.as_bytes())?;
+        let named =
+            figures.files.iter().zip(&contents).map(|(file, bytes)| (folder.join(&file.name), bytes.as_slice()));
+        let named: Vec<_> = named.chain([(folder.join(FIGURES), text.as_bytes())]).collect();
+        export::write(&named)?;
         report(&made, &figures, &args.formats);
         let names: Vec<&str> = figures.files.iter().map(|file| file.name.as_str()).collect();
         println!("wrote {}, {FIGURES} in {}", names.join(", "), folder.display());

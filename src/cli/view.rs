@@ -10,7 +10,8 @@ use super::export::{Cameras, EXPORT, FIGURES, Pose, STEM};
 use super::folders::Origin;
 use super::shared;
 use crate::export;
-use crate::view::{Page, Start, server};
+use crate::scene::Camera;
+use crate::view::{self, Page, Start, server};
 
 /// Show an exported scene in the browser
 ///
@@ -46,7 +47,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let page = page(args)?;
     if let Some(file) = &args.html {
         let html = page.single().with_context(|| format!("{}: cannot be made", file.display()))?;
-        export::write(file, html.as_bytes())?;
+        export::write(&[(file.clone(), html.as_bytes())])?;
         println!("{}: {:.1} MB, needs nothing else", file.display(), html.len() as f64 / 1e6);
         return Ok(());
     }
@@ -88,7 +89,7 @@ fn page(args: &Args) -> anyhow::Result<Page> {
     };
     let origin = Origin::find(run).ok();
     let photograph = origin.filter(|_| !args.no_photograph).and_then(|origin| {
-        let jpeg = photograph(&origin, &pose.name);
+        let jpeg = photograph(&origin, pose);
         if let Err(error) = &jpeg {
             eprintln!("note: without a photograph: {error:#}");
         }
@@ -113,13 +114,18 @@ fn start(pose: &Pose, cameras: &Cameras) -> Start {
     Start { center: pose.center, target, fov: pose.fov, size: pose.size }
 }
 
-fn photograph(origin: &Origin, name: &str) -> anyhow::Result<Vec<u8>> {
+/// What the photograph shows from the viewer's camera.
+fn photograph(origin: &Origin, pose: &Pose) -> anyhow::Result<Vec<u8>> {
     let settings = origin.settings(vec![])?;
     let scene = origin.scene().context("a model alone does not know its photographs")?;
     let scene = shared::load_scene(Path::new(scene), &settings)?;
-    let view = scene.train.iter().find(|view| view.name == name);
-    let view = view.with_context(|| format!("{name}: the scene has no such view any more"))?;
+    let view = scene.train.iter().find(|view| view.name == pose.name);
+    let view = view.with_context(|| format!("{}: the scene has no such view any more", pose.name))?;
+    // Its lens, in the axes of the export.
+    let rotation = pose.rotation;
+    let camera = Camera { rotation, translation: Camera::translation_to(&rotation, pose.center), ..view.camera };
+    let picture = view::resampled(&view.image, &camera, &view::upright(&camera));
     let mut jpeg = vec![];
-    view.image.write_with_encoder(JpegEncoder::new_with_quality(&mut jpeg, 92))?;
+    picture.write_with_encoder(JpegEncoder::new_with_quality(&mut jpeg, 92))?;
     Ok(jpeg)
 }

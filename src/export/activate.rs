@@ -412,7 +412,7 @@ mod tests {
                 + f64::from(out.opacity[i]) * f64::from(grad.grad_opacity[i])
         };
         let h = 1.0 / 128.0;
-        let mut check = |name: &str, i: usize, got: f32, change: &dyn Fn(&mut activate::Arrays, f32)| {
+        let check = |name: &str, i: usize, got: f32, change: &dyn Fn(&mut activate::Arrays, f32)| {
             let at = |step: f32| {
                 let mut moved = start.clone();
                 change(&mut moved, step);

@@ -31,7 +31,7 @@ pub enum Error {
     #[error(transparent)]
     Gpu(#[from] crate::gpu::Error),
     /// A file that the system refuses.
-    #[error("{}: cannot be written: {source}; nothing of it was left behind", path.display())]
+    #[error("{}: cannot be written: {source}; nothing of it is left behind", path.display())]
     Write {
         /// The file.
         path: PathBuf,
@@ -131,20 +131,29 @@ pub fn logit(opacity: f64) -> f32 {
     (o / (1.0 - o)).ln() as f32
 }
 
-/// Writes a file that appears complete or not at all.
+/// Writes files that appear complete or not at all: all are on the disk before the first replaces its predecessor.
 ///
 /// # Errors
 /// [`Error::Write`].
-pub fn write(path: &Path, bytes: &[u8]) -> Result<(), Error> {
-    let write = || {
-        if let Some(folder) = path.parent() {
-            std::fs::create_dir_all(folder)?;
-        }
-        let mut file = AtomicWriteFile::open(path)?;
-        file.write_all(bytes)?;
-        file.commit()
-    };
-    write().map_err(|source| Error::Write { path: path.to_owned(), source })
+pub fn write(files: &[(PathBuf, &[u8])]) -> Result<(), Error> {
+    let failed = |path: &Path, source| Error::Write { path: path.to_owned(), source };
+    let mut whole = vec![];
+    for (path, bytes) in files {
+        let write = || {
+            if let Some(folder) = path.parent() {
+                std::fs::create_dir_all(folder)?;
+            }
+            let mut file = AtomicWriteFile::open(path)?;
+            file.write_all(bytes)?;
+            file.sync_all()?;
+            Ok(file)
+        };
+        whole.push(write().map_err(|source| failed(path, source))?);
+    }
+    for (file, (path, _)) in whole.into_iter().zip(files) {
+        file.commit().map_err(|source| failed(path, source))?;
+    }
+    Ok(())
 }
 
 /// What an export is made of besides the model.

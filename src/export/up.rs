@@ -2,16 +2,16 @@
 //!
 //! Nobody holds a camera level to the degree, but on average its y axis points down and its x axis lies in the horizon.
 //! Up is the mean of the cameras' upward axes, freed of what the x axes say is horizontal: with M the mean of x x^T,
-//! `(M + 0.01 I)^-1 up`. The x axes' spread outweighs a tilt common to all cameras (everybody looks down at a table) as
-//! soon as their directions differ by some six degrees; with less they say nothing and the mean remains.
+//! `(M + 0.001 I)^-1 up`. The x axes' spread outweighs a tilt common to all cameras (everybody looks down at a table) as
+//! soon as their directions differ by a few degrees; with less they say nothing and the mean remains.
 
 use glam::{DMat3, DVec3};
 
 use super::Cloud;
 use crate::scene::Camera;
 
-/// Weight of the mean against the x axes' spread: the squared sine of six degrees.
-const RIDGE: f64 = 0.01;
+/// Weight of the mean against the x axes' spread: the squared sine of two degrees.
+const RIDGE: f64 = 0.001;
 
 fn axis(camera: &Camera, i: usize) -> DVec3 {
     DVec3::from_array(camera.rotation[i].map(f64::from)).normalize_or_zero()

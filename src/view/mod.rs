@@ -12,9 +12,13 @@ use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD;
 use flate2::Compression;
 use flate2::write::GzEncoder;
+use glam::{DMat3, DVec3};
+use image::{Rgb, RgbImage};
 use serde_json::{Value, json};
 
 use server::Resource;
+
+use crate::scene::{Camera, distort};
 
 /// The viewer's program, gzip.
 const VIEWER: &[u8] = include_bytes!("supersplat/index.js.gz");
@@ -39,6 +43,59 @@ pub struct Start {
     pub size: [u32; 2],
 }
 
+/// The camera with which the viewer starts, for a training camera in axes in which up is -y: of the same place, direction
+/// and size, but upright, without distortion, its principal point in the middle, its pixels square.
+pub fn upright(camera: &Camera) -> Camera {
+    let ahead = DVec3::from_array(camera.rotation[2].map(f64::from)).normalize_or(DVec3::Z);
+    let right = DVec3::Y.cross(ahead).try_normalize().unwrap_or(DVec3::X);
+    let rotation = [right, ahead.cross(right), ahead].map(|axis| axis.to_array().map(|v| v as f32));
+    let longer = usize::from(camera.size[1] >= camera.size[0]);
+    Camera {
+        rotation,
+        translation: Camera::translation_to(&rotation, camera.center()),
+        focal: [camera.focal[longer]; 2],
+        principal: camera.size.map(|side| side as f32 / 2.0),
+        distortion: [0.0; 4],
+        size: camera.size,
+    }
+}
+
+/// A photograph as another camera at the same place would have taken it, black where it shows nothing.
+pub fn resampled(photograph: &RgbImage, camera: &Camera, to: &Camera) -> RgbImage {
+    // Columns are the axes: of the camera in the world, then of the other in the camera.
+    let axes = |camera: &Camera| DMat3::from_cols_array_2d(&camera.rotation.map(|row| row.map(f64::from)));
+    let turn = axes(camera).transpose() * axes(to);
+    let [focal, principal] = [to.focal, to.principal].map(|v| v.map(f64::from));
+    let (width, height) = photograph.dimensions();
+    RgbImage::from_fn(to.size[0], to.size[1], |x, y| {
+        let at = [(f64::from(x) + 0.5 - principal[0]) / focal[0], (f64::from(y) + 0.5 - principal[1]) / focal[1]];
+        let ray = turn * DVec3::new(at[0], at[1], 1.0);
+        let black = Rgb([0; 3]);
+        if ray.z <= 0.0 {
+            return black;
+        }
+        let seen = distort([ray.x / ray.z, ray.y / ray.z], camera.distortion.map(f64::from));
+        let pixel: [f64; 2] =
+            std::array::from_fn(|i| seen[i] * f64::from(camera.focal[i]) + f64::from(camera.principal[i]));
+        let inside = (0..2).all(|i| (0.0..f64::from([width, height][i])).contains(&pixel[i]));
+        if !inside {
+            return black;
+        }
+        // Between the four nearest centres, of which those beyond the edge are those on it.
+        let corner = pixel.map(|v| (v - 0.5).floor());
+        let share: [f64; 2] = std::array::from_fn(|i| pixel[i] - 0.5 - corner[i]);
+        let stored = |dx: f64, dy: f64| {
+            let clamp = |v: f64, size: u32| v.clamp(0.0, f64::from(size - 1)) as u32;
+            photograph.get_pixel(clamp(corner[0] + dx, width), clamp(corner[1] + dy, height)).0.map(f64::from)
+        };
+        let corners = [stored(0.0, 0.0), stored(1.0, 0.0), stored(0.0, 1.0), stored(1.0, 1.0)];
+        Rgb(std::array::from_fn(|c| {
+            let row = |a: usize| corners[a][c] * (1.0 - share[0]) + corners[a + 1][c] * share[0];
+            (row(0) * (1.0 - share[1]) + row(2) * share[1]).round() as u8
+        }))
+    })
+}
+
 /// A scene to show.
 #[derive(Debug, Clone)]
 pub struct Page {
@@ -50,7 +107,7 @@ pub struct Page {
     pub start: Start,
     /// What shines through, 0 to 1.
     pub background: [f64; 3],
-    /// The start's photograph as JPEG.
+    /// What the start's photograph shows from the viewer's camera ([`upright`]) as JPEG.
     pub photograph: Option<Vec<u8>>,
 }
 
@@ -159,6 +216,57 @@ mod tests {
         assert_eq!(initial["position"], json!([-1.0, -2.0, 3.0]));
         assert_eq!(initial["target"], json!([-4.0, 5.0, 6.0]));
         assert_eq!((&config["aspect"], &config["photograph"]), (&json!(160.0 / 120.0), &json!(true)));
+    }
+
+    fn camera(roll: f32) -> Camera {
+        let (s, c) = roll.sin_cos();
+        let rotation = [[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]];
+        Camera {
+            rotation,
+            translation: Camera::translation_to(&rotation, [1.0, 2.0, 3.0]),
+            focal: [60.0, 60.0],
+            principal: [20.0, 15.0],
+            distortion: [0.0; 4],
+            size: [40, 30],
+        }
+    }
+
+    fn photograph() -> RgbImage {
+        RgbImage::from_fn(40, 30, |x, y| Rgb([6 * x as u8, 8 * y as u8, (2 * x + 3 * y) as u8]))
+    }
+
+    #[test]
+    fn an_upright_camera_keeps_its_photograph() {
+        let camera = camera(0.0);
+        assert_eq!(upright(&camera).rotation, camera.rotation);
+        assert!(resampled(&photograph(), &camera, &upright(&camera)) == photograph());
+    }
+
+    /// The photograph is linear in x and y, so that its values say where they were taken from.
+    #[test]
+    fn roll_lens_and_principal_point_are_taken_out() {
+        let mut camera = camera(0.1);
+        (camera.principal, camera.distortion) = ([22.0, 14.0], [0.05, 0.0, 0.0, 0.0]);
+        let to = upright(&camera);
+        assert!((to.rotation[0][1]).abs() < 1e-7 && (to.rotation[1][1] - 1.0).abs() < 1e-7);
+        let picture = resampled(&photograph(), &camera, &to);
+        let center = camera.center();
+        let mut compared = 0;
+        for (x, y, pixel) in picture.enumerate_pixels() {
+            let at = to.unproject([f64::from(x) + 0.5, f64::from(y) + 0.5]).expect("no distortion");
+            let rows = to.rotation.map(|row| row.map(f64::from));
+            let point = std::array::from_fn(|i| center[i] + at[0] * rows[0][i] + at[1] * rows[1][i] + rows[2][i]);
+            let [u, v] = camera.project(point).expect("ahead");
+            if (1.0..39.0).contains(&u) && (1.0..29.0).contains(&v) {
+                // Half a step of the 8 bits.
+                assert!((f64::from(pixel.0[0]) - 6.0 * (u - 0.5)).abs() < 0.51, "{x} {y}");
+                assert!((f64::from(pixel.0[1]) - 8.0 * (v - 0.5)).abs() < 0.51, "{x} {y}");
+                compared += 1;
+            } else if u < 0.0 || v < 0.0 || u > 40.0 || v > 30.0 {
+                assert_eq!(pixel.0, [0; 3]);
+            }
+        }
+        assert!(compared > 900, "{compared}");
     }
 
     #[test]
