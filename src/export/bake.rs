@@ -46,9 +46,7 @@ impl Sums {
             self.log_scale[i] += share * scale[i].max(f32::MIN_POSITIVE).ln();
             self.color[i] += share * color[i];
         }
-        for i in 0..4 {
-            self.rotation[i] += signed * rotation[i];
-        }
+        self.rotation.iter_mut().zip(rotation).for_each(|(sum, v)| *sum += signed * v);
     }
 }
 

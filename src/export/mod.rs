@@ -173,7 +173,7 @@ pub struct Options {
 
 impl Default for Options {
     fn default() -> Self {
-        Self { upright: true, degree: 0, views: 48, steps: 400, seed: 0 }
+        Self { upright: true, degree: 0, views: 48, steps: 1000, seed: 0 }
     }
 }
 

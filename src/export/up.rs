@@ -7,7 +7,6 @@
 
 use glam::{DMat3, DVec3};
 
-use super::Cloud;
 use crate::scene::Camera;
 
 /// Weight of the mean against the x axes' spread: the squared sine of two degrees.
@@ -56,13 +55,6 @@ pub fn turn_camera(camera: &Camera, by: DMat3) -> Camera {
 pub fn roll(camera: &Camera) -> f64 {
     let (x, y) = (axis(camera, 0), axis(camera, 1));
     x.y.atan2(y.y).abs()
-}
-
-/// How far a cloud's Gaussians reach below and above, left and right: for tests and notes.
-pub fn extent(cloud: &Cloud) -> [DVec3; 2] {
-    let at = |p: &[f32; 3]| DVec3::from_array(p.map(f64::from));
-    let low = cloud.position.iter().map(at).fold(DVec3::INFINITY, DVec3::min);
-    [low, cloud.position.iter().map(at).fold(DVec3::NEG_INFINITY, DVec3::max)]
 }
 
 #[cfg(test)]

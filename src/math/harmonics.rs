@@ -49,7 +49,7 @@ mod tests {
         for (node, weight) in nodes.into_iter().flat_map(|(z, w)| [(z, w), (-z, w)]) {
             for step in 0..9 {
                 let (sin, cos) = (std::f64::consts::TAU * f64::from(step) / 9.0).sin_cos();
-                let r = (1.0 - node * node as f64).sqrt();
+                let r = f64::sqrt(1.0 - node * node);
                 let h = harmonics([r * cos, r * sin, node]);
                 for (i, row) in sums.iter_mut().enumerate() {
                     row.iter_mut().zip(h).for_each(|(s, v)| *s += h[i] * v * weight * std::f64::consts::TAU / 9.0);
