@@ -1,11 +1,9 @@
 //! From anchors to static Gaussians: one value each of what depends on the direction and the distance.
 //!
-//! The anchors are decoded and drawn on the device at every pose. A Gaussian's opacity is the mean over all poses whose
-//! picture it lies in, 0 where it does not exist; scale (as logarithm), rotation (with one sign) and colour are means
+//! The anchors are decoded and drawn on the device at every pose. A Gaussian's opacity is the mean over all poses in which
+//! it is drawn, or would be if it existed (there it counts as 0); scale (as logarithm), rotation (with one sign) and colour are means
 //! weighted with what it gave to the pictures: its sum of alpha x transmittance over the pixels, which is the colour's
 //! gradient under a picture gradient of 1. Gaussians that gave nothing are left out.
-
-use rayon::prelude::*;
 
 use super::{Cloud, Error, logit};
 use crate::gpu::{Buffer, Gpu};
@@ -18,16 +16,14 @@ use crate::render::view::{Capacity, Forward, Model, to_rgb8};
 use crate::render::{Config, Method};
 use crate::scene::Camera;
 
-/// A Gaussian counts as inside a picture enlarged by this share on every side: its tail reaches in.
-const MARGIN: f64 = 0.05;
 /// Gaussians whose samples all stay below what a viewer skips are not seen.
 const FAINT: f64 = 1.0 / 255.0;
 
 /// What is summed of a Gaussian over the poses.
 #[derive(Clone, Copy, Default)]
 struct Sums {
-    /// Poses whose picture it lies in.
-    inside: u32,
+    /// Poses in which its anchor was decoded and it is drawn, or lies in the picture and is not.
+    looked: u32,
     opacity: f32,
     /// Pixels' worth of alpha x transmittance.
     share: f32,
@@ -162,33 +158,35 @@ impl Baker {
     }
 
     fn take_down(&mut self, camera: &Camera) -> Result<(), Error> {
-        let near = self.config.near;
-        let size = camera.size.map(f64::from);
-        self.sums.par_iter_mut().zip(&self.position).for_each(|(sums, position)| {
-            let ahead = camera.to_camera(*position)[2] > near;
-            let inside = |at: [f64; 2]| (0..2).all(|i| (-MARGIN..=1.0 + MARGIN).contains(&(at[i] / size[i])));
-            sums.inside += u32::from(ahead && camera.project(*position).is_some_and(inside));
-        });
         let Stages { forward, backward, .. } = self.stages.as_ref().expect("the pose was drawn");
         let gpu = &self.gpu;
         let visible_count = gpu.read(&forward.visible.count)?[0] as usize;
-        let existing_count = gpu.read(&forward.decode.existing.count)?[0] as usize;
         let offsets = self.anchors.offsets as usize;
         let slots = visible_count * offsets;
         let visible = gpu.read_range(&forward.visible.list, visible_count)?;
-        let existing = gpu.read_range(&forward.decode.existing.list, existing_count)?;
         let opacity = gpu.read_range(&forward.decode.opacity, slots)?;
         let color = gpu.read_range(&forward.decode.color, slots)?;
         let scale = gpu.read_range(&forward.decode.scale, slots)?;
         let rotation = gpu.read_range(&forward.decode.rotation, slots)?;
         let tiles = gpu.read_range(forward.bin.tiles(), slots)?;
         let shares = gpu.read_range(&backward.grad_color, slots)?;
-        for slot in existing.into_iter().map(|slot| slot as usize) {
+        let (near, size) = (self.config.near, camera.size.map(f64::from));
+        let within = |position: [f64; 3]| {
+            let ahead = camera.to_camera(position)[2] > near;
+            ahead && camera.project(position).is_some_and(|at| (0..2).all(|i| (0.0..size[i]).contains(&at[i])))
+        };
+        for slot in 0..slots {
             let (k, v) = (slot / visible_count, slot % visible_count);
-            let sums = &mut self.sums[visible[v] as usize * offsets + k];
-            sums.opacity += opacity[slot];
-            if tiles[slot] > 0 && shares[slot][0] > 0.0 {
-                sums.add(shares[slot][0], scale[slot], rotation[slot], color[slot]);
+            let gaussian = visible[v] as usize * offsets + k;
+            let drawn = tiles[slot] > 0;
+            // What is not drawn has a say only where it could have been: its opacity elsewhere is nobody's business.
+            if drawn || within(self.position[gaussian]) {
+                let sums = &mut self.sums[gaussian];
+                sums.looked += 1;
+                sums.opacity += opacity[slot].max(0.0);
+                if drawn && shares[slot][0] > 0.0 {
+                    sums.add(shares[slot][0], scale[slot], rotation[slot], color[slot]);
+                }
             }
         }
         Ok(())
@@ -201,7 +199,7 @@ impl Baker {
     pub fn cloud(&self, share: f32, poses: usize) -> Result<Cloud, Error> {
         let mut cloud = Cloud::default();
         for (sums, position) in self.sums.iter().zip(&self.position) {
-            let opacity = f64::from(sums.opacity) / f64::from(sums.inside.max(1));
+            let opacity = f64::from(sums.opacity) / f64::from(sums.looked.max(1));
             let norm = sums.rotation.iter().map(|v| v * v).sum::<f32>().sqrt();
             if sums.share <= share || opacity < FAINT || norm <= 0.0 {
                 continue;

@@ -241,3 +241,86 @@ impl Drawer {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::export::tests::cloud;
+    use crate::export::{Cloud, logit};
+    use crate::gpu::testing;
+    use crate::math::harmonics::ZEROTH;
+    use crate::render::view::to_rgb8;
+    use crate::train::photographs::pack;
+
+    /// Looks along z at Gaussians around the origin from ten units away.
+    fn camera(size: [u32; 2]) -> Camera {
+        Camera {
+            rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            translation: [0.0, 0.0, 10.0],
+            focal: [60.0; 2],
+            principal: size.map(|side| side as f32 / 2.0),
+            distortion: [0.02, 0.0, 0.0, 0.0],
+            size,
+        }
+    }
+
+    fn drawer(gpu: &Gpu, cloud: &Cloud) -> Drawer {
+        let gaussians = Static::upload(gpu, cloud).expect("room");
+        Drawer::new(gpu, gaussians, &Config::default(), [0.0; 3]).expect("room")
+    }
+
+    /// White Gaussians before black: what a pixel shows is what they gave to it.
+    #[test]
+    fn contributions_are_what_the_picture_is_made_of() {
+        let gpu = testing::gpu();
+        let mut cloud = cloud(200, 0);
+        cloud.harmonics.fill([(0.5 / ZEROTH) as f32; 3]);
+        for size in [[64, 48], [50, 70]] {
+            let mut drawer = drawer(&gpu, &cloud);
+            let picture: f64 = drawer.draw(&camera(size)).expect("a picture").iter().map(|rgb| f64::from(rgb[0])).sum();
+            let shares = drawer.contributions(&camera(size)).expect("contributions");
+            let given: f64 = shares.iter().map(|share| f64::from(*share)).sum();
+            assert!(picture > 100.0, "something is seen: {picture}");
+            // Sums of some thousand float32 terms on either side.
+            assert!((given - picture).abs() < 1e-4 * picture, "{given} of {picture}");
+            // One behind the camera gives nothing.
+            assert!(shares.iter().zip(&cloud.position).all(|(share, p)| p[2] > -9.8 || *share == 0.0));
+        }
+    }
+
+    #[test]
+    fn steps_lead_to_the_picture() {
+        let gpu = testing::gpu();
+        let (goal, camera) = (cloud(150, 1), camera([64, 48]));
+        let picture = drawer(&gpu, &goal).draw(&camera).expect("a picture");
+        let target = pack(&to_rgb8(camera.size, &picture), None);
+        let mut start = goal.clone();
+        start.position.iter_mut().for_each(|p| p[0] += 0.05);
+        start.harmonics.iter_mut().for_each(|h| h[1] -= 0.2);
+        start.logit.fill(logit(0.5));
+        let mut drawer = drawer(&gpu, &start);
+        let rates = [5e-3, 5e-3, 1e-3, 5e-2, 1e-2];
+        let losses: Vec<f32> =
+            (1..=60).map(|step| drawer.step(&camera, &target, step, rates).expect("a step")).collect();
+        assert!(losses[59] < 0.4 * losses[0], "{} to {}", losses[0], losses[59]);
+        // A rate of 0 leaves its parameter where it was.
+        let before = drawer.gaussians.read(&gpu).expect("Gaussians");
+        drawer.step(&camera, &target, 61, [0.0, 0.0, 0.0, 0.0, 1e-2]).expect("a step");
+        let after = drawer.gaussians.read(&gpu).expect("Gaussians");
+        assert!(before.position == after.position && before.logit == after.logit);
+        assert!(before.harmonics != after.harmonics);
+    }
+
+    /// More pairs than there is room for at first.
+    #[test]
+    fn room_is_made_where_it_is_needed() {
+        let gpu = testing::gpu();
+        let mut cloud = cloud(3000, 0);
+        cloud.log_scale.fill([1.0; 3]);
+        let camera = camera([256, 192]);
+        let mut drawer = drawer(&gpu, &cloud);
+        let first = drawer.draw(&camera).expect("a picture");
+        assert!(drawer.pairs > PAIRS, "the case has enough pairs");
+        assert!(first == drawer.draw(&camera).expect("a picture") && first.iter().any(|rgb| rgb[0] > 0.1));
+    }
+}
