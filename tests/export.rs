@@ -235,7 +235,7 @@ fn a_run_becomes_files_of_the_same_scene() {
     assert_eq!(gltf::decode(&read("scene.glb")).expect("our own file").position, cloud.position);
     assert_eq!(spz::decode(&read("scene.spz")).expect("our own file").len(), cloud.len());
     let loss = |stage: &str| figures["loss"][stage]["anchors"]["full"]["psnr"].as_f64().expect(stage);
-    assert!(loss("refined") > loss("baked") + 1.0, "{} dB, then {}", loss("baked"), loss("refined"));
+    assert!(loss("baked") > 30.0 && loss("refined") > loss("baked"), "{} dB, then {}", loss("baked"), loss("refined"));
     for file in figures["files"].as_array().expect("files") {
         assert!(file["photographs"]["mask"]["ssim"].is_f64(), "masked figures are there: {file}");
         let psnr = file["anchors"]["full"]["psnr"].as_f64().expect("a figure");
