@@ -32,14 +32,12 @@ pub fn estimate(cameras: &[Camera]) -> DVec3 {
 /// The rotation into axes in which up is -y and the cameras look along +z on average.
 pub fn upright(cameras: &[Camera]) -> DMat3 {
     let down = -estimate(cameras);
-    let ahead: DVec3 = cameras.iter().map(|camera| axis(camera, 2)).sum();
+    let level = |ahead: DVec3| ahead.reject_from_normalized(down);
+    let mean = level(cameras.iter().map(|camera| axis(camera, 2)).sum::<DVec3>() / cameras.len().max(1) as f64);
     // Around a scene the views cancel: then the first camera's.
-    let ahead = if ahead.length() > 0.1 * cameras.len() as f64 {
-        ahead
-    } else {
-        cameras.first().map_or(DVec3::Z, |camera| axis(camera, 2))
-    };
-    let ahead = ahead.reject_from_normalized(down).try_normalize().unwrap_or_else(|| down.any_orthonormal_vector());
+    let ahead =
+        if mean.length() > 0.1 { mean } else { cameras.first().map_or(DVec3::Z, |camera| level(axis(camera, 2))) };
+    let ahead = if ahead.length() > 0.01 { ahead.normalize() } else { down.any_orthonormal_vector() };
     DMat3::from_cols(down.cross(ahead), down, ahead).transpose()
 }
 
