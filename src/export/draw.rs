@@ -63,9 +63,7 @@ pub struct Drawer {
     /// The Gaussians.
     pub gaussians: Static,
     stages: Option<Stages>,
-    /// One for each size of pictures so far, and what holds them all.
-    canvases: Vec<Canvas>,
-    largest: [u32; 2],
+    canvas: Option<Canvas>,
 }
 
 impl Drawer {
@@ -82,8 +80,7 @@ impl Drawer {
             pairs: PAIRS,
             gaussians,
             stages: None,
-            canvases: vec![],
-            largest: [0; 2],
+            canvas: None,
         })
     }
 
@@ -95,7 +92,7 @@ impl Drawer {
         self.run(camera, |drawer, rec, stages, canvas| {
             drawer.forward(rec, stages, canvas, camera);
         })?;
-        self.gpu.read(&self.canvas(camera.size).picture.rgb)
+        self.gpu.read(&self.canvas.as_ref().expect("made by the run").picture.rgb)
     }
 
     /// The sum of alpha x transmittance of every Gaussian over the pixels of a view: the colour's own gradient where the
@@ -122,16 +119,12 @@ impl Drawer {
     /// As [`Drawer::draw`].
     pub fn step(&mut self, camera: &Camera, target: &[u32], step: u32, rates: Rates) -> Result<f32, Error> {
         self.furnish(camera.size)?;
-        self.gpu.write(&self.canvas(camera.size).target, target)?;
+        self.gpu.write(&self.canvas.as_ref().expect("just made").target, target)?;
         self.run(camera, |drawer, rec, stages, canvas| {
             let binned = drawer.forward(rec, stages, canvas, camera);
             drawer.improve(rec, stages, canvas, binned, camera, (step, rates));
         })?;
-        Ok(self.gpu.read(self.canvas(camera.size).losses.terms())?[0])
-    }
-
-    fn canvas(&self, size: [u32; 2]) -> &Canvas {
-        self.canvases.iter().find(|canvas| canvas.picture.size == size).expect("furnished for this size")
+        Ok(self.gpu.read(self.canvas.as_ref().expect("made by the run").losses.terms())?[0])
     }
 
     fn method(&self) -> Method {
@@ -205,13 +198,11 @@ impl Drawer {
 
     /// Makes what is missing for pictures of this size.
     fn furnish(&mut self, size: [u32; 2]) -> Result<(), Error> {
-        let Self { gpu, config, pairs, gaussians, stages, canvases, largest, .. } = self;
-        if canvases.iter().all(|canvas| canvas.picture.size != size) {
-            canvases.push(Canvas::new(gpu, size)?);
-            let all = std::array::from_fn(|i| largest[i].max(size[i]));
-            if all != *largest {
-                (*largest, *stages) = (all, None);
-            }
+        let Self { gpu, config, pairs, gaussians, stages, canvas, .. } = self;
+        if canvas.as_ref().is_none_or(|canvas| canvas.picture.size != size) {
+            // Those of another size go before these are made: the tiles' lists are of that size as well.
+            (*canvas, *stages) = (None, None);
+            *canvas = Some(Canvas::new(gpu, size)?);
         }
         if stages.is_none() {
             let n = gaussians.count;
@@ -220,7 +211,7 @@ impl Drawer {
             *stages = Some(Stages {
                 activate: Activate::new(gpu, n)?,
                 all: Slots::all(gpu, n)?,
-                bin: Bin::new(gpu, method, n, *pairs, *largest)?,
+                bin: Bin::new(gpu, method, n, *pairs, size)?,
                 rasterize_backward: Backward::new(gpu, method, n as usize, *pairs as usize, Outputs::Color)?,
                 project_backward: ProjectBackward::new(gpu, &project)?,
                 activate_backward: ActivateBackward::new(gpu, gaussians)?,
@@ -234,9 +225,9 @@ impl Drawer {
     fn run(&mut self, camera: &Camera, work: impl Fn(&Self, &mut Recorder<'_>, &Stages, &Canvas)) -> Result<(), Error> {
         loop {
             self.furnish(camera.size)?;
-            let stages = self.stages.as_ref().expect("just made");
+            let (stages, canvas) = self.stages.as_ref().zip(self.canvas.as_ref()).expect("just made");
             let mut rec = self.gpu.recorder()?;
-            work(self, &mut rec, stages, self.canvas(camera.size));
+            work(self, &mut rec, stages, canvas);
             rec.submit()?.wait()?;
             if self.gpu.read(self.limits.overflow())?[0] == 0 {
                 return Ok(());

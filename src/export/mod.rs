@@ -226,7 +226,7 @@ pub fn make(
     let turned = |camera: &Camera| up::turn_camera(camera, turn);
     let looked = poses::spread(&train, TRAIN_VIEWS);
     let between = poses::virtual_views(&train, options.views, options.seed);
-    let cameras: Vec<Camera> = looked.iter().copied().chain(between.iter().map(poses::widened)).collect();
+    let cameras: Vec<Camera> = looked.iter().chain(&between).copied().collect();
 
     let held_out = poses::virtual_views(&train, HELD_OUT, !options.seed);
     let tests = if scene.test.is_empty() { held_out.len() } else { scene.test.len() };

@@ -43,20 +43,6 @@ pub fn virtual_views(cameras: &[Camera], count: u32, seed: u64) -> Vec<Camera> {
         .collect()
 }
 
-/// Share of a picture's sides that a widened one has more, on every side.
-const MARGIN: f64 = 0.25;
-
-/// The same camera with a picture that shows more on every side: what lies just beyond the training pictures is seen from
-/// other places.
-pub fn widened(camera: &Camera) -> Camera {
-    let margin = camera.size.map(|side| (MARGIN * f64::from(side)).round() as u32);
-    Camera {
-        principal: std::array::from_fn(|i| camera.principal[i] + margin[i] as f32),
-        size: std::array::from_fn(|i| camera.size[i] + 2 * margin[i]),
-        ..*camera
-    }
-}
-
 /// At most `most` of them, evenly spread.
 pub fn spread<T: Clone>(all: &[T], most: usize) -> Vec<T> {
     let n = all.len().min(most);
@@ -115,16 +101,6 @@ mod tests {
         assert!(virtual_views(&[], 5, 1).is_empty());
         let alone = virtual_views(&cameras[..1], 2, 1);
         assert!((DVec3::from_array(alone[1].center()) - DVec3::from_array(cameras[0].center())).length() < 1e-6);
-    }
-
-    #[test]
-    fn a_wider_picture_shows_the_same_in_its_middle() {
-        let narrow = camera(DVec3::new(1.0, 2.0, 3.0), 0.3);
-        let wide = widened(&narrow);
-        assert_eq!(wide.size, [90, 60]);
-        let point = [2.0, 2.5, 9.0];
-        let [a, b] = [&narrow, &wide].map(|camera| camera.project(point).expect("ahead"));
-        assert!((b[0] - a[0] - 15.0).abs() < 1e-9 && (b[1] - a[1] - 10.0).abs() < 1e-9);
     }
 
     #[test]
