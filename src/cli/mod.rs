@@ -9,6 +9,7 @@ mod ablate;
 mod bench;
 mod devices;
 mod eval;
+mod export;
 pub mod folders;
 mod instruments;
 pub mod pictures;
@@ -19,6 +20,7 @@ pub mod shared;
 mod synth;
 mod train;
 mod verify;
+mod view;
 
 use std::fmt::Write as _;
 use std::process::ExitCode;
@@ -53,6 +55,8 @@ enum Command {
     Train(train::Args),
     Render(render::Args),
     Eval(eval::Args),
+    Export(export::Args),
+    View(view::Args),
     Devices(devices::Args),
     Synth(synth::Args),
     Plan(plan::Args),
@@ -71,6 +75,8 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
         Command::Train(args) => train::run(&args),
         Command::Render(args) => render::run(&args),
         Command::Eval(args) => eval::run(&args),
+        Command::Export(args) => export::run(&args),
+        Command::View(args) => view::run(&args),
         Command::Devices(args) => devices::run(&args),
         Command::Synth(args) => synth::run(&args),
         Command::Plan(args) => plan::run(&args),

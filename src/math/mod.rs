@@ -5,5 +5,6 @@ pub mod align;
 pub mod attention;
 pub mod camera;
 pub mod decoder;
+pub mod harmonics;
 pub mod ssim;
 pub mod tiles;

@@ -1,0 +1,332 @@
+//! `gscream-vk export`.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::{Context as _, bail};
+use indicatif::{ProgressBar, ProgressStyle};
+use serde::{Deserialize, Serialize};
+
+use super::folders::Origin;
+use super::shared::{self, DeviceArgs};
+use crate::config::{Settings, Source};
+use crate::export::{self, Cloud, Export, Observer, Options, gltf, measure, ply, spz, up};
+use crate::model;
+use crate::scene::{Camera, Scene, path};
+
+/// The export's folder within a run folder.
+pub(super) const EXPORT: &str = "export";
+/// The figures' file within an export's folder.
+pub(super) const FIGURES: &str = "export.json";
+/// Stem of the exported files.
+pub(super) const STEM: &str = "scene";
+
+/// Write a trained model as static Gaussians, for viewers: PLY, SPZ and glTF
+///
+/// An anchor's Gaussians depend on the direction and the distance they are seen from; a file holds one value each. They
+/// are read off from the training cameras and from cameras between them, refined against the anchors' own pictures, and
+/// pruned. What that costs is measured on views that took no part, printed, and written to export.json.
+///
+/// scene.ply is the file of 3D Gaussian Splatting (62 floats), scene.spz Niantic's SPZ of version 3, scene.glb glTF with
+/// KHR_gaussian_splatting. Up is -y in the first two and +y in the last.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  gscream-vk export runs/garden
+  gscream-vk export runs/garden --formats spz --out garden
+  gscream-vk export runs/garden/model --scene garden --up keep --degree 3")]
+pub(super) struct Args {
+    /// Run folder, or a model's own folder
+    #[arg(value_name = "RUN")]
+    model: PathBuf,
+    /// Folder for the files [default: export in RUN]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Files to write
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "ply,spz,glb")]
+    formats: Vec<Format>,
+    /// Which way is up
+    #[arg(long, value_enum, default_value_t = Up::Auto)]
+    up: Up,
+    /// Highest degree of the colours' spherical harmonics
+    #[arg(long, value_name = "N", default_value_t = Options::default().degree, value_parser = clap::value_parser!(u32).range(0..=3))]
+    degree: u32,
+    /// Cameras between training cameras to look from
+    #[arg(long, value_name = "N", default_value_t = Options::default().views, value_parser = clap::value_parser!(u32).range(0..=10_000))]
+    views: u32,
+    /// Steps of the refinement
+    #[arg(long, value_name = "N", default_value_t = Options::default().steps)]
+    steps: u32,
+    /// Scene to take the cameras from, or the word `synthetic` [default: the run's own]
+    #[arg(long, value_name = "DIR")]
+    scene: Option<PathBuf>,
+    /// TOML file whose settings replace those of the run
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Replace one setting; may be given many times
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    #[command(flatten)]
+    device: DeviceArgs,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Format {
+    /// 3D Gaussian Splatting's own
+    Ply,
+    /// Niantic's, about a tenth of the size
+    Spz,
+    /// Binary glTF
+    Glb,
+}
+
+impl Format {
+    fn extension(self) -> &'static str {
+        match self {
+            Self::Ply => "ply",
+            Self::Spz => "spz",
+            Self::Glb => "glb",
+        }
+    }
+
+    fn encode(self, cloud: &Cloud) -> Result<Vec<u8>, export::Error> {
+        match self {
+            Self::Ply => Ok(ply::encode(cloud)),
+            Self::Spz => spz::encode(cloud),
+            Self::Glb => gltf::encode(cloud),
+        }
+    }
+
+    fn decode(self, bytes: &[u8]) -> Result<Cloud, export::Error> {
+        match self {
+            Self::Ply => ply::decode(bytes),
+            Self::Spz => spz::decode(bytes),
+            Self::Glb => gltf::decode(bytes),
+        }
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Up {
+    /// Estimated from the cameras
+    Auto,
+    /// The scene's axes as they are, taken for y down
+    Keep,
+}
+
+/// A camera in the cloud's axes, in which up is -y.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(super) struct Pose {
+    /// The training view's name.
+    pub name: String,
+    /// Its centre.
+    pub center: [f64; 3],
+    /// Right, down and ahead, world to camera.
+    pub rotation: [[f32; 3]; 3],
+    /// Field of view across the longer side, degrees.
+    pub fov: f64,
+    /// Width and height in pixels.
+    pub size: [u32; 2],
+    /// How far it is rolled out of the horizon, in degrees.
+    pub roll: f64,
+}
+
+impl Pose {
+    fn new(name: &str, camera: &Camera) -> Self {
+        let longer = usize::from(camera.size[1] >= camera.size[0]);
+        let half = 0.5 * f64::from(camera.size[longer]) / f64::from(camera.focal[longer]);
+        Self {
+            name: name.to_owned(),
+            center: camera.center(),
+            rotation: camera.rotation,
+            fov: 2.0 * half.atan().to_degrees(),
+            size: camera.size,
+            roll: up::roll(camera).to_degrees(),
+        }
+    }
+}
+
+/// What `view` reads of export.json.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(super) struct Cameras {
+    /// Background, 0 to 1.
+    pub background: [f64; 3],
+    /// What the training cameras look at.
+    pub focus: [f64; 3],
+    /// The training cameras.
+    pub cameras: Vec<Pose>,
+}
+
+#[derive(Serialize)]
+struct File {
+    name: String,
+    bytes: usize,
+    #[serde(flatten)]
+    loss: measure::Loss,
+}
+
+#[derive(Serialize)]
+struct Figures {
+    version: &'static str,
+    command: String,
+    device: String,
+    note: &'static str,
+    measured_on: String,
+    train_views: usize,
+    virtual_views: usize,
+    steps: u32,
+    degree: u32,
+    up: &'static str,
+    /// Rows: a world point p of the scene is `rotation p` in the PLY.
+    rotation: [[f64; 3]; 3],
+    gaussians_of_the_model: usize,
+    gaussians_baked: usize,
+    gaussians: usize,
+    seconds: f64,
+    loss: serde_json::Map<String, serde_json::Value>,
+    files: Vec<File>,
+    #[serde(flatten)]
+    cameras: Cameras,
+}
+
+const NOTE: &str = "loss: means over the views of measured_on, which took no part in baking and refinement; anchors: \
+                    against the anchor model's own pictures, photographs: against the photographs; cameras: right, \
+                    down and ahead in the axes of the PLY";
+
+/// A bar for each part of the work.
+#[derive(Default)]
+struct Bars(Option<ProgressBar>);
+
+impl Observer for Bars {
+    fn begin(&mut self, part: &str, turns: u64) {
+        self.end();
+        let style = ProgressStyle::with_template("{prefix} {wide_bar} {pos}/{len}, {eta} left {msg}");
+        let bar = ProgressBar::new(turns).with_prefix(part.to_owned());
+        self.0 = Some(style.map_or(bar.clone(), |style| bar.with_style(style)));
+    }
+
+    fn turn(&mut self, note: &str) {
+        if let Some(bar) = &self.0 {
+            bar.inc(1);
+            bar.set_message(note.to_owned());
+        }
+    }
+}
+
+impl Bars {
+    fn end(&mut self) {
+        if let Some(bar) = self.0.take() {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+pub(super) fn run(args: &Args) -> anyhow::Result<()> {
+    let origin = Origin::find(&args.model)?;
+    let file = args.config.iter().cloned().map(Source::File);
+    let settings = origin.settings(file.chain(args.set.iter().cloned().map(Source::Set)).collect())?;
+    let model = model::files::load(&origin.model())?;
+    let own = origin.scene().map(Path::new);
+    let scene = args.scene.as_deref().or(own).with_context(|| {
+        format!("{}: a model alone does not know its cameras; name the scene with --scene", args.model.display())
+    })?;
+    let scene = shared::load_scene(scene, &settings)?;
+    let folder = args.out.clone().unwrap_or_else(|| args.model.join(EXPORT));
+    if args.formats.is_empty() {
+        bail!("--formats: names no format");
+    }
+    args.device.with_gpu(|gpu| {
+        let began = Instant::now();
+        let options = Options {
+            upright: args.up == Up::Auto,
+            degree: args.degree,
+            views: args.views,
+            steps: args.steps,
+            seed: settings.train.seed,
+        };
+        let mut bars = Bars::default();
+        let made = export::make(gpu, (&model.0, &model.1), &scene, &settings, &options, &mut bars);
+        bars.end();
+        let mut made = made?;
+        // All files are made before the first is written.
+        let mut written = vec![];
+        for format in &args.formats {
+            let bytes = format.encode(&made.cloud)?;
+            let background = settings.train.background.map(|channel| channel as f32);
+            let read_back = format.decode(&bytes)?;
+            let loss = made.yardstick.of_cloud(gpu, &read_back, &settings.render, background)?;
+            let name = format!("{STEM}.{}", format.extension());
+            made.losses.push((format!("{name}, {}", size(bytes.len())), loss));
+            written.push((File { name, bytes: bytes.len(), loss }, bytes));
+        }
+        let (files, contents): (Vec<File>, Vec<Vec<u8>>) = written.into_iter().unzip();
+        let figures = figures(args, gpu.info().name.clone(), &scene, &settings, &made, files, began);
+        let text = serde_json::to_string_pretty(&figures)? + "\n";
+        let named =
+            figures.files.iter().zip(&contents).map(|(file, bytes)| (folder.join(&file.name), bytes.as_slice()));
+        let named: Vec<_> = named.chain([(folder.join(FIGURES), text.as_bytes())]).collect();
+        export::write(&named)?;
+        report(&made, &figures, &args.formats);
+        let names: Vec<&str> = figures.files.iter().map(|file| file.name.as_str()).collect();
+        println!("wrote {}, {FIGURES} in {}", names.join(", "), folder.display());
+        Ok(())
+    })
+}
+
+fn figures(
+    args: &Args,
+    device: String,
+    scene: &Scene,
+    settings: &Settings,
+    made: &Export,
+    files: Vec<File>,
+    began: Instant,
+) -> Figures {
+    let command: Vec<String> = std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect();
+    let stages = made.losses.iter().take(made.losses.len() - files.len());
+    let loss = stages.filter_map(|(name, loss)| Some((name.clone(), serde_json::to_value(loss).ok()?)));
+    let cameras: Vec<Camera> = scene.train.iter().map(|view| up::turn_camera(&view.camera, made.turn)).collect();
+    // The points are of other axes and only say how far parallel views look, for which the origin does.
+    let focus = path::focus(&cameras, &[]).unwrap_or_default();
+    let cameras = scene.train.iter().zip(&cameras).map(|(view, camera)| Pose::new(&view.name, camera));
+    Figures {
+        version: env!("CARGO_PKG_VERSION"),
+        command: command.join(" "),
+        device,
+        note: NOTE,
+        measured_on: made.yardstick.what.clone(),
+        train_views: made.poses[0],
+        virtual_views: made.poses[1],
+        steps: args.steps,
+        degree: args.degree,
+        up: if args.up == Up::Auto { "auto" } else { "keep" },
+        rotation: made.turn.transpose().to_cols_array_2d(),
+        gaussians_of_the_model: made.gaussians[0],
+        gaussians_baked: made.gaussians[1],
+        gaussians: made.cloud.len(),
+        seconds: began.elapsed().as_secs_f64(),
+        loss: loss.collect(),
+        files,
+        cameras: Cameras { background: settings.train.background, focus, cameras: cameras.collect() },
+    }
+}
+
+fn size(bytes: usize) -> String {
+    format!("{:.1} MB", bytes as f64 / 1e6)
+}
+
+fn report(made: &Export, figures: &Figures, formats: &[Format]) {
+    println!("{}", measure::table(&made.losses));
+    println!(
+        "measured on {}; {} Gaussians, of {} baked from {} training and {} virtual cameras; {:.0} s",
+        figures.measured_on,
+        figures.gaussians,
+        figures.gaussians_baked,
+        figures.train_views,
+        figures.virtual_views,
+        figures.seconds
+    );
+    let cut = spz::beyond_range(&made.cloud);
+    if formats.contains(&Format::Spz) && cut > 0 {
+        println!("SPZ holds scales between 4.5e-5 and 380 units: {cut} of {} were cut off", 3 * made.cloud.len());
+    }
+}

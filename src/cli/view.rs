@@ -1,0 +1,131 @@
+//! `gscream-vk view`.
+
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, anyhow, bail};
+use image::codecs::jpeg::JpegEncoder;
+
+use super::export::{Cameras, EXPORT, FIGURES, Pose, STEM};
+use super::folders::Origin;
+use super::shared;
+use crate::export;
+use crate::scene::Camera;
+use crate::view::{self, Page, Start, server};
+
+/// Show an exported scene in the browser
+///
+/// Serves a page on the loopback address until it is stopped; nothing is fetched from elsewhere. The view starts at a
+/// training camera, by default the one that stands most upright, and a slider draws its photograph over the scene.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  gscream-vk view runs/garden
+  gscream-vk view runs/garden --camera IMG_0012 --port 9000
+  gscream-vk view runs/garden --html garden.html")]
+pub(super) struct Args {
+    /// Run folder that was exported, or an export's own folder
+    #[arg(value_name = "RUN")]
+    run: PathBuf,
+    /// Training view to start at [default: the most upright one]
+    #[arg(long, value_name = "NAME")]
+    camera: Option<String>,
+    /// Write one page that needs nothing else, and serve nothing
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["port", "host"])]
+    html: Option<PathBuf>,
+    /// Port to serve on; 0 is any free one
+    #[arg(long, value_name = "N", default_value_t = 8642)]
+    port: u16,
+    /// Address to serve on; others than the loopback let other machines in
+    #[arg(long, value_name = "ADDRESS", default_value_t = IpAddr::V4(Ipv4Addr::LOCALHOST))]
+    host: IpAddr,
+    /// Leave out the photograph
+    #[arg(long)]
+    no_photograph: bool,
+}
+
+pub(super) fn run(args: &Args) -> anyhow::Result<()> {
+    let page = page(args)?;
+    if let Some(file) = &args.html {
+        let html = page.single().with_context(|| format!("{}: cannot be made", file.display()))?;
+        export::write(&[(file.clone(), html.as_bytes())])?;
+        println!("{}: {:.1} MB, needs nothing else", file.display(), html.len() as f64 / 1e6);
+        return Ok(());
+    }
+    let address = SocketAddr::new(args.host, args.port);
+    let listener = server::bind(address).map_err(|error| match error.kind() {
+        std::io::ErrorKind::AddrInUse => anyhow!("{address}: another program serves there; --port 0 takes a free one"),
+        _ => anyhow!("{address}: cannot be served on: {error}"),
+    })?;
+    println!("http://{}/ (Ctrl-C ends it)", listener.local_addr().unwrap_or(address));
+    server::serve(&listener, page.resources()).with_context(|| format!("{address}: cannot be served on"))
+}
+
+fn page(args: &Args) -> anyhow::Result<Page> {
+    let run = &args.run;
+    if !run.is_dir() {
+        bail!("{}: there is no such folder", run.display());
+    }
+    let folder = if run.join(FIGURES).is_file() { run.clone() } else { run.join(EXPORT) };
+    let read = |name: &str| {
+        let path = folder.join(name);
+        std::fs::read(&path).with_context(|| {
+            format!("{}: cannot be read; `gscream-vk export {}` writes it", path.display(), run.display())
+        })
+    };
+    let ply = read(&format!("{STEM}.ply"))?;
+    let figures = folder.join(FIGURES);
+    let cameras: Cameras = serde_json::from_slice(&read(FIGURES)?)
+        .with_context(|| format!("{}: not the figures of an export", figures.display()))?;
+    let pose = match &args.camera {
+        Some(name) => cameras.cameras.iter().find(|pose| pose.name == *name).ok_or_else(|| {
+            let first = cameras.cameras.first().map_or("none", |pose| &pose.name);
+            anyhow!("--camera {name}: no training view has this name; they are called like {first}")
+        })?,
+        None => cameras
+            .cameras
+            .iter()
+            .min_by(|a, b| a.roll.total_cmp(&b.roll))
+            .with_context(|| format!("{}: names no camera", figures.display()))?,
+    };
+    let origin = Origin::find(run).ok();
+    let photograph = origin.filter(|_| !args.no_photograph).and_then(|origin| {
+        let jpeg = photograph(&origin, pose);
+        if let Err(error) = &jpeg {
+            eprintln!("note: without a photograph: {error:#}");
+        }
+        jpeg.ok()
+    });
+    let name = std::path::absolute(run).unwrap_or_else(|_| run.clone());
+    Ok(Page {
+        title: name.file_name().map_or_else(|| "scene".into(), |name| name.to_string_lossy().into_owned()),
+        ply,
+        start: start(pose, &cameras),
+        background: cameras.background,
+        photograph,
+    })
+}
+
+/// The camera looks along its axis at the point nearest to what all cameras look at.
+fn start(pose: &Pose, cameras: &Cameras) -> Start {
+    let ahead = pose.rotation[2].map(f64::from);
+    let along: f64 = (0..3).map(|i| (cameras.focus[i] - pose.center[i]) * ahead[i]).sum();
+    let distance = if along > 0.0 { along } else { 1.0 };
+    let target = std::array::from_fn(|i| pose.center[i] + distance * ahead[i]);
+    Start { center: pose.center, target, fov: pose.fov, size: pose.size }
+}
+
+/// What the photograph shows from the viewer's camera.
+fn photograph(origin: &Origin, pose: &Pose) -> anyhow::Result<Vec<u8>> {
+    let settings = origin.settings(vec![])?;
+    let scene = origin.scene().context("a model alone does not know its photographs")?;
+    let scene = shared::load_scene(Path::new(scene), &settings)?;
+    let view = scene.train.iter().find(|view| view.name == pose.name);
+    let view = view.with_context(|| format!("{}: the scene has no such view any more", pose.name))?;
+    // Its lens, in the axes of the export.
+    let rotation = pose.rotation;
+    let camera = Camera { rotation, translation: Camera::translation_to(&rotation, pose.center), ..view.camera };
+    let picture = view::resampled(&view.image, &camera, &view::upright(&camera));
+    let mut jpeg = vec![];
+    picture.write_with_encoder(JpegEncoder::new_with_quality(&mut jpeg, 92))?;
+    Ok(jpeg)
+}

@@ -1,0 +1,416 @@
+#![doc = include_str!("README.md")]
+
+pub mod activate;
+pub mod bake;
+pub mod draw;
+pub mod gltf;
+pub mod measure;
+pub mod ply;
+pub mod poses;
+pub mod refine;
+pub mod spz;
+pub mod up;
+
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
+
+use atomic_write_file::AtomicWriteFile;
+use glam::{DMat3, DQuat, DVec3};
+
+use crate::config::Settings;
+use crate::gpu::Gpu;
+use crate::math::harmonics::coefficients;
+use crate::model::files;
+use crate::render::view::Renderer;
+use crate::scene::{Camera, Scene};
+
+/// Why an export, or one of its files, cannot be written or read.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The device.
+    #[error(transparent)]
+    Gpu(#[from] crate::gpu::Error),
+    /// A file that the system refuses.
+    #[error("{}: cannot be written: {source}; nothing of it is left behind", path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// The system's words.
+        source: io::Error,
+    },
+    /// A file that is not what its name says.
+    #[error("{0}")]
+    Format(String),
+    /// A model of which nothing is seen.
+    #[error("none of the model's {gaussians} Gaussians is seen from any of {poses} poses: there is nothing to export")]
+    Nothing {
+        /// Gaussians of the model.
+        gaussians: usize,
+        /// Poses they were looked at from.
+        poses: usize,
+    },
+    /// Pictures that cannot be compared.
+    #[error(transparent)]
+    Evaluate(#[from] crate::evaluate::Error),
+}
+
+/// Static Gaussians: what a viewer draws.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Cloud {
+    /// \[gaussian\] scene units.
+    pub position: Vec<[f32; 3]>,
+    /// \[gaussian\] natural logarithms of the standard deviations in scene units.
+    pub log_scale: Vec<[f32; 3]>,
+    /// \[gaussian\] unit quaternions w x y z.
+    pub rotation: Vec<[f32; 4]>,
+    /// \[gaussian\] logit of the opacity.
+    pub logit: Vec<f32>,
+    /// Highest degree of the harmonics, 0 to 3.
+    pub degree: u32,
+    /// \[gaussian, coefficient\] rgb, `(degree + 1)^2` coefficients: see [`crate::math::harmonics`].
+    pub harmonics: Vec<[f32; 3]>,
+}
+
+impl Cloud {
+    /// Number of Gaussians.
+    pub fn len(&self) -> usize {
+        self.position.len()
+    }
+
+    /// True without Gaussians.
+    pub fn is_empty(&self) -> bool {
+        self.position.is_empty()
+    }
+
+    /// The coefficients of one Gaussian.
+    pub fn harmonics_of(&self, i: usize) -> &[[f32; 3]] {
+        let each = coefficients(self.degree);
+        &self.harmonics[i * each..(i + 1) * each]
+    }
+
+    /// Those for which `keep` says so, in their order.
+    pub fn retain(&mut self, keep: &[bool]) {
+        fn kept<T: Copy>(from: &mut Vec<T>, keep: &[bool], each: usize) {
+            let mut flags = keep.iter().flat_map(|k| std::iter::repeat_n(*k, each));
+            from.retain(|_| flags.next().unwrap_or(true));
+        }
+        let each = coefficients(self.degree);
+        kept(&mut self.position, keep, 1);
+        kept(&mut self.log_scale, keep, 1);
+        kept(&mut self.rotation, keep, 1);
+        kept(&mut self.logit, keep, 1);
+        kept(&mut self.harmonics, keep, each);
+    }
+
+    /// The same Gaussians in axes turned by a rotation matrix.
+    ///
+    /// # Panics
+    /// With harmonics beyond degree 0, which are to be fitted in the axes they are written in.
+    pub fn turn(&mut self, by: DMat3) {
+        assert_eq!(self.degree, 0, "harmonics are not turned");
+        let turn = DQuat::from_mat3(&by);
+        for position in &mut self.position {
+            *position = (by * DVec3::from_array(position.map(f64::from))).to_array().map(|v| v as f32);
+        }
+        for rotation in &mut self.rotation {
+            let [w, x, y, z] = rotation.map(f64::from);
+            let q = (turn * DQuat::from_xyzw(x, y, z, w)).normalize();
+            *rotation = [q.w, q.x, q.y, q.z].map(|v| v as f32);
+        }
+    }
+}
+
+/// The opacity of a logit, 0 to 1.
+pub fn sigmoid(logit: f32) -> f64 {
+    1.0 / (1.0 + (-f64::from(logit)).exp())
+}
+
+/// The logit of an opacity, finite: opacities are cut off at the largest alpha of a sample and at what a viewer skips.
+pub fn logit(opacity: f64) -> f32 {
+    let o = opacity.clamp(1e-4, 0.9999);
+    (o / (1.0 - o)).ln() as f32
+}
+
+/// Writes files that appear complete or not at all: all are on the disk before the first replaces its predecessor.
+///
+/// # Errors
+/// [`Error::Write`].
+pub fn write(files: &[(PathBuf, &[u8])]) -> Result<(), Error> {
+    let failed = |path: &Path, source| Error::Write { path: path.to_owned(), source };
+    let mut whole = vec![];
+    for (path, bytes) in files {
+        let write = || {
+            if let Some(folder) = path.parent() {
+                std::fs::create_dir_all(folder)?;
+            }
+            let mut file = AtomicWriteFile::open(path)?;
+            file.write_all(bytes)?;
+            file.sync_all()?;
+            Ok(file)
+        };
+        whole.push(write().map_err(|source| failed(path, source))?);
+    }
+    for (file, (path, _)) in whole.into_iter().zip(files) {
+        file.commit().map_err(|source| failed(path, source))?;
+    }
+    Ok(())
+}
+
+/// What an export is made of besides the model.
+#[derive(Debug, Clone, Copy)]
+pub struct Options {
+    /// Turn the scene so that up is -y in the cloud.
+    pub upright: bool,
+    /// Highest degree of the harmonics, 0 to 3.
+    pub degree: u32,
+    /// Poses between training cameras to look from.
+    pub views: u32,
+    /// Steps of the refinement.
+    pub steps: u32,
+    /// Seed of the poses and of their order.
+    pub seed: u64,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self { upright: true, degree: 0, views: 48, steps: 1000, seed: 0 }
+    }
+}
+
+/// Training cameras looked from at most: a capture of hundreds is seen as well from every second or third.
+const TRAIN_VIEWS: usize = 120;
+/// Poses to measure at where the scene has no test views.
+const HELD_OUT: u32 = 12;
+/// Pixels' worth of alpha x transmittance over all poses that a Gaussian must give to be kept.
+const SEEN: f32 = 0.05;
+
+/// Is told how far the work is.
+pub trait Observer {
+    /// A part of the work begins, of so many turns.
+    fn begin(&mut self, part: &str, turns: u64);
+    /// A turn is done; `note` says something of it, or nothing.
+    fn turn(&mut self, note: &str);
+}
+
+/// A finished export, before it is written.
+pub struct Export {
+    /// The Gaussians, up -y.
+    pub cloud: Cloud,
+    /// From the scene's axes into the cloud's.
+    pub turn: DMat3,
+    /// Where losses are measured.
+    pub yardstick: measure::Yardstick,
+    /// What was measured on the way, in order: the anchors, the baked and the refined Gaussians.
+    pub losses: Vec<(String, measure::Loss)>,
+    /// Poses looked from: training cameras, poses between them.
+    pub poses: [usize; 2],
+    /// Gaussians of the model, and those that were baked.
+    pub gaussians: [usize; 2],
+}
+
+/// Bakes, refines and prunes.
+///
+/// # Errors
+/// When the device has no room, or is lost; a model of which nothing is seen.
+pub fn make(
+    gpu: &Gpu,
+    model: (&files::Anchors, &files::Weights),
+    scene: &Scene,
+    settings: &Settings,
+    options: &Options,
+    observer: &mut dyn Observer,
+) -> Result<Export, Error> {
+    let background = settings.train.background.map(|channel| channel as f32);
+    let train: Vec<Camera> = scene.train.iter().map(|view| view.camera).collect();
+    let turn = if options.upright { up::upright(&train) } else { DMat3::IDENTITY };
+    let turned = |camera: &Camera| up::turn_camera(camera, turn);
+    let looked = poses::spread(&train, TRAIN_VIEWS);
+    let between = poses::virtual_views(&train, options.views, options.seed);
+    let cameras: Vec<Camera> = looked.iter().chain(&between).copied().collect();
+
+    let held_out = poses::virtual_views(&train, HELD_OUT, !options.seed);
+    let tests = if scene.test.is_empty() { held_out.len() } else { scene.test.len() };
+    observer.begin("drawing the anchors to compare with", tests as u64);
+    let mut renderer = Renderer::new(gpu, model.0, model.1, &settings.render, background)?;
+    let yardstick = measure::Yardstick::new(&mut renderer, scene, &held_out, turned, || observer.turn(""))?;
+    drop(renderer);
+    let mut losses = vec![("anchors".to_owned(), yardstick.of_anchors()?)];
+
+    observer.begin("baking", cameras.len() as u64);
+    let mut baker = bake::Baker::new(gpu, model, &settings.render, background)?;
+    let mut views = vec![];
+    for camera in &cameras {
+        views.push((turned(camera), baker.look(camera)?));
+        observer.turn("");
+    }
+    let mut cloud = baker.cloud(SEEN, cameras.len())?;
+    let gaussians = [baker.gaussians(), cloud.len()];
+    drop(baker);
+    cloud.turn(turn);
+    let each = coefficients(options.degree);
+    cloud.harmonics =
+        cloud.harmonics.iter().flat_map(|h| std::iter::once(*h).chain(vec![[0.0; 3]; each - 1])).collect();
+    cloud.degree = options.degree;
+
+    let gaussian_config = &settings.render;
+    let mut drawer = draw::Drawer::new(gpu, activate::Static::upload(gpu, &cloud)?, gaussian_config, background)?;
+    losses.push(("baked".to_owned(), yardstick.of_drawer(&mut drawer)?));
+    observer.begin("refining", options.steps.into());
+    let config = refine::Config { steps: options.steps, seed: options.seed, radius: scene.radius.into() };
+    refine::run(&mut drawer, &views, &config, |_, loss| observer.turn(&format!("loss {loss:.4}")))?;
+    losses.push(("refined".to_owned(), yardstick.of_drawer(&mut drawer)?));
+
+    observer.begin("pruning", views.len() as u64);
+    let mut shares = vec![0f32; cloud.len()];
+    for (camera, _) in &views {
+        shares.iter_mut().zip(drawer.contributions(camera)?).for_each(|(sum, share)| *sum += share);
+        observer.turn("");
+    }
+    cloud = drawer.gaussians.read(gpu)?;
+    cloud.retain(&shares.iter().map(|share| *share > SEEN).collect::<Vec<_>>());
+    Ok(Export { cloud, turn, yardstick, losses, poses: [looked.len(), between.len()], gaussians })
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use rand::{RngExt as _, SeedableRng as _};
+    use rand_pcg::Pcg64;
+
+    use super::*;
+
+    /// Random Gaussians of a scene some units across.
+    pub(crate) fn cloud(n: usize, degree: u32) -> Cloud {
+        let mut rng = Pcg64::seed_from_u64(n as u64 + u64::from(degree));
+        let mut vec3 = |low: f32, high: f32| -> [f32; 3] { std::array::from_fn(|_| rng.random_range(low..high)) };
+        let mut cloud = Cloud {
+            position: (0..n).map(|_| vec3(-6.0, 6.0)).collect(),
+            log_scale: (0..n).map(|_| vec3(-9.0, 1.0)).collect(),
+            harmonics: (0..n * coefficients(degree)).map(|_| vec3(-0.9, 0.9)).collect(),
+            degree,
+            ..Cloud::default()
+        };
+        for _ in 0..n {
+            let q: [f64; 4] = std::array::from_fn(|_| rng.random_range(-1.0..1.0));
+            let norm = q.iter().map(|v| v * v).sum::<f64>().sqrt().max(1e-6);
+            cloud.rotation.push(q.map(|v| (v / norm) as f32));
+            cloud.logit.push(rng.random_range(-5.0..8.0));
+        }
+        cloud
+    }
+
+    /// Angle between two rotations, radians.
+    pub(crate) fn angle(a: [f32; 4], b: [f32; 4]) -> f64 {
+        let dot: f64 = a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(b)).sum();
+        2.0 * (1.0 - dot * dot).max(0.0).sqrt().asin()
+    }
+
+    /// Largest distance of two arrays' values.
+    pub(crate) fn distance(a: &[[f32; 3]], b: &[[f32; 3]]) -> f32 {
+        assert_eq!(a.len(), b.len());
+        a.as_flattened().iter().zip(b.as_flattened()).fold(0.0, |m, (a, b)| m.max((a - b).abs()))
+    }
+
+    #[test]
+    fn a_ply_keeps_every_bit() {
+        for degree in 0..=3 {
+            let cloud = cloud(37, degree);
+            let bytes = ply::encode(&cloud);
+            assert_eq!(ply::decode(&bytes).expect("our own file"), cloud);
+            let text = String::from_utf8_lossy(&bytes[..2000]);
+            assert_eq!(text.matches("property float ").count(), 62);
+            assert!(!text.contains("comment"), "some readers take no comments");
+            assert!(ply::decode(&bytes[..bytes.len() - 1]).is_err(), "cut off");
+        }
+        assert!(ply::decode(b"ply\n").is_err());
+    }
+
+    /// Float32 exponentials and logarithms, and a logit that is flat where the opacity is near 1.
+    #[test]
+    fn a_glb_keeps_what_float32_keeps() {
+        for degree in 0..=3 {
+            let cloud = cloud(41, degree);
+            let bytes = gltf::encode(&cloud).expect("it is small");
+            assert_eq!(bytes.len() % 4, 0);
+            let back = gltf::decode(&bytes).expect("our own file");
+            assert_eq!((&back.position, &back.harmonics, back.degree), (&cloud.position, &cloud.harmonics, degree));
+            assert!(distance(&back.log_scale, &cloud.log_scale) < 1e-5);
+            assert!(back.rotation == cloud.rotation, "turning there and back moves components and signs");
+            for (a, b) in back.logit.iter().zip(&cloud.logit) {
+                assert!((sigmoid(*a) - sigmoid(*b)).abs() < 1e-6, "{a} {b}");
+            }
+            assert!(gltf::decode(&bytes[..bytes.len() - 4]).is_err(), "cut off");
+        }
+    }
+
+    /// The turn into glTF's axes is a rotation: the Gaussians' covariances turn with their positions.
+    #[test]
+    fn a_glb_stands_the_other_way_up() {
+        let mut turned = cloud(9, 0);
+        let bytes = gltf::encode(&turned).expect("it is small");
+        turned.turn(DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0)));
+        // What a reader sees that knows nothing of the turn.
+        let as_written = {
+            let mut back = gltf::decode(&bytes).expect("our own file");
+            for (p, q) in back.position.iter_mut().zip(&mut back.rotation) {
+                *p = [p[0], -p[1], -p[2]];
+                *q = [-q[1], q[0], -q[3], q[2]];
+            }
+            back
+        };
+        assert!(distance(&as_written.position, &turned.position) == 0.0);
+        for (a, b) in as_written.rotation.iter().zip(&turned.rotation) {
+            assert!(angle(*a, *b) < 1e-3, "{a:?} {b:?}");
+        }
+    }
+
+    /// What a byte or 24 bits round, and no more.
+    #[test]
+    fn an_spz_keeps_what_its_bits_keep() {
+        for degree in 0..=3 {
+            let cloud = cloud(53, degree);
+            let bytes = spz::encode(&cloud).expect("it fits");
+            let back = spz::decode(&bytes).expect("our own file");
+            // 6 units leave 20 fractional bits of 24 signed ones.
+            assert!(distance(&back.position, &cloud.position) <= 0.5 / f32::from(1u16 << 10).powi(2));
+            assert!(distance(&back.log_scale, &cloud.log_scale) <= 0.5 / 16.0 + 1e-6);
+            let each = coefficients(degree);
+            for i in 0..cloud.len() {
+                // 1.77 units of the coefficient of degree 0 on either side in 255 steps.
+                let (a, b) = (&back.harmonics[i * each..][..each], &cloud.harmonics[i * each..][..each]);
+                assert!(distance(&a[..1], &b[..1]) <= 0.5 / 255.0 / 0.15 + 1e-6);
+                assert!(distance(&a[1..], &b[1..]) <= 0.5 / 128.0 + 1e-6);
+                assert!((sigmoid(back.logit[i]) - sigmoid(cloud.logit[i])).abs() <= 0.5 / 255.0 + 1.1e-4);
+                // Three components of half a step of 1.38e-3 each, and the fourth that follows from them.
+                assert!(angle(back.rotation[i], cloud.rotation[i]) < 6e-3);
+            }
+            assert_eq!(&bytes[..2], &[0x1f, 0x8b], "gzip");
+            assert!(spz::decode(&bytes[..bytes.len() / 2]).is_err(), "cut off");
+        }
+    }
+
+    #[test]
+    fn an_spz_takes_any_unit() {
+        for unit in [1e-3f32, 1.0, 1e3, 1e6] {
+            let mut cloud = cloud(50, 0);
+            cloud.position.iter_mut().for_each(|p| *p = p.map(|v| v * unit));
+            let back = spz::decode(&spz::encode(&cloud).expect("it fits")).expect("our own file");
+            // 22 bits of the farthest coordinate, or the 24 fractional ones that JavaScript's shifts allow.
+            let step = (12.0 * unit / (1 << 22) as f32).max(0.6 / (1 << 24) as f32);
+            assert!(distance(&back.position, &cloud.position) <= step, "{unit}");
+        }
+        let mut far = cloud(2, 0);
+        far.position[1][2] = 1e7;
+        let error = spz::encode(&far).expect_err("24 bits do not hold it").to_string();
+        assert!(error.contains("--formats"), "{error}");
+    }
+
+    #[test]
+    fn retaining_keeps_what_belongs_together() {
+        let mut kept = cloud(10, 1);
+        let all = kept.clone();
+        kept.retain(&(0..10).map(|i| i % 3 == 1).collect::<Vec<_>>());
+        assert_eq!(kept.position, [all.position[1], all.position[4], all.position[7]]);
+        assert_eq!(kept.harmonics_of(2), all.harmonics_of(7));
+        assert_eq!((kept.len(), kept.logit.len(), kept.rotation.len(), kept.log_scale.len()), (3, 3, 3, 3));
+    }
+}
