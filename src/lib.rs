@@ -8,6 +8,7 @@
 //! sorts, scans and sums that know nothing of splats. [`cli`] has one file per command.
 
 pub mod bench;
+pub mod capture;
 pub mod cli;
 pub mod config;
 pub mod densify;

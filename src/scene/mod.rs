@@ -33,6 +33,8 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 pub use camera::{Camera, distort, undistort};
+pub(crate) use layout::stem;
+pub(crate) use priors::rank_correlation;
 
 /// How a scene is read.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -600,7 +602,7 @@ fn same_proportions(picture: [u32; 2], calibrated: [u32; 2]) -> bool {
 }
 
 /// Decodes a picture by its content, whatever its extension says.
-fn decode(path: &Path) -> Result<DynamicImage, Error> {
+pub(crate) fn decode(path: &Path) -> Result<DynamicImage, Error> {
     let io = |source| Error::Io { path: path.to_path_buf(), source };
     let reader = image::ImageReader::open(path).map_err(io)?.with_guessed_format().map_err(io)?;
     reader.decode().map_err(|source| Error::Picture { path: path.to_path_buf(), source })
