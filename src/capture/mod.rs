@@ -16,6 +16,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use image::GrayImage;
+use rayon::prelude::*;
 
 use crate::gpu::{self, Gpu};
 use crate::scene::{self, Scene, resample};
@@ -240,7 +241,7 @@ pub fn prepare(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<()
     let mut splats = Splats::new(gpu, &fit.anchors, &fit.weights, &fit.settings.render)?;
     let masked = |preparation: &Preparation<'_>| preparation.masks_on_disk(&scene);
     if request.wants(Step::Masks) {
-        preparation.masks(&capture, &scene, &fit, &mut splats, &object)?;
+        preparation.masks(&scene, &fit, &mut splats, &object)?;
     }
     if request.wants(Step::Depth) {
         let masks = masked(&preparation)?;
@@ -270,7 +271,9 @@ fn no_such_view<'a>(name: &str, option: &str, views: impl Iterator<Item = &'a st
 fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>, Error> {
     let mut all = BTreeMap::new();
     for (name, (path, inverted)) in &capture.masks {
-        let size = picture_size(&capture.photographs[name])?;
+        // Masks of no photograph are not this scene's.
+        let Some(photograph) = capture.photographs.get(name) else { continue };
+        let size = picture_size(photograph)?;
         let mut mask = scene::mask(path, 1)?;
         if *inverted {
             mask.iter_mut().for_each(|v| *v = 255 - *v);
@@ -343,7 +346,7 @@ fn corrected(
         let Some(photograph) = capture.photographs.get(&name) else { continue };
         if !given.contains_key(&name) && folder.is_users(&relative)? {
             let mask = checked(&path, scene::mask(&path, 1)?, picture_size(photograph)?, true)?;
-            all.insert(name, Given { mask, from: "the user's own".into() });
+            all.insert(name, Given { mask, from: USERS.into() });
         }
     }
     Ok(all)
@@ -457,10 +460,9 @@ impl Preparation<'_> {
         })
     }
 
-    fn masks(
+    fn masks<'a>(
         &mut self,
-        capture: &Capture,
-        scene: &Scene,
+        scene: &'a Scene,
         fit: &Fit,
         splats: &mut Splats,
         given: &BTreeMap<String, Given>,
@@ -482,39 +484,70 @@ impl Preparation<'_> {
         if given.is_empty() {
             return Err(Error::Request("no view has a mask yet: name one with --mask NAME=FILE.png".into()));
         }
-        self.watch.begin(Step::Masks, (given.len() + scene.train.len()) as u64);
-        let mut votes = masks::Votes::new(splats);
-        let with_mask = scene.train.iter().filter_map(|view| Some((view, given.get(&view.name)?)));
-        for (unit, (view, Given { mask, .. })) in with_mask.enumerate() {
-            votes.add(splats, &view.camera, &masks::parts(mask, view.camera.size))?;
-            self.watch.at(unit as u64 + 1);
+        let fine = self.load(MASK_SIDE)?;
+        let files = scene::pictures(&self.folder.root().join(poses::IMAGES))?;
+        self.watch.begin(Step::Masks, u64::from(2 * MASK_ROUNDS) * scene.train.len() as u64);
+        // Twice: what is carried from the given masks, brought to the pictures' edges, votes along in the second round.
+        let mut current: Vec<Option<GrayImage>> =
+            scene.train.iter().map(|view| given.get(&view.name).map(|given| given.mask.clone())).collect();
+        let mut thin: Vec<(f64, &str)> = vec![];
+        let mut unit = 0;
+        for round in 0..MASK_ROUNDS {
+            let mut votes = masks::Votes::new(splats);
+            for (view, mask) in scene.train.iter().zip(&current) {
+                if let Some(mask) = mask {
+                    votes.add(splats, &view.camera, &masks::parts(mask, view.camera.size))?;
+                }
+            }
+            let shares = votes.count(&fit.anchors.position);
+            let mut carried = vec![];
+            for view in &scene.train {
+                let known = given.contains_key(&view.name);
+                carried.push(if known { None } else { Some(shares.carry(splats, &view.camera)?) });
+                unit += 1;
+                self.watch.at(unit);
+            }
+            if round == 0 {
+                let of = |(view, carried): (&'a scene::View, &Option<masks::Carried>)| {
+                    Some((carried.as_ref()?.thinness()?, view.name.as_str()))
+                };
+                thin.extend(scene.train.iter().zip(&carried).filter_map(of));
+            }
+            let refined: Vec<Result<Option<GrayImage>, Error>> = fine
+                .train
+                .par_iter()
+                .zip(&scene.train)
+                .zip(&carried)
+                .map(|((view, small), carried)| {
+                    let Some(carried) = carried else { return Ok(None) };
+                    let size = view.camera.size;
+                    let parts = resample::map(&carried.object, small.camera.size, size);
+                    let mask = masks::without_specks(&graph_cut::refine(&view.image, &parts), SPECK);
+                    let full = picture_size(&files[&view.name])?;
+                    Ok(Some(masks::threshold(&masks::parts(&mask, size), size, full)))
+                })
+                .collect();
+            for (mask, refined) in current.iter_mut().zip(refined) {
+                if let Some(refined) = refined? {
+                    *mask = Some(refined);
+                }
+            }
+            unit += scene.train.len() as u64;
+            self.watch.at(unit);
         }
-        let shares = votes.count(&fit.anchors.position);
         let mut batch = Batch::default();
         let names: Vec<&str> = given.keys().map(String::as_str).collect();
         let from = format!("carried from {}", abridged(&names));
-        let (mut thin, mut shown): (Vec<(f64, &str)>, usize) = (vec![], 0);
-        for (i, view) in scene.train.iter().enumerate() {
-            self.watch.at((given.len() + i) as u64);
-            let path = format!("masks/{}.png", view.name);
-            let mask = match given.get(&view.name) {
-                Some(Given { mask, from }) => {
-                    if from != "the user's own" {
-                        batch.gray(path, mask, from.clone());
-                    }
-                    mask.clone()
-                }
-                None => {
-                    let carried = shares.carry(splats, &view.camera)?;
-                    let size = picture_size(&capture.photographs[&view.name])?;
-                    let mask = masks::threshold(&carried.object, view.camera.size, size);
-                    let mask = masks::without_specks(&mask, SPECK);
-                    thin.extend(carried.thinness().map(|part| (part, view.name.as_str())));
-                    batch.gray(path, &mask, from.clone());
-                    mask
-                }
-            };
+        let mut shown = 0;
+        for (view, mask) in scene.train.iter().zip(current) {
+            let mask = mask.expect("every view without a given mask was carried one");
             shown += usize::from(mask.as_raw().iter().any(|v| *v != 0));
+            let path = format!("masks/{}.png", view.name);
+            match given.get(&view.name) {
+                Some(Given { from, .. }) if from == USERS => {}
+                Some(Given { from, .. }) => batch.gray(path, &mask, from.clone()),
+                None => batch.gray(path, &mask, from.clone()),
+            }
         }
         if shown < 3 {
             batch.notes.push(format!(
@@ -596,6 +629,13 @@ impl Preparation<'_> {
 const THIN: f64 = 0.3;
 /// Pieces of a carried mask that are smaller than this share of its largest piece are taken away.
 const SPECK: f64 = 0.02;
+
+/// What the masks of the user's own are made from.
+const USERS: &str = "the user's own";
+/// Rounds of votes and cuts.
+const MASK_ROUNDS: u32 = 2;
+/// The longer side of the pictures that carried masks are cut in, pixels.
+const MASK_SIDE: u32 = 512;
 
 /// The first names of a list.
 fn abridged(names: &[&str]) -> String {

@@ -7,11 +7,16 @@
 
 use rand::RngExt;
 use rand_pcg::Pcg64;
+use rayon::prelude::*;
 
 /// Patches are 2 `RADIUS` + 1 pixels wide.
 const RADIUS: usize = 3;
 /// Rounds of search and vote per scale.
 const ROUNDS: u32 = 5;
+/// By how much less a patch counts for each pixel that it lies farther in the hole (Wexler et al.).
+const INWARDS: f32 = 1.2;
+/// Fillings that are tried; the one whose patches are most like others is taken.
+const TRIES: u64 = 3;
 /// A side of the smallest picture that is worked on, pixels.
 const SMALLEST: usize = 24;
 
@@ -63,6 +68,21 @@ impl Canvas {
             }
         }
         out
+    }
+
+    /// Steps of eight neighbours from what is known, up to 40.
+    fn steps_inwards(&self) -> Vec<u32> {
+        let [w, h] = self.size;
+        let mut steps: Vec<u32> = self.hole.iter().map(|hole| if *hole { 40 } else { 0 }).collect();
+        // Forwards, then backwards: exact for this metric.
+        for i in (0..w * h).chain((0..w * h).rev()) {
+            let (x, y) = (i % w, i / w);
+            let rows = y.saturating_sub(1)..(y + 2).min(h);
+            let least = rows.flat_map(|v| (x.saturating_sub(1)..(x + 2).min(w)).map(move |u| v * w + u));
+            let least = least.map(|j| steps[j] + 1).min().unwrap_or(40);
+            steps[i] = steps[i].min(least);
+        }
+        steps
     }
 
     /// Fills the hole from its border inwards with means of what is known: something to begin with.
@@ -200,8 +220,9 @@ fn patch(size: [usize; 2], middle: usize) -> impl Iterator<Item = (usize, [isize
 }
 
 /// Rounds of search and vote on one scale. `guess` holds for each pixel the source pixel it was made from on the scale
-/// before. Returns the same of this scale; nothing where no patch can be copied from.
-fn refine(canvas: &mut Canvas, guess: Option<&[usize]>, rng: &mut Pcg64) -> Option<Vec<usize>> {
+/// before. Returns the same of this scale, and how much the patches differ from what they were made from; nothing where no
+/// patch can be copied from.
+fn refine(canvas: &mut Canvas, guess: Option<&[usize]>, rng: &mut Pcg64) -> Option<(Vec<usize>, f32)> {
     let size @ [w, h] = canvas.size;
     let whole = |i: usize| {
         let (x, y) = (i % w, i / w);
@@ -223,7 +244,9 @@ fn refine(canvas: &mut Canvas, guess: Option<&[usize]>, rng: &mut Pcg64) -> Opti
             (guessed.unwrap_or_else(|| sources[rng.random_range(0..sources.len())]), f32::INFINITY)
         })
         .collect();
-    for round in 0..ROUNDS {
+    let inwards = canvas.steps_inwards();
+    // On a small picture, where what goes where is decided, a round costs next to nothing.
+    for round in 0..if targets.len() < 2000 { 4 * ROUNDS } else { ROUNDS } {
         let search = Search { canvas, targets: &targets, is_source: &is_source };
         // The colours have changed since the last round, and the distances with them.
         for (target, found) in targets.iter().zip(&mut matches) {
@@ -231,24 +254,26 @@ fn refine(canvas: &mut Canvas, guess: Option<&[usize]>, rng: &mut Pcg64) -> Opti
         }
         search.improve(&mut matches, &of, 2 * round, rng);
         search.improve(&mut matches, &of, 2 * round + 1, rng);
-        vote(canvas, &targets, &matches);
+        vote(canvas, &targets, &matches, &inwards);
     }
     let mut map = vec![usize::MAX; w * h];
     for (target, found) in targets.iter().zip(&matches) {
         map[*target] = found.0;
     }
-    Some(map)
+    let off = matches.iter().map(|(_, distance)| distance).sum::<f32>() / matches.len() as f32;
+    Some((map, off))
 }
 
-/// Every pixel of the hole becomes the mean of what the patches over it say, the similar ones first.
-fn vote(canvas: &mut Canvas, targets: &[usize], matches: &[(usize, f32)]) {
+/// Every pixel of the hole becomes the mean of what the patches over it say, the similar ones first and those at the
+/// hole's border, which see what is known. `inwards` counts the steps from there.
+fn vote(canvas: &mut Canvas, targets: &[usize], matches: &[(usize, f32)], inwards: &[u32]) {
     let size = canvas.size;
     let mut distances: Vec<f32> = matches.iter().map(|(_, distance)| *distance).collect();
     distances.sort_unstable_by(f32::total_cmp);
     let typical = distances[distances.len() * 3 / 4].max(1e-6);
     let mut sums = vec![[0f32; 4]; canvas.rgb.len()];
     for (target, (source, distance)) in targets.iter().zip(matches) {
-        let weight = (-distance / (2.0 * typical)).exp();
+        let weight = (-distance / (2.0 * typical)).exp() * INWARDS.powi(-(inwards[*target] as i32));
         for (pixel, [dx, dy]) in patch(size, *target) {
             if canvas.hole[pixel] {
                 // The whole patch around a source is in the picture.
@@ -277,18 +302,32 @@ pub fn fill(canvas: &mut Canvas, seed: u64) {
         }
         scales.push(smaller);
     }
-    let mut rng = Pcg64::new(seed.into(), 21);
-    let mut coarser: Option<(Canvas, Option<Vec<usize>>)> = None;
-    for mut scale in scales.into_iter().rev() {
+    scales.reverse();
+    let tries: Vec<(Vec<[f32; 3]>, f32)> = (0..TRIES)
+        .into_par_iter()
+        .map(|attempt| ascend(scales.clone(), &mut Pcg64::new(seed.into(), (21 + attempt).into())))
+        .collect();
+    let best = tries.into_iter().min_by(|a, b| a.1.total_cmp(&b.1));
+    for (i, color) in best.into_iter().flat_map(|(rgb, _)| rgb).enumerate() {
+        if canvas.hole[i] {
+            canvas.rgb[i] = color;
+        }
+    }
+}
+
+/// From the smallest scale, the first, to the largest; its colours, and how much its patches differ from their sources.
+fn ascend(scales: Vec<Canvas>, rng: &mut Pcg64) -> (Vec<[f32; 3]>, f32) {
+    let mut coarser: Option<(Canvas, Option<(Vec<usize>, f32)>)> = None;
+    for mut scale in scales {
         let [w, h] = scale.size;
         let mut guess = None;
         match &coarser {
-            Some((small, map)) => {
+            Some((small, found)) => {
                 let below = |x: usize, y: usize| (y / 2) * small.size[0] + x / 2;
                 for i in (0..w * h).filter(|i| scale.hole[*i]) {
                     scale.rgb[i] = small.rgb[below(i % w, i / w)];
                 }
-                guess = map.as_ref().map(|map| {
+                guess = found.as_ref().map(|(map, _)| {
                     let up = |i: usize| {
                         let (x, y) = (i % w, i / w);
                         let from = map[below(x, y)];
@@ -303,14 +342,10 @@ pub fn fill(canvas: &mut Canvas, seed: u64) {
             }
             None => scale.peel(),
         }
-        let map = refine(&mut scale, guess.as_deref(), &mut rng);
-        coarser = Some((scale, map));
+        let found = refine(&mut scale, guess.as_deref(), rng);
+        coarser = Some((scale, found));
     }
-    if let Some((filled, _)) = coarser {
-        for (i, color) in filled.rgb.into_iter().enumerate().filter(|(i, _)| canvas.hole[*i]) {
-            canvas.rgb[i] = color;
-        }
-    }
+    coarser.map_or((vec![], 0.0), |(scale, found)| (scale.rgb, found.map_or(f32::INFINITY, |(_, off)| off)))
 }
 
 #[cfg(test)]

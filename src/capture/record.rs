@@ -65,9 +65,9 @@ impl Inputs {
         self
     }
 
-    /// The hash of all parts.
+    /// The hash of all parts and of the program's version, by which steps may change.
     pub fn finish(self) -> String {
-        self.0.finalize().to_hex().to_string()
+        self.add(env!("CARGO_PKG_VERSION")).0.finalize().to_hex().to_string()
     }
 }
 

@@ -320,6 +320,11 @@ fn fill(
         }
     }
     lonely(&mut guessed, hole.as_raw(), [w, h]);
+    // Where nobody looked the sweep has found nothing: what lies around is continued.
+    for (value, _) in disparity.iter_mut().zip(&guessed).filter(|(_, guessed)| **guessed) {
+        *value = f32::NAN;
+    }
+    membrane(&mut disparity, [w, h], |_| true);
     watch.at(2 * task.scene.train.len() as u64 + 3);
     inpaint(&mut rgb, &guessed, hole.as_raw(), &disparity, [w, h], task.seed);
 
