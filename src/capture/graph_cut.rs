@@ -311,72 +311,6 @@ pub fn segment(picture: &RgbImage, known: &[Known]) -> Option<Vec<bool>> {
     object.iter().any(|v| *v).then_some(object)
 }
 
-/// What is carried over from other views is sure of a pixel from these parts on.
-const SURE: [f32; 2] = [0.08, 0.92];
-/// Colours are counted this many pixels around what is not sure: the models are of the border's neighbourhood.
-const AROUND: u32 = 12;
-
-/// Brings the border of a carried mask to the picture's edges: `parts` (the object's part of every pixel) decides where it
-/// is sure, and is weighed against the colours and the contrast where it is not.
-///
-/// # Panics
-/// Unless there is a part for every pixel.
-pub fn refine(picture: &RgbImage, parts: &[f32]) -> GrayImage {
-    let [w, h] = [picture.width(), picture.height()];
-    assert_eq!(parts.len(), (w * h) as usize, "a part for every pixel");
-    let of = |condition: &dyn Fn(f32) -> bool| {
-        let raw = parts.iter().map(|p| if condition(*p) { 255 } else { 0 }).collect();
-        GrayImage::from_raw(w, h, raw).expect("a value per pixel")
-    };
-    let plain = of(&|p| p > 0.5);
-    let open = of(&|p| p > SURE[0] && p < SURE[1]);
-    let near = resample::dilate(&open, AROUND);
-    let Some([x0, y0, x1, y1]) = crate::train::photographs::mask_box(&near) else { return plain };
-    let size = [(x1 - x0) as usize, (y1 - y0) as usize];
-    let cells: Vec<usize> = (y0..y1).flat_map(|y| (x0..x1).map(move |x| (y * w + x) as usize)).collect();
-    let pixel = |i: usize| picture.get_pixel(i as u32 % w, i as u32 / w).0.map(f64::from);
-    let colors: Vec<[f64; 3]> = cells.iter().map(|i| pixel(*i)).collect();
-    let model = |condition: &dyn Fn(f32) -> bool, seed| {
-        let chosen = cells.iter().zip(&colors).filter(|(i, _)| near.as_raw()[**i] != 0 && condition(parts[**i]));
-        let chosen: Vec<[f64; 3]> = chosen.map(|(_, color)| *color).collect();
-        (chosen.len() >= 30).then(|| Mixture::of(&chosen, seed))
-    };
-    let models = model(&|p| p >= SURE[1], 1).zip(model(&|p| p <= SURE[0], 2));
-    let Some((inside, outside)) = models else { return plain };
-    let edges = contrasts(&colors, size);
-    let labels = {
-        let mut grid = Grid::new(size);
-        for &(i, d, cost) in &edges {
-            grid.set_edge(i, d, cost);
-        }
-        let sure = (UNIT * SMOOTHNESS * 16.0) as i64;
-        for (k, (i, color)) in cells.iter().zip(&colors).enumerate() {
-            let part = parts[*i];
-            if part >= SURE[1] {
-                grid.set_terminals(k, sure, 0);
-            } else if part <= SURE[0] {
-                grid.set_terminals(k, 0, sure);
-            } else {
-                // The colours' say is bounded: a stray colour is no proof.
-                let colors = (outside.cost(*color) - inside.cost(*color)).clamp(-COLOR, COLOR);
-                let carried = CARRIED * f64::from(part / (1.0 - part)).ln();
-                let cost = (UNIT * (colors + carried)) as i64;
-                grid.set_terminals(k, cost.max(0), (-cost).max(0));
-            }
-        }
-        grid.cut()
-    };
-    let mut mask = plain;
-    for (i, on) in cells.iter().zip(labels) {
-        mask.put_pixel(*i as u32 % w, *i as u32 / w, Luma([if on { 255 } else { 0 }]));
-    }
-    mask
-}
-
-/// What the colours of one pixel may say at most, and the weight of what is carried over.
-const COLOR: f64 = 8.0;
-const CARRIED: f64 = 2.0;
-
 /// A picture's size with the longer side at most [`SIDE`].
 fn reduced(size: [u32; 2]) -> [u32; 2] {
     let longest = size[0].max(size[1]);
@@ -558,26 +492,6 @@ mod tests {
         // Nothing but ground.
         let flat = RgbImage::from_pixel(64, 64, image::Rgb([90, 90, 90]));
         assert!(from_box(&flat, [20, 20, 40, 40]).is_none());
-    }
-
-    /// What was carried over is a disc three pixels off, unsure for six pixels around its border.
-    #[test]
-    fn carried_borders_go_to_the_edges() {
-        let (picture, inside) = disc();
-        let part = |x: u32, y: u32| {
-            let r = f64::hypot(f64::from(x) - 63.0, f64::from(y) - 45.0);
-            (0.5 + (22.0 - r) / 12.0).clamp(0.0, 1.0) as f32
-        };
-        let parts: Vec<f32> = (0..128 * 96).map(|i| part(i % 128, i / 128)).collect();
-        let carried = masks::threshold(&parts, [128, 96], [128, 96]);
-        let before = wrong(&carried, &inside);
-        let after = wrong(&refine(&picture, &parts), &inside);
-        assert!(before > 100 && after < 20, "{before} wrong before, {after} behind");
-        // Sure everywhere: nothing to do. Unsure everywhere: nothing to go by.
-        let sure: Vec<f32> = parts.iter().map(|p| if *p > 0.5 { 1.0 } else { 0.0 }).collect();
-        assert_eq!(refine(&picture, &sure), carried);
-        let unsure = vec![0.5; parts.len()];
-        assert_eq!(refine(&picture, &unsure), masks::threshold(&unsure, [128, 96], [128, 96]));
     }
 
     #[test]

@@ -9,12 +9,20 @@ use kiddo::{ImmutableKdTree, SquaredEuclidean};
 
 use super::splats::Splats;
 use crate::gpu::Error;
-use crate::scene::{Camera, resample};
+use crate::scene::{Camera, View, resample};
 
-/// A Gaussian with less than this (pixels) in the masked views was not seen there.
-const SEEN: f32 = 1e-2;
-/// Anchors seen in no masked view are taken to be what so many seen ones around them are.
+/// Anchors seen less than this (pixels) in the masked views count as unseen: what shines through the object.
+const SEEN: f32 = 1.0;
+/// Votes (pixels) that a Gaussian's surroundings have beside its own.
+const PRIOR: f32 = 1.0;
+/// Anchors seen in no masked view are taken to be what so many seen ones are that are near them and look like them.
 const NEIGHBOURS: usize = 8;
+/// Colours that differ by this are as far apart as anchors [`REACH`] times their spacing away from each other.
+const COLOR: f32 = 0.08;
+/// See [`COLOR`].
+const REACH: f32 = 6.0;
+/// Views that are asked for the Gaussians' colours.
+const COLORED: usize = 6;
 /// A pixel less covered than this shows nothing that could be the object.
 const COVERED: f32 = 0.1;
 
@@ -59,9 +67,10 @@ impl Votes {
         Ok(())
     }
 
-    /// Counts them. `positions` are the anchors': a Gaussian that no masked view has seen votes as its anchor does, and an
-    /// anchor that none has seen as those around it.
-    pub fn count(&self, positions: &[[f32; 3]]) -> Shares {
+    /// Counts them. `positions` and `colors` are the anchors': a Gaussian that no masked view has seen votes as its anchor
+    /// does, and an anchor that none has seen as those which are near it and look like it. What stands behind the object is
+    /// as near to it as its own other side, but seldom of its colour.
+    pub fn count(&self, positions: &[[f32; 3]], colors: &[[f32; 3]]) -> Shares {
         let offsets = self.all.len() / positions.len().max(1);
         let of_anchors: Vec<[f32; 2]> = (0..positions.len())
             .map(|a| {
@@ -70,11 +79,15 @@ impl Votes {
             })
             .collect();
         let seen: Vec<usize> = (0..positions.len()).filter(|a| of_anchors[*a][1] > SEEN).collect();
-        let tree: ImmutableKdTree<f32, 3> =
-            ImmutableKdTree::new_from_slice(&seen.iter().map(|a| positions[*a]).collect::<Vec<_>>());
+        let spacing = spacing(positions);
+        let place = |a: usize| -> [f32; 6] {
+            std::array::from_fn(|i| if i < 3 { positions[a][i] / (REACH * spacing) } else { colors[a][i - 3] / COLOR })
+        };
+        let tree: ImmutableKdTree<f32, 6> =
+            ImmutableKdTree::new_from_slice(&seen.iter().map(|a| place(*a)).collect::<Vec<_>>());
         let around = |a: usize| -> f32 {
             let Some(count) = std::num::NonZero::new(NEIGHBOURS.min(seen.len())) else { return 0.0 };
-            let near = tree.nearest_n::<SquaredEuclidean>(&positions[a], count);
+            let near = tree.nearest_n::<SquaredEuclidean>(&place(a), count);
             let votes = near.iter().map(|n| of_anchors[seen[n.item as usize]]);
             votes.map(|[inside, all]| inside / all).sum::<f32>() / count.get() as f32
         };
@@ -83,15 +96,43 @@ impl Votes {
         for a in 0..positions.len() {
             let [inside, all] = of_anchors[a];
             let seen = all > SEEN;
-            let anchor = if seen { inside / all } else { around(a) };
+            let prior = if seen { inside / all } else { around(a) };
             for g in a * offsets..(a + 1) * offsets {
-                let own = self.all[g] > SEEN;
-                shares.object.push(if own { self.inside[g] / self.all[g] } else { anchor }.clamp(0.0, 1.0));
+                let share = (self.inside[g] + PRIOR * prior) / (self.all[g] + PRIOR);
+                shares.object.push(share.clamp(0.0, 1.0));
                 shares.seen.push(seen);
             }
         }
         shares
     }
+}
+
+/// Median distance of some anchors to the next.
+fn spacing(positions: &[[f32; 3]]) -> f32 {
+    let Some(two) = std::num::NonZero::new(2).filter(|_| positions.len() > 1) else { return 1.0 };
+    let tree: ImmutableKdTree<f32, 3> = ImmutableKdTree::new_from_slice(positions);
+    let some = positions.iter().step_by(positions.len().div_ceil(1000));
+    let mut distances: Vec<f32> =
+        some.filter_map(|p| tree.nearest_n::<SquaredEuclidean>(p, two).last().map(|n| n.distance.sqrt())).collect();
+    distances.sort_unstable_by(f32::total_cmp);
+    distances[distances.len() / 2].max(f32::MIN_POSITIVE)
+}
+
+/// The anchors' mean colours, from some views; grey where none has an anchor.
+///
+/// # Errors
+/// When the device has no room, or is lost.
+pub fn colors(splats: &mut Splats, views: &[View]) -> Result<Vec<[f32; 3]>, Error> {
+    let offsets = splats.offsets();
+    let mut sums = vec![[0f32; 4]; splats.len() / offsets];
+    for view in views.iter().step_by(views.len().div_ceil(COLORED).max(1)) {
+        for (name, color) in splats.colors(&view.camera)? {
+            let sum = &mut sums[name as usize / offsets];
+            (0..3).for_each(|c| sum[c] += color[c]);
+            sum[3] += 1.0;
+        }
+    }
+    Ok(sums.into_iter().map(|s| if s[3] > 0.0 { std::array::from_fn(|c| s[c] / s[3]) } else { [0.5; 3] }).collect())
 }
 
 impl Shares {
@@ -212,16 +253,41 @@ mod tests {
         assert_eq!(threshold(&small, [2, 2], [2, 2]), mask(&["#.", ".."]));
     }
 
-    /// Anchors in a row, two Gaussians each: the first wholly inside, the second half, the third was never seen.
+    /// Four anchors of two Gaussians each: inside, outside, and two that were not seen, as near to the one as to the other,
+    /// but of their colours.
     #[test]
-    fn votes_are_counted_by_gaussian_anchor_and_neighbourhood() {
-        let votes = Votes { inside: vec![2.0, 0.0, 1.0, 3.0, 0.0, 0.0], all: vec![2.0, 0.0, 4.0, 4.0, 0.0, 0.0] };
-        let shares = votes.count(&[[0.0; 3], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]);
-        // The mean of the two seen anchors: (1 + 4 / 8) / 2.
-        assert_eq!(shares.object, [1.0, 1.0, 0.25, 0.75, 0.75, 0.75]);
-        assert_eq!(shares.seen, [true, true, true, true, false, false]);
+    fn votes_are_counted_by_gaussian_anchor_and_likeness() {
+        let votes = Votes {
+            inside: vec![20.0, 0.0, 0.0, 1.0, 0.0, 0.2, 0.0, 0.0],
+            all: vec![20.0, 0.0, 19.0, 1.0, 0.0, 0.2, 0.0, 0.0],
+        };
+        let positions = [[0.0; 3], [1.0, 0.0, 0.0], [0.5, 0.1, 0.0], [0.5, -0.1, 0.0]];
+        let (red, grey) = ([0.8, 0.2, 0.1], [0.5; 3]);
+        let shares = votes.count(&positions, &[red, grey, grey, red]);
+        let near = |a: f32, b: f32| (a - b).abs() < 1e-6;
+        assert!(near(shares.object[0], 1.0) && near(shares.object[1], 1.0));
+        // (0 + 0.05) / 20 and (1 + 0.05) / 2, with the anchor's 1 / 20 as a vote of one pixel.
+        assert!(near(shares.object[2], 0.0025) && near(shares.object[3], 0.525));
+        // With two seen anchors only, both are asked: half of each.
+        assert!(near(shares.object[6], 0.525));
+        assert_eq!(shares.seen, [true, true, true, true, false, false, false, false]);
         // Nobody was seen at all.
         let votes = Votes { inside: vec![0.0; 2], all: vec![0.0; 2] };
-        assert_eq!(votes.count(&[[0.0; 3]]).object, [0.0; 2]);
+        assert_eq!(votes.count(&[[0.0; 3]], &[grey]).object, [0.0; 2]);
+    }
+
+    /// Among many seen anchors of two colours, one that was not seen follows those of its own colour.
+    #[test]
+    fn unseen_anchors_follow_their_like() {
+        let n = 40;
+        let positions: Vec<[f32; 3]> = (0..n).map(|i| [(i / 2) as f32 * 0.1, 0.0, 0.0]).collect();
+        let colors: Vec<[f32; 3]> = (0..n).map(|i| if i % 2 == 0 { [0.8, 0.2, 0.1] } else { [0.5; 3] }).collect();
+        let mut votes = Votes { inside: vec![0.0; n], all: vec![10.0; n] };
+        (0..n).step_by(2).for_each(|i| votes.inside[i] = 10.0);
+        for unseen in [20, 21] {
+            (votes.inside[unseen], votes.all[unseen]) = (0.0, 0.0);
+        }
+        let shares = votes.count(&positions, &colors);
+        assert_eq!((shares.object[20], shares.object[21]), (1.0, 0.0));
     }
 }

@@ -16,7 +16,6 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use image::GrayImage;
-use rayon::prelude::*;
 
 use crate::gpu::{self, Gpu};
 use crate::scene::{self, Scene, resample};
@@ -460,9 +459,9 @@ impl Preparation<'_> {
         })
     }
 
-    fn masks<'a>(
+    fn masks(
         &mut self,
-        scene: &'a Scene,
+        scene: &Scene,
         fit: &Fit,
         splats: &mut Splats,
         given: &BTreeMap<String, Given>,
@@ -484,70 +483,44 @@ impl Preparation<'_> {
         if given.is_empty() {
             return Err(Error::Request("no view has a mask yet: name one with --mask NAME=FILE.png".into()));
         }
-        let fine = self.load(MASK_SIDE)?;
         let files = scene::pictures(&self.folder.root().join(poses::IMAGES))?;
-        self.watch.begin(Step::Masks, u64::from(2 * MASK_ROUNDS) * scene.train.len() as u64);
-        // Twice: what is carried from the given masks, brought to the pictures' edges, votes along in the second round.
-        let mut current: Vec<Option<GrayImage>> =
-            scene.train.iter().map(|view| given.get(&view.name).map(|given| given.mask.clone())).collect();
-        let mut thin: Vec<(f64, &str)> = vec![];
+        self.watch.begin(Step::Masks, (given.len() + scene.train.len()) as u64);
+        let mut votes = masks::Votes::new(splats);
         let mut unit = 0;
-        for round in 0..MASK_ROUNDS {
-            let mut votes = masks::Votes::new(splats);
-            for (view, mask) in scene.train.iter().zip(&current) {
-                if let Some(mask) = mask {
-                    votes.add(splats, &view.camera, &masks::parts(mask, view.camera.size))?;
-                }
-            }
-            let shares = votes.count(&fit.anchors.position);
-            let mut carried = vec![];
-            for view in &scene.train {
-                let known = given.contains_key(&view.name);
-                carried.push(if known { None } else { Some(shares.carry(splats, &view.camera)?) });
+        for view in &scene.train {
+            if let Some(Given { mask, .. }) = given.get(&view.name) {
+                votes.add(splats, &view.camera, &masks::parts(mask, view.camera.size))?;
                 unit += 1;
                 self.watch.at(unit);
             }
-            if round == 0 {
-                let of = |(view, carried): (&'a scene::View, &Option<masks::Carried>)| {
-                    Some((carried.as_ref()?.thinness()?, view.name.as_str()))
-                };
-                thin.extend(scene.train.iter().zip(&carried).filter_map(of));
-            }
-            let refined: Vec<Result<Option<GrayImage>, Error>> = fine
-                .train
-                .par_iter()
-                .zip(&scene.train)
-                .zip(&carried)
-                .map(|((view, small), carried)| {
-                    let Some(carried) = carried else { return Ok(None) };
-                    let size = view.camera.size;
-                    let parts = resample::map(&carried.object, small.camera.size, size);
-                    let mask = masks::without_specks(&graph_cut::refine(&view.image, &parts), SPECK);
-                    let full = picture_size(&files[&view.name])?;
-                    Ok(Some(masks::threshold(&masks::parts(&mask, size), size, full)))
-                })
-                .collect();
-            for (mask, refined) in current.iter_mut().zip(refined) {
-                if let Some(refined) = refined? {
-                    *mask = Some(refined);
-                }
-            }
-            unit += scene.train.len() as u64;
-            self.watch.at(unit);
         }
+        let colors = masks::colors(splats, &scene.train)?;
+        let shares = votes.count(&fit.anchors.position, &colors);
         let mut batch = Batch::default();
         let names: Vec<&str> = given.keys().map(String::as_str).collect();
         let from = format!("carried from {}", abridged(&names));
-        let mut shown = 0;
-        for (view, mask) in scene.train.iter().zip(current) {
-            let mask = mask.expect("every view without a given mask was carried one");
-            shown += usize::from(mask.as_raw().iter().any(|v| *v != 0));
+        let (mut thin, mut shown): (Vec<(f64, &str)>, usize) = (vec![], 0);
+        for view in &scene.train {
             let path = format!("masks/{}.png", view.name);
-            match given.get(&view.name) {
-                Some(Given { from, .. }) if from == USERS => {}
-                Some(Given { from, .. }) => batch.gray(path, &mask, from.clone()),
-                None => batch.gray(path, &mask, from.clone()),
-            }
+            let mask = match given.get(&view.name) {
+                Some(Given { mask, from }) => {
+                    if from != USERS {
+                        batch.gray(path, mask, from.clone());
+                    }
+                    mask.clone()
+                }
+                None => {
+                    let carried = shares.carry(splats, &view.camera)?;
+                    let mask = masks::threshold(&carried.object, view.camera.size, picture_size(&files[&view.name])?);
+                    let mask = masks::without_specks(&mask, SPECK);
+                    thin.extend(carried.thinness().map(|part| (part, view.name.as_str())));
+                    batch.gray(path, &mask, from.clone());
+                    mask
+                }
+            };
+            shown += usize::from(mask.as_raw().iter().any(|v| *v != 0));
+            unit += 1;
+            self.watch.at(unit);
         }
         if shown < 3 {
             batch.notes.push(format!(
@@ -632,11 +605,6 @@ const SPECK: f64 = 0.02;
 
 /// What the masks of the user's own are made from.
 const USERS: &str = "the user's own";
-/// Rounds of votes and cuts.
-const MASK_ROUNDS: u32 = 2;
-/// The longer side of the pictures that carried masks are cut in, pixels.
-const MASK_SIDE: u32 = 512;
-
 /// The first names of a list.
 fn abridged(names: &[&str]) -> String {
     match names {

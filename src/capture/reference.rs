@@ -197,7 +197,8 @@ fn votes(task: &Task<'_>, fit: &Fit, splats: &mut Splats, watch: &mut dyn Watch)
         votes.add(splats, &view.camera, &masks::parts(mask, view.camera.size))?;
         watch.at(i as u64);
     }
-    Ok(votes.count(&fit.anchors.position))
+    let colors = masks::colors(splats, &task.scene.train)?;
+    Ok(votes.count(&fit.anchors.position, &colors))
 }
 
 /// Makes the reference picture, the map of where its pixels are from and, if asked for, its depth.

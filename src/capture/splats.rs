@@ -61,6 +61,11 @@ impl Splats {
         self.anchors.count as usize * self.anchors.offsets as usize
     }
 
+    /// How many names an anchor has.
+    pub fn offsets(&self) -> usize {
+        self.anchors.offsets as usize
+    }
+
     /// Whether there is no Gaussian at all.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
@@ -111,6 +116,17 @@ impl Splats {
             color: gpu.buffer("color", slots)?,
             opacity: gpu.buffer("opacity", slots)?,
         })
+    }
+
+    /// The colours that the Gaussians near this camera's view have in it, by name; hidden ones, too.
+    ///
+    /// # Errors
+    /// When the device has no room, or is lost.
+    pub fn colors(&mut self, camera: &Camera) -> Result<Vec<(u32, [f32; 3])>, Error> {
+        let (stages, names) = self.decode(camera)?;
+        let colors = self.gpu.read(&stages.forward.decode.color)?;
+        self.stages = Some(stages);
+        Ok(names.into_iter().map(|(slot, name)| (name, colors[slot as usize])).collect())
     }
 
     /// For every Gaussian that this camera draws, its name and the sum over the pixels of its share in the pixel
