@@ -292,8 +292,8 @@ pub fn segment(picture: &RgbImage, known: &[Known]) -> Option<Vec<bool>> {
             grid.set_edge(i, d, cost);
         }
         let sure = (UNIT * SMOOTHNESS * 16.0) as i64;
-        for i in 0..w * h {
-            match known[i] {
+        for (i, known) in known.iter().enumerate() {
+            match known {
                 Known::Object => grid.set_terminals(i, sure, 0),
                 Known::Background => grid.set_terminals(i, 0, sure),
                 _ => {
@@ -325,7 +325,7 @@ fn to_mask(object: Vec<bool>, from: [u32; 2], to: [u32; 2]) -> GrayImage {
     let raw = object.into_iter().map(|v| if v { 255 } else { 0 }).collect();
     let mask = GrayImage::from_raw(from[0], from[1], raw).expect("a label per pixel");
     let mask = masks::without_specks(&mask, SPECK);
-    masks::threshold(&masks::parts(&mask, from), from, to)
+    masks::threshold(&masks::parts(&mask, from), from, to, 0.5)
 }
 
 /// The object in a box (x0, y0 and one past x1, y1). Its surroundings, as wide again as the box, are what it is told from.

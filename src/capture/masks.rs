@@ -2,7 +2,7 @@
 //!
 //! In a view with a mask, a Gaussian's share in the pixels inside, over its share in all pixels, says how much of it is
 //! the object. Rendered into another view in place of the colours and divided by what covers the pixel, these shares are
-//! the object's part of each pixel; half is the border.
+//! the object's part of each pixel.
 
 use image::{GrayImage, Luma};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
@@ -25,6 +25,11 @@ const REACH: f32 = 6.0;
 const COLORED: usize = 6;
 /// A pixel less covered than this shows nothing that could be the object.
 const COVERED: f32 = 0.1;
+
+/// A pixel of which more than this part is the object belongs to the carried mask. Below a half: along the object's rim
+/// lie Gaussians that no masked view has seen, and a mask that is too narrow leaves a ghost where one that is too wide
+/// leaves nothing.
+pub const OBJECT: f32 = 0.35;
 
 /// The votes of the masked views.
 pub struct Votes {
@@ -93,8 +98,7 @@ impl Votes {
         };
         let mut shares =
             Shares { object: Vec::with_capacity(self.all.len()), seen: Vec::with_capacity(self.all.len()) };
-        for a in 0..positions.len() {
-            let [inside, all] = of_anchors[a];
+        for (a, [inside, all]) in of_anchors.iter().copied().enumerate() {
             let seen = all > SEEN;
             let prior = if seen { inside / all } else { around(a) };
             for g in a * offsets..(a + 1) * offsets {
@@ -165,10 +169,11 @@ impl Carried {
     }
 }
 
-/// The mask where more than half of a pixel is the object: `parts` (width, height `from`) brought to the size `to`.
-pub fn threshold(parts: &[f32], from: [u32; 2], to: [u32; 2]) -> GrayImage {
+/// The mask where more than the part `least` of a pixel is the object: `parts` (width, height `from`) brought to the size
+/// `to`.
+pub fn threshold(parts: &[f32], from: [u32; 2], to: [u32; 2], least: f32) -> GrayImage {
     let large = resample::map(parts, from, to);
-    GrayImage::from_fn(to[0], to[1], |x, y| Luma([if large[(y * to[0] + x) as usize] > 0.5 { 255 } else { 0 }]))
+    GrayImage::from_fn(to[0], to[1], |x, y| Luma([if large[(y * to[0] + x) as usize] > least { 255 } else { 0 }]))
 }
 
 /// The mask's part of each pixel of a picture of the size `to`.
@@ -250,7 +255,7 @@ mod tests {
         let large = mask(&["##..", "##..", "#...", "...."]);
         let small = parts(&large, [2, 2]);
         assert_eq!(small, [1.0, 0.0, 0.25, 0.0]);
-        assert_eq!(threshold(&small, [2, 2], [2, 2]), mask(&["#.", ".."]));
+        assert_eq!(threshold(&small, [2, 2], [2, 2], 0.5), mask(&["#.", ".."]));
     }
 
     /// Four anchors of two Gaussians each: inside, outside, and two that were not seen, as near to the one as to the other,

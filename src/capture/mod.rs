@@ -438,7 +438,7 @@ impl Preparation<'_> {
     fn fit(&mut self, scene: &Scene) -> Result<Fit, Error> {
         let settings = fit::settings(self.request, scene.points.len());
         let fingerprint = serde_json::to_string(&Fingerprint::of(scene)).expect("names and hashes");
-        let inputs = Inputs::default().add(fingerprint).add(settings.to_toml()).finish();
+        let inputs = Inputs::default().with(fingerprint).with(settings.to_toml()).finish();
         if self.skips(Step::Fit, &inputs) {
             return Fit::read(self.folder.root(), settings);
         }
@@ -466,9 +466,9 @@ impl Preparation<'_> {
         splats: &mut Splats,
         given: &BTreeMap<String, Given>,
     ) -> Result<(), Error> {
-        let mut inputs = Inputs::default().add(self.fit_hash());
+        let mut inputs = Inputs::default().with(self.fit_hash());
         for (name, Given { mask, from }) in given {
-            inputs = inputs.add(name).add(mask.as_raw()).add(from);
+            inputs = inputs.with(name).with(mask.as_raw()).with(from);
         }
         let inputs = inputs.finish();
         if self.skips(Step::Masks, &inputs) {
@@ -511,7 +511,12 @@ impl Preparation<'_> {
                 }
                 None => {
                     let carried = shares.carry(splats, &view.camera)?;
-                    let mask = masks::threshold(&carried.object, view.camera.size, picture_size(&files[&view.name])?);
+                    let mask = masks::threshold(
+                        &carried.object,
+                        view.camera.size,
+                        picture_size(&files[&view.name])?,
+                        masks::OBJECT,
+                    );
                     let mask = masks::without_specks(&mask, SPECK);
                     thin.extend(carried.thinness().map(|part| (part, view.name.as_str())));
                     batch.gray(path, &mask, from.clone());
@@ -559,7 +564,7 @@ impl Preparation<'_> {
     }
 
     fn inputs_behind_masks(&self, masks: &[GrayImage]) -> Inputs {
-        masks.iter().fold(Inputs::default().add(self.fit_hash()), |inputs, mask| inputs.add(mask.as_raw()))
+        masks.iter().fold(Inputs::default().with(self.fit_hash()), |inputs, mask| inputs.with(mask.as_raw()))
     }
 
     fn depth(&mut self, scene: &Scene, splats: &mut Splats, masks: &[GrayImage]) -> Result<(), Error> {
@@ -576,7 +581,7 @@ impl Preparation<'_> {
 
     fn reference(&mut self, scene: &Scene, fit: &Fit, splats: &mut Splats, masks: &[GrayImage]) -> Result<(), Error> {
         let named = self.request.reference.clone().unwrap_or_default();
-        let inputs = self.inputs_behind_masks(masks).add(named).add([u8::from(self.request.depth)]).finish();
+        let inputs = self.inputs_behind_masks(masks).with(named).with([u8::from(self.request.depth)]).finish();
         if self.skips(Step::Reference, &inputs) {
             return Ok(());
         }

@@ -160,7 +160,7 @@ impl Capture {
     pub fn inputs(&self) -> Result<String, Error> {
         let mut inputs = Inputs::default();
         let mut add = |name: &str, path: &Path| -> Result<(), Error> {
-            inputs = std::mem::take(&mut inputs).add(name).add(record::hash(path)?);
+            inputs = std::mem::take(&mut inputs).with(name).with(record::hash(path)?);
             Ok(())
         };
         self.photographs.iter().chain(&self.depths).try_for_each(|(name, path)| add(name, path))?;

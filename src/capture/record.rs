@@ -58,7 +58,7 @@ pub struct Inputs(blake3::Hasher);
 
 impl Inputs {
     /// Adds a part.
-    pub fn add(mut self, part: impl AsRef<[u8]>) -> Self {
+    pub fn with(mut self, part: impl AsRef<[u8]>) -> Self {
         let part = part.as_ref();
         self.0.update(&(part.len() as u64).to_le_bytes());
         self.0.update(part);
@@ -67,7 +67,7 @@ impl Inputs {
 
     /// The hash of all parts and of the program's version, by which steps may change.
     pub fn finish(self) -> String {
-        self.add(env!("CARGO_PKG_VERSION")).0.finalize().to_hex().to_string()
+        self.with(env!("CARGO_PKG_VERSION")).0.finalize().to_hex().to_string()
     }
 }
 
