@@ -17,12 +17,13 @@ use crate::scene::{self, resample};
 
 /// The longer side of the picture that is cut, pixels.
 const SIDE: u32 = 320;
-/// Gaussians of a mixture.
-const COMPONENTS: usize = 5;
+/// Gaussians of the object's mixture and of the background's, which shows more things.
+const COMPONENTS: [usize; 2] = [5, 8];
 /// Rounds of mixtures and cuts.
 const ROUNDS: u32 = 6;
-/// Cost of a border between pixels of the same colour (Rother et al.).
-const SMOOTHNESS: f64 = 50.0;
+/// Cost of a border between pixels of the same colour (Rother et al.: 50, for larger pictures, whose narrow parts are more
+/// pixels wide).
+const SMOOTHNESS: f64 = 20.0;
 /// Costs are whole numbers of this fraction.
 const UNIT: f64 = 256.0;
 /// Pieces smaller than this share of the largest are no part of the object.
@@ -206,11 +207,11 @@ struct Mixture(Vec<Component>);
 
 impl Mixture {
     /// Of these colours: k-means, then a Gaussian of each cluster.
-    fn of(colors: &[[f64; 3]], seed: u64) -> Self {
+    fn of(colors: &[[f64; 3]], components: usize, seed: u64) -> Self {
         let mut rng = Pcg64::new(seed.into(), 31);
         let distance = |a: [f64; 3], b: [f64; 3]| (0..3).map(|c| (a[c] - b[c]).powi(2)).sum::<f64>();
         let mut centers = vec![colors[rng.random_range(0..colors.len())]];
-        while centers.len() < COMPONENTS {
+        while centers.len() < components {
             // The next centre is drawn by its squared distance from those there are (k-means++).
             let nearest: Vec<f64> = colors
                 .iter()
@@ -286,7 +287,7 @@ pub fn segment(picture: &RgbImage, known: &[Known]) -> Option<Vec<bool>> {
         if inside.is_empty() || outside.is_empty() {
             return None;
         }
-        let (inside, outside) = (Mixture::of(&inside, 1), Mixture::of(&outside, 2));
+        let (inside, outside) = (Mixture::of(&inside, COMPONENTS[0], 1), Mixture::of(&outside, COMPONENTS[1], 2));
         let mut grid = Grid::new([w, h]);
         for &(i, d, cost) in &edges {
             grid.set_edge(i, d, cost);
