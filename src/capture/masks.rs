@@ -210,8 +210,8 @@ pub fn without_specks(mask: &GrayImage, share: f64) -> GrayImage {
             }
         }
     }
-    let least = (share * sizes.iter().copied().max().unwrap_or(0) as f64) as usize;
-    let raw = label.iter().map(|l| if *l != 0 && sizes[*l] >= least { 255 } else { 0 }).collect();
+    let least = share * sizes.iter().copied().max().unwrap_or(0) as f64;
+    let raw = label.iter().map(|l| if *l != 0 && sizes[*l] as f64 >= least { 255 } else { 0 }).collect();
     GrayImage::from_raw(mask.width(), mask.height(), raw).expect("a value per pixel")
 }
 
@@ -285,7 +285,7 @@ mod tests {
     #[test]
     fn unseen_anchors_follow_their_like() {
         let n = 40;
-        let positions: Vec<[f32; 3]> = (0..n).map(|i| [(i / 2) as f32 * 0.1, 0.0, 0.0]).collect();
+        let positions: Vec<[f32; 3]> = (0..n).map(|i| [(i / 2) as f32 * 0.1, (i % 2) as f32 * 0.05, 0.0]).collect();
         let colors: Vec<[f32; 3]> = (0..n).map(|i| if i % 2 == 0 { [0.8, 0.2, 0.1] } else { [0.5; 3] }).collect();
         let mut votes = Votes { inside: vec![0.0; n], all: vec![10.0; n] };
         (0..n).step_by(2).for_each(|i| votes.inside[i] = 10.0);
