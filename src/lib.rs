@@ -9,6 +9,7 @@
 //! nothing of splats. [`cli`] has one file per command.
 
 pub mod bench;
+pub mod capture;
 pub mod cli;
 pub mod config;
 pub mod densify;

@@ -223,13 +223,13 @@ impl Bars {
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let origin = Origin::find(&args.model)?;
     let file = args.config.iter().cloned().map(Source::File);
-    let settings = origin.settings(file.chain(args.set.iter().cloned().map(Source::Set)).collect())?;
+    let mut settings = origin.settings(file.chain(args.set.iter().cloned().map(Source::Set)).collect())?;
     let model = model::files::load(&origin.model())?;
     let own = origin.scene().map(Path::new);
     let scene = args.scene.as_deref().or(own).with_context(|| {
         format!("{}: a model alone does not know its cameras; name the scene with --scene", args.model.display())
     })?;
-    let scene = shared::load_scene(scene, &settings)?;
+    let scene = shared::load_scene_of_model(scene, &mut settings)?;
     let folder = args.out.clone().unwrap_or_else(|| args.model.join(EXPORT));
     if args.formats.is_empty() {
         bail!("--formats: names no format");

@@ -8,12 +8,14 @@
 mod ablate;
 mod bench;
 mod devices;
+mod doctor;
 mod eval;
 mod export;
 pub mod folders;
 mod instruments;
 pub mod pictures;
 mod plan;
+mod prepare;
 mod render;
 mod report;
 pub mod shared;
@@ -52,6 +54,8 @@ pub struct Arguments {
 /// What can be done.
 #[derive(Debug, clap::Subcommand)]
 enum Command {
+    Prepare(prepare::Args),
+    Doctor(doctor::Args),
     Train(train::Args),
     Render(render::Args),
     Eval(eval::Args),
@@ -72,6 +76,8 @@ enum Command {
 /// One sentence for the user, see [`message`].
 pub fn run(arguments: Arguments) -> anyhow::Result<()> {
     match arguments.command {
+        Command::Prepare(args) => prepare::run(&args),
+        Command::Doctor(args) => doctor::run(&args),
         Command::Train(args) => train::run(&args),
         Command::Render(args) => render::run(&args),
         Command::Eval(args) => eval::run(&args),

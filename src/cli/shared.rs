@@ -143,6 +143,17 @@ pub fn load_scene(scene: &Path, settings: &Settings) -> anyhow::Result<Scene> {
     Ok(scene)
 }
 
+/// As [`load_scene`], in the lengths of the scene's files, which are those of a model on disk; what the settings say in
+/// training units is brought to them.
+///
+/// # Errors
+/// As [`load_scene`].
+pub fn load_scene_of_model(scene: &Path, settings: &mut Settings) -> anyhow::Result<Scene> {
+    let mut scene = load_scene(scene, settings)?;
+    settings.render.near *= scene.restore_unit();
+    Ok(scene)
+}
+
 #[cfg(test)]
 mod tests {
     use clap::Parser as _;

@@ -89,6 +89,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         }
         (scene, settings, name, folder)
     };
+    eprintln!("doctor: {}", crate::capture::doctor::verdict(&scene));
     let options = Options { timestamps: args.profile, ..args.device.options() };
     with_gpu(&options, |gpu| {
         eprintln!("device: {} ({})", gpu.info().name, gpu.info().driver);

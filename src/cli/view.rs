@@ -116,9 +116,9 @@ fn start(pose: &Pose, cameras: &Cameras) -> Start {
 
 /// What the photograph shows from the viewer's camera.
 fn photograph(origin: &Origin, pose: &Pose) -> anyhow::Result<Vec<u8>> {
-    let settings = origin.settings(vec![])?;
+    let mut settings = origin.settings(vec![])?;
     let scene = origin.scene().context("a model alone does not know its photographs")?;
-    let scene = shared::load_scene(Path::new(scene), &settings)?;
+    let scene = shared::load_scene_of_model(Path::new(scene), &mut settings)?;
     let view = scene.train.iter().find(|view| view.name == pose.name);
     let view = view.with_context(|| format!("{}: the scene has no such view any more", pose.name))?;
     // Its lens, in the axes of the export.

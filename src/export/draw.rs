@@ -40,7 +40,14 @@ struct Canvas {
 impl Canvas {
     fn new(gpu: &Gpu, size: [u32; 2]) -> Result<Self, Error> {
         let pixels = size[0] as usize * size[1] as usize;
-        let plan = losses::Plan { size, ssim_weight: SSIM_WEIGHT, masks: false, depth: false, gradient_scales: 0 };
+        let plan = losses::Plan {
+            size,
+            ssim_weight: SSIM_WEIGHT,
+            masks: false,
+            ssim_across_masks: false,
+            depth: false,
+            gradient_scales: 0,
+        };
         Ok(Self {
             picture: Picture::new(gpu, size, pixels, Outputs::Color)?,
             losses: Losses::new(gpu, &plan)?,

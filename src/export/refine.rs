@@ -46,7 +46,7 @@ pub fn run(
     if views.is_empty() {
         return Ok(());
     }
-    let mut order = Order::new(views.len(), config.seed, ViewOrder::Shuffled);
+    let mut order = Order::new(views.len(), None, config.seed, ViewOrder::Shuffled);
     for step in 1..=config.steps {
         let (camera, picture) = &views[order.view(step)];
         let loss = drawer.step(camera, &pack(picture, None), step, rates(config, step))?;

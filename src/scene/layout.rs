@@ -364,7 +364,7 @@ pub(super) fn relative(scene: &Path, path: &Path) -> String {
 }
 
 /// Removes picture extensions: `a.JPG` and COLMAP's mask name `a.jpg.png` both become `a`.
-pub(super) fn stem(name: &str) -> &str {
+pub(crate) fn stem(name: &str) -> &str {
     let mut stem = name;
     while let Some((rest, extension)) = stem.rsplit_once('.') {
         if rest.is_empty() || !PICTURES.iter().chain(&priors::EXTENSIONS).any(|e| extension.eq_ignore_ascii_case(e)) {

@@ -38,6 +38,8 @@ use crate::config::{Invalid, ensure};
 
 pub use camera::{Camera, distort, undistort};
 pub use condition::{condition, footprint};
+pub(crate) use layout::stem;
+pub(crate) use priors::rank_correlation;
 
 /// How a scene is read.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -554,6 +556,16 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
 }
 
 impl Scene {
+    /// Counts all lengths in the model's units again, those of the files, and returns how many of them one was.
+    pub fn restore_unit(&mut self) -> f64 {
+        let unit = self.unit;
+        if unit != 1.0 {
+            self.rescale(1.0 / unit);
+            self.unit = 1.0;
+        }
+        unit
+    }
+
     /// Counts all lengths in units of `unit` of those they are counted in now.
     fn rescale(&mut self, unit: f64) {
         for view in self.train.iter_mut().chain(&mut self.test) {
@@ -878,7 +890,7 @@ fn same_proportions(picture: [u32; 2], calibrated: [u32; 2]) -> bool {
 }
 
 /// Decodes a picture by its content, whatever its extension says.
-fn decode(path: &Path) -> Result<DynamicImage, Error> {
+pub(crate) fn decode(path: &Path) -> Result<DynamicImage, Error> {
     let io = |source| Error::Io { path: path.to_path_buf(), source };
     let reader = image::ImageReader::open(path).map_err(io)?.with_guessed_format().map_err(io)?;
     reader.decode().map_err(|source| Error::Picture { path: path.to_path_buf(), source })

@@ -144,7 +144,7 @@ fn png(path: &Path) -> Result<Map, Error> {
 
 /// Spearman's rank correlation of two maps of the same size over the pixels where `valid`; at most about 65,536 of them,
 /// evenly spread. `None` with fewer than 16 pixels or a constant side.
-pub(super) fn rank_correlation(a: &[f32], b: &[f32], valid: impl Fn(usize) -> bool) -> Option<f64> {
+pub(crate) fn rank_correlation(a: &[f32], b: &[f32], valid: impl Fn(usize) -> bool) -> Option<f64> {
     let usable: Vec<usize> = (0..a.len()).filter(|i| valid(*i)).collect();
     let picked: Vec<usize> = usable.iter().copied().step_by(usable.len().div_ceil(1 << 16).max(1)).collect();
     if picked.len() < 16 {

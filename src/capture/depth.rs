@@ -1,0 +1,228 @@
+//! Depth priors from the fit itself: kept where views agree on them, nothing elsewhere.
+
+use image::GrayImage;
+use rayon::prelude::*;
+
+use super::record::Batch;
+use super::splats::Splats;
+use super::{Error, Watch};
+use crate::scene::{Camera, Scene, resample};
+
+/// A pixel less covered than this has no depth.
+const COVERED: f32 = 0.9;
+/// Depths agree that differ by at most this part.
+pub const AGREE: f64 = 0.03;
+/// Views that are asked, the nearest ones.
+const WITNESSES: usize = 6;
+/// The object is enlarged by this part of the picture's longer side: the fit is not sharp at its border.
+const MARGIN: f64 = 0.012;
+
+/// A view's depth.
+pub struct DepthMap {
+    /// Its camera.
+    pub camera: Camera,
+    /// `[pixel]` mean depth of what is seen, scene units; NaN where that is not known.
+    pub depth: Vec<f32>,
+}
+
+impl DepthMap {
+    /// The fit's, without the Gaussians for which `removed` says so.
+    ///
+    /// # Errors
+    /// When the device has no room, or is lost.
+    pub fn of(splats: &mut Splats, camera: &Camera, removed: impl Fn(u32) -> bool) -> Result<Self, crate::gpu::Error> {
+        let drawn = splats.paint(camera, |name, own| (!removed(name)).then_some(own))?;
+        let depth = drawn.depth.iter().zip(&drawn.transmittance);
+        let depth = depth.map(|(z, left)| if 1.0 - left < COVERED { f32::NAN } else { z / (1.0 - left) }).collect();
+        Ok(Self { camera: *camera, depth })
+    }
+
+    /// The depth at a pixel position, of the pixel it falls into; NaN outside.
+    pub fn at(&self, [x, y]: [f64; 2]) -> f32 {
+        let [w, h] = self.camera.size;
+        if x < 0.0 || y < 0.0 || x >= f64::from(w) || y >= f64::from(h) {
+            return f32::NAN;
+        }
+        self.depth[y as usize * w as usize + x as usize]
+    }
+
+    /// The depth at a pixel position, interpolated where all four neighbours are known.
+    pub fn smooth(&self, position: [f64; 2]) -> f32 {
+        let [w, h] = self.camera.size.map(|n| n as usize);
+        let [x, y]: [f64; 2] =
+            std::array::from_fn(|i| (position[i] - 0.5).clamp(0.0, (f64::from(self.camera.size[i]) - 1.001).max(0.0)));
+        let (u, v) = (x as usize, y as usize);
+        let (fx, fy) = ((x - u as f64) as f32, (y - v as f64) as f32);
+        let at = |u: usize, v: usize| self.depth[v.min(h - 1) * w + u.min(w - 1)];
+        let above = at(u, v) * (1.0 - fx) + at(u + 1, v) * fx;
+        let below = at(u, v + 1) * (1.0 - fx) + at(u + 1, v + 1) * fx;
+        let mean = above * (1.0 - fy) + below * fy;
+        if mean.is_finite() { mean } else { self.at(position) }
+    }
+}
+
+/// The world point at a depth behind a pixel position; nothing where the lens has no ray.
+pub fn point(camera: &Camera, pixel: [f64; 2], depth: f64) -> Option<[f64; 3]> {
+    let [x, y] = camera.unproject(pixel)?;
+    let seen = [x * depth, y * depth, depth];
+    let shifted: [f64; 3] = std::array::from_fn(|i| seen[i] - camera.translation[i]);
+    Some(std::array::from_fn(|i| (0..3).map(|k| f64::from(camera.rotation[k][i]) * shifted[k]).sum()))
+}
+
+/// How a depth map sees a point that some other view claims.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Witness {
+    /// It has something at that depth.
+    Agrees,
+    /// Something nearer stands before it.
+    Hidden,
+    /// It sees through where the point should be.
+    Contradicts,
+    /// The point is out of its picture, or nothing is known there.
+    Silent,
+}
+
+impl DepthMap {
+    /// Asks for a world point.
+    pub fn witness(&self, point: [f64; 3], agree: f64) -> Witness {
+        let z = self.camera.to_camera(point)[2];
+        let known = self.camera.project(point).map_or(f32::NAN, |pixel| self.at(pixel));
+        if !known.is_finite() {
+            return Witness::Silent;
+        }
+        let known = f64::from(known);
+        if (z - known).abs() <= agree * known {
+            Witness::Agrees
+        } else if z > known {
+            Witness::Hidden
+        } else {
+            Witness::Contradicts
+        }
+    }
+}
+
+/// Other views, the nearest camera first.
+pub fn neighbours(cameras: &[Camera], of: usize) -> Vec<usize> {
+    let center = cameras[of].center();
+    let distance = |i: usize| {
+        let other = cameras[i].center();
+        (0..3).map(|k| (other[k] - center[k]).powi(2)).sum::<f64>()
+    };
+    let mut others: Vec<usize> = (0..cameras.len()).filter(|i| *i != of).collect();
+    others.sort_by(|a, b| distance(*a).total_cmp(&distance(*b)));
+    others
+}
+
+/// The depth of view `of` where two others agree with it and hardly any contradicts; NaN elsewhere.
+pub fn agreed(maps: &[DepthMap], of: usize) -> Vec<f32> {
+    let cameras: Vec<Camera> = maps.iter().map(|map| map.camera).collect();
+    let witnesses: Vec<usize> = neighbours(&cameras, of).into_iter().take(WITNESSES).collect();
+    let map = &maps[of];
+    let w = map.camera.size[0] as usize;
+    let keep = |i: usize, depth: f32| {
+        let pixel = [(i % w) as f64 + 0.5, (i / w) as f64 + 0.5];
+        let Some(point) = point(&map.camera, pixel, f64::from(depth)) else { return false };
+        let said: Vec<Witness> = witnesses.iter().map(|j| maps[*j].witness(point, AGREE)).collect();
+        let count = |what| said.iter().filter(|s| **s == what).count();
+        count(Witness::Agrees) >= 2 && 2 * count(Witness::Contradicts) < count(Witness::Agrees)
+    };
+    let values = map.depth.iter().enumerate();
+    values.map(|(i, depth)| if depth.is_finite() && keep(i, *depth) { *depth } else { f32::NAN }).collect()
+}
+
+/// The mask at the size of a picture, enlarged by [`MARGIN`].
+pub fn enlarged(mask: &GrayImage, size: [u32; 2]) -> GrayImage {
+    let small = resample::mask(mask, size);
+    let radius = (MARGIN * f64::from(size[0].max(size[1]))).ceil() as u32;
+    resample::dilate(&small, radius)
+}
+
+/// Writes every view's agreed depth outside its mask.
+///
+/// # Errors
+/// When the device has no room, or is lost.
+pub fn make(scene: &Scene, splats: &mut Splats, masks: &[GrayImage], watch: &mut dyn Watch) -> Result<Batch, Error> {
+    let mut maps = vec![];
+    for (i, view) in scene.train.iter().enumerate() {
+        maps.push(DepthMap::of(splats, &view.camera, |_| false)?);
+        watch.at(i as u64 + 1);
+    }
+    let kept: Vec<Vec<f32>> = (0..maps.len()).into_par_iter().map(|i| agreed(&maps, i)).collect();
+    let mut batch = Batch::default();
+    let (mut known, mut all) = (0u64, 0u64);
+    for ((view, mut depth), mask) in scene.train.iter().zip(kept).zip(masks) {
+        let size = view.camera.size;
+        for (value, inside) in depth.iter_mut().zip(enlarged(mask, size).as_raw()) {
+            if *inside != 0 {
+                *value = f32::NAN;
+            }
+        }
+        known += depth.iter().filter(|v| v.is_finite()).count() as u64;
+        all += depth.len() as u64;
+        batch.npy(
+            format!("depth/{}.npy", view.name),
+            size,
+            depth,
+            "the fit's own depth where views agree, NaN elsewhere",
+        );
+    }
+    let part = known as f64 / all.max(1) as f64;
+    batch.notes.push(format!("{:.0} % of all pixels have a depth that views agree on", 100.0 * part));
+    batch.figures.insert("known".into(), part);
+    Ok(batch)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Looks along z from (x, 0, 0); a plane at z = 4.
+    fn map(x: f64, depth: f32) -> DepthMap {
+        let camera = Camera {
+            rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            translation: [-x, 0.0, 0.0],
+            focal: [20.0; 2],
+            principal: [10.0, 8.0],
+            distortion: [0.0; 4],
+            size: [20, 16],
+        };
+        DepthMap { camera, depth: vec![depth; 20 * 16] }
+    }
+
+    #[test]
+    fn witnesses_tell_apart_what_they_see() {
+        let wall = map(0.0, 4.0);
+        assert_eq!(wall.witness([0.0, 0.0, 4.05], AGREE), Witness::Agrees);
+        assert_eq!(wall.witness([0.0, 0.0, 5.0], AGREE), Witness::Hidden);
+        assert_eq!(wall.witness([0.0, 0.0, 3.0], AGREE), Witness::Contradicts);
+        assert_eq!(wall.witness([9.0, 0.0, 4.0], AGREE), Witness::Silent);
+        assert_eq!(wall.witness([0.0, 0.0, -4.0], AGREE), Witness::Silent);
+    }
+
+    #[test]
+    fn points_lie_where_they_are_seen() {
+        let map = map(1.0, 4.0);
+        let p = point(&map.camera, [12.0, 8.0], 4.0).unwrap();
+        // Two pixels to the right at focal length 20 and depth 4, from x = 1.
+        assert!((p[0] - 1.4).abs() < 1e-12 && p[1].abs() < 1e-12 && (p[2] - 4.0).abs() < 1e-12);
+        assert_eq!(map.smooth([3.3, 4.7]), 4.0);
+    }
+
+    /// Three cameras before a wall agree; the fourth, which sees something else, keeps nothing.
+    #[test]
+    fn depth_needs_two_witnesses() {
+        let maps = [map(-0.2, 4.0), map(0.0, 4.0), map(0.2, 4.0), map(0.4, 2.5)];
+        let kept = agreed(&maps, 1);
+        let middle = 8 * 20 + 10;
+        assert_eq!(kept[middle], 4.0);
+        assert!(agreed(&maps, 3).iter().all(|v| v.is_nan()));
+        // At the border only one of the others sees the point.
+        assert!(agreed(&maps[..2], 1).iter().all(|v| v.is_nan()));
+    }
+
+    #[test]
+    fn neighbours_are_sorted_by_distance() {
+        let cameras: Vec<Camera> = [0.0, 3.0, 1.0, -0.5].into_iter().map(|x| map(x, 1.0).camera).collect();
+        assert_eq!(neighbours(&cameras, 0), [3, 2, 1]);
+    }
+}

@@ -1,0 +1,93 @@
+//! A short plain fit to the photographs, object and all: what the votes, the depths and the reference look at.
+
+use std::path::Path;
+
+use super::record::Batch;
+use super::{Error, Request, Watch};
+use crate::config::Settings;
+use crate::gpu::Gpu;
+use crate::model::files::{self, Anchors, POINT_CLOUD, WEIGHTS, Weights};
+use crate::scene::Scene;
+use crate::train::run::{Observer, Progress, Run, Signal};
+
+/// The fit's folder within a prepared scene.
+pub const FOLDER: &str = "prepare/fit";
+
+/// A fit.
+pub struct Fit {
+    /// What is learnt per anchor.
+    pub anchors: Anchors,
+    /// The decoders.
+    pub weights: Weights,
+    /// What it was made with.
+    pub settings: Settings,
+}
+
+/// Points that become anchors one by one; of more, several share an anchor.
+const POINTS: f64 = 2500.0;
+
+/// The settings of the fit to a scene of so many points: those of the preset `lavapipe`, its schedule shortened.
+pub fn settings(request: &Request, points: usize) -> Settings {
+    let steps = request.fit_steps.max(1);
+    let mut settings = Settings::default();
+    let part = |share: f64| ((f64::from(steps) * share).round() as u32).max(1);
+    let train = &mut settings.train;
+    train.iterations = steps;
+    train.seed = request.seed;
+    train.log_interval = part(0.1);
+    (train.eval_interval, train.save_interval, train.checkpoint_interval) = (0, 0, 0);
+    settings.model.voxel = 0.0;
+    settings.model.voxel_factor = (points as f64 / POINTS).sqrt().clamp(1.0, 6.0);
+    settings.model.attention.enabled = false;
+    settings.losses.depth.enabled = false;
+    let densify = &mut settings.densify;
+    (densify.from, densify.until) = (part(0.15), part(0.6));
+    densify.every = part(0.04);
+    densify.statistics_from = part(0.05);
+    (densify.min_slot_visits, densify.min_anchor_visits) = (part(0.015), part(0.03));
+    densify.max_log_scaling = f64::INFINITY;
+    settings
+}
+
+struct Bar<'w>(&'w mut dyn Watch);
+
+impl Observer for Bar<'_> {
+    fn step(&mut self, progress: &Progress) {
+        self.0.at(u64::from(progress.step));
+    }
+    fn interrupted(&mut self) -> Option<Signal> {
+        self.0.interrupted()
+    }
+}
+
+/// Fits the photographs and keeps the model as files of the scene.
+///
+/// # Errors
+/// Whatever training meets.
+pub fn make(gpu: &Gpu, scene: &Scene, settings: Settings, watch: &mut dyn Watch) -> Result<(Batch, Fit), Error> {
+    let work = tempfile::tempdir().map_err(|source| Error::Io { path: std::env::temp_dir(), source })?;
+    let mut run = Run::new(gpu, scene, &settings)?;
+    let summary = run.train(work.path(), &mut Bar(watch))?;
+    drop(run);
+    let mut batch = Batch::default();
+    let model = work.path().join("model");
+    for name in [POINT_CLOUD, WEIGHTS] {
+        let path = model.join(name);
+        let bytes = std::fs::read(&path).map_err(|source| Error::Io { path, source })?;
+        batch.bytes(format!("{FOLDER}/{name}"), bytes, "a short fit to the photographs");
+    }
+    batch.figures.insert("anchors".into(), f64::from(summary.anchors));
+    let (anchors, weights) = files::load(&model)?;
+    Ok((batch, Fit { anchors, weights, settings }))
+}
+
+impl Fit {
+    /// The fit in a scene's folder.
+    ///
+    /// # Errors
+    /// Files that cannot be read.
+    pub fn read(root: &Path, settings: Settings) -> Result<Self, Error> {
+        let (anchors, weights) = files::load(&root.join(FOLDER))?;
+        Ok(Self { anchors, weights, settings })
+    }
+}

@@ -1,0 +1,517 @@
+//! A box or strokes become a mask: colour models of object and background, and a minimum cut between them.
+//!
+//! GrabCut (Rother et al. 2004): each side's colours are a mixture of Gaussians; a pixel's label costs what its side's
+//! mixture says of its colour, and labels of neighbours differ at a cost that falls with their contrast. The cheapest
+//! labelling is a minimum cut of a graph on the pixels, found by Dinic's algorithm on the grid itself; mixtures and
+//! labels take turns.
+
+use std::collections::VecDeque;
+use std::path::Path;
+
+use image::{GrayImage, Luma, RgbImage};
+use rand::RngExt;
+use rand_pcg::Pcg64;
+
+use super::{Error, masks};
+use crate::scene::{self, resample};
+
+/// The longer side of the picture that is cut, pixels.
+const SIDE: u32 = 320;
+/// Gaussians of the object's mixture and of the background's, which shows more things.
+const COMPONENTS: [usize; 2] = [5, 8];
+/// Rounds of mixtures and cuts.
+const ROUNDS: u32 = 6;
+/// Cost of a border between pixels of the same colour (Rother et al.: 50, for larger pictures, whose narrow parts are more
+/// pixels wide).
+const SMOOTHNESS: f64 = 20.0;
+/// Costs are whole numbers of this fraction.
+const UNIT: f64 = 256.0;
+/// Pieces smaller than this share of the largest are no part of the object.
+const SPECK: f64 = 0.05;
+
+/// What is known of a pixel before.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Known {
+    /// It is the object.
+    Object,
+    /// It is not.
+    Background,
+    /// Nothing; the cut decides, beginning with the object.
+    Maybe,
+    /// Nothing; the cut decides, beginning with the background.
+    MaybeBackground,
+}
+
+// ---------------------------------------------------------------- minimum cut
+
+/// Shifts to the neighbours of a pixel; the opposite of `d` is `7 - d`.
+const SHIFTS: [[isize; 2]; 8] = [[-1, -1], [0, -1], [1, -1], [-1, 0], [1, 0], [-1, 1], [0, 1], [1, 1]];
+
+/// A graph whose nodes are pixels, each joined to its eight neighbours, to the object's terminal and to the background's.
+pub struct Grid {
+    size: [usize; 2],
+    /// What still fits through the edge to each neighbour.
+    edges: Vec<[i32; 8]>,
+    /// What still fits from the object's terminal, or, below zero, to the background's.
+    terminal: Vec<i64>,
+}
+
+impl Grid {
+    /// Without any edges.
+    pub fn new(size: [usize; 2]) -> Self {
+        let n = size[0] * size[1];
+        Self { size, edges: vec![[0; 8]; n], terminal: vec![0; n] }
+    }
+
+    fn neighbour(&self, node: usize, direction: usize) -> Option<usize> {
+        let (x, y) = ((node % self.size[0]) as isize, (node / self.size[0]) as isize);
+        let [u, v] = [x + SHIFTS[direction][0], y + SHIFTS[direction][1]];
+        let inside = u >= 0 && v >= 0 && u < self.size[0] as isize && v < self.size[1] as isize;
+        inside.then(|| (v * self.size[0] as isize + u) as usize)
+    }
+
+    /// Labelling this pixel as background costs `object`, as object `background`.
+    pub fn set_terminals(&mut self, node: usize, object: i64, background: i64) {
+        self.terminal[node] = object - background;
+    }
+
+    /// Different labels of a pixel and its neighbour in this direction cost so much, either way.
+    pub fn set_edge(&mut self, node: usize, direction: usize, cost: i32) {
+        if let Some(other) = self.neighbour(node, direction) {
+            self.edges[node][direction] = cost;
+            self.edges[other][7 - direction] = cost;
+        }
+    }
+
+    /// The cheapest labelling: true on the object's side. Where both are equally cheap, the background's.
+    pub fn cut(mut self) -> Vec<bool> {
+        let n = self.terminal.len();
+        loop {
+            // Levels: steps from the object's terminal along edges through which something fits.
+            let mut level = vec![u32::MAX; n];
+            let mut queue: VecDeque<usize> = (0..n).filter(|i| self.terminal[*i] > 0).collect();
+            queue.iter().for_each(|i| level[*i] = 0);
+            let mut last = u32::MAX;
+            while let Some(node) = queue.pop_front() {
+                if level[node] >= last {
+                    break;
+                }
+                for d in 0..8 {
+                    if self.edges[node][d] > 0
+                        && let Some(next) = self.neighbour(node, d)
+                        && level[next] == u32::MAX
+                    {
+                        level[next] = level[node] + 1;
+                        if self.terminal[next] < 0 {
+                            last = level[next];
+                        }
+                        queue.push_back(next);
+                    }
+                }
+            }
+            if last == u32::MAX {
+                return level.into_iter().map(|level| level != u32::MAX).collect();
+            }
+            self.block(&level);
+        }
+    }
+
+    /// Sends flow along the levels until nothing more fits.
+    fn block(&mut self, level: &[u32]) {
+        let mut tried = vec![0u8; level.len()];
+        let mut path: Vec<(usize, usize)> = vec![];
+        for source in (0..level.len()).filter(|i| level[*i] == 0) {
+            let mut node = source;
+            path.clear();
+            while self.terminal[source] > 0 {
+                if self.terminal[node] < 0 {
+                    let fits = path.iter().map(|(node, d)| i64::from(self.edges[*node][*d])).min().unwrap_or(i64::MAX);
+                    let flow = fits.min(self.terminal[source]).min(-self.terminal[node]);
+                    self.terminal[source] -= flow;
+                    self.terminal[node] += flow;
+                    let mut back = None;
+                    for (i, &(from, d)) in path.iter().enumerate() {
+                        let to = self.neighbour(from, d).expect("the path is in the picture");
+                        // A flow is at most the least capacity of its path.
+                        self.edges[from][d] -= flow as i32;
+                        self.edges[to][7 - d] += flow as i32;
+                        if self.edges[from][d] == 0 && back.is_none() {
+                            back = Some(i);
+                        }
+                    }
+                    // Goes on from the first edge that is full now.
+                    if let Some(i) = back {
+                        node = path[i].0;
+                        path.truncate(i);
+                    }
+                    continue;
+                }
+                let onward = (usize::from(tried[node])..8).find_map(|d| {
+                    let next = self.neighbour(node, d)?;
+                    (self.edges[node][d] > 0 && level[next] == level[node] + 1).then_some((d, next))
+                });
+                match onward {
+                    Some((d, next)) => {
+                        tried[node] = d as u8;
+                        path.push((node, d));
+                        node = next;
+                    }
+                    None => {
+                        tried[node] = 8;
+                        let Some((before, _)) = path.pop() else { break };
+                        tried[before] += 1;
+                        node = before;
+                    }
+                }
+            }
+        }
+    }
+}
+
+// ---------------------------------------------------------------- colour models
+
+/// One Gaussian of a mixture.
+#[derive(Clone, Copy)]
+struct Component {
+    weight: f64,
+    mean: [f64; 3],
+    /// Inverse covariance.
+    inverse: glam::DMat3,
+    determinant: f64,
+}
+
+impl Component {
+    /// Of these colours, out of `all` of the mixture.
+    fn of(colors: &[[f64; 3]], all: usize) -> Self {
+        let n = colors.len() as f64;
+        let mean: [f64; 3] = std::array::from_fn(|c| colors.iter().map(|p| p[c]).sum::<f64>() / n);
+        let mut covariance = glam::DMat3::ZERO;
+        for color in colors {
+            let d = glam::DVec3::from_array(std::array::from_fn(|c| color[c] - mean[c]));
+            covariance += glam::DMat3::from_cols(d * d.x, d * d.y, d * d.z);
+        }
+        // A level of grey of noise: one colour only is no singular covariance.
+        let covariance = covariance * (1.0 / n) + glam::DMat3::IDENTITY;
+        Self { weight: n / all as f64, mean, inverse: covariance.inverse(), determinant: covariance.determinant() }
+    }
+
+    /// Minus the logarithm of weight times density, without the constant.
+    fn cost(&self, color: [f64; 3]) -> f64 {
+        let d = glam::DVec3::from_array(std::array::from_fn(|c| color[c] - self.mean[c]));
+        -self.weight.ln() + 0.5 * self.determinant.ln() + 0.5 * d.dot(self.inverse * d)
+    }
+}
+
+/// A mixture of Gaussians over colours.
+struct Mixture(Vec<Component>);
+
+impl Mixture {
+    /// Of these colours: k-means, then a Gaussian of each cluster.
+    fn of(colors: &[[f64; 3]], components: usize, seed: u64) -> Self {
+        let mut rng = Pcg64::new(seed.into(), 31);
+        let distance = |a: [f64; 3], b: [f64; 3]| (0..3).map(|c| (a[c] - b[c]).powi(2)).sum::<f64>();
+        let mut centers = vec![colors[rng.random_range(0..colors.len())]];
+        while centers.len() < components {
+            // The next centre is drawn by its squared distance from those there are (k-means++).
+            let nearest: Vec<f64> = colors
+                .iter()
+                .map(|color| centers.iter().map(|c| distance(*c, *color)).fold(f64::INFINITY, f64::min))
+                .collect();
+            let total: f64 = nearest.iter().sum();
+            if total < 1.0 {
+                break;
+            }
+            let mut left = rng.random_range(0.0..total);
+            let drawn = nearest.iter().position(|d| {
+                left -= d;
+                left < 0.0
+            });
+            centers.push(colors[drawn.unwrap_or(colors.len() - 1)]);
+        }
+        let mut clusters: Vec<Vec<[f64; 3]>> = vec![];
+        for _ in 0..8 {
+            clusters = vec![vec![]; centers.len()];
+            for color in colors {
+                let best = (0..centers.len())
+                    .min_by(|a, b| distance(centers[*a], *color).total_cmp(&distance(centers[*b], *color)));
+                clusters[best.unwrap_or(0)].push(*color);
+            }
+            for (center, cluster) in centers.iter_mut().zip(&clusters) {
+                if !cluster.is_empty() {
+                    let n = cluster.len() as f64;
+                    *center = std::array::from_fn(|c| cluster.iter().map(|p| p[c]).sum::<f64>() / n);
+                }
+            }
+        }
+        let components = clusters.iter().filter(|cluster| !cluster.is_empty());
+        Self(components.map(|cluster| Component::of(cluster, colors.len())).collect())
+    }
+
+    /// Cost of a colour: that of the component it fits best.
+    fn cost(&self, color: [f64; 3]) -> f64 {
+        self.0.iter().map(|component| component.cost(color)).fold(f64::INFINITY, f64::min)
+    }
+}
+
+// ---------------------------------------------------------------- pictures
+
+/// What a border between neighbours costs: a pixel, the direction of its neighbour, the cost.
+fn contrasts(colors: &[[f64; 3]], [w, h]: [usize; 2]) -> Vec<(usize, usize, i32)> {
+    let contrast = |i: usize, j: usize| (0..3).map(|c| (colors[i][c] - colors[j][c]).powi(2)).sum::<f64>();
+    let mut edges = vec![];
+    for i in 0..w * h {
+        for (d, [dx, dy]) in SHIFTS.into_iter().enumerate().skip(4) {
+            let (x, y) = ((i % w) as isize + dx, (i / w) as isize + dy);
+            if x >= 0 && x < w as isize && y < h as isize {
+                let j = y as usize * w + x as usize;
+                edges.push((i, d, contrast(i, j), f64::hypot(dx as f64, dy as f64)));
+            }
+        }
+    }
+    let mean = edges.iter().map(|edge| edge.2).sum::<f64>() / edges.len().max(1) as f64;
+    let beta = if mean > 0.0 { 0.5 / mean } else { 0.0 };
+    let cost = |contrast: f64, length: f64| (UNIT * SMOOTHNESS * (-beta * contrast).exp() / length) as i32;
+    edges.into_iter().map(|(i, d, contrast, length)| (i, d, cost(contrast, length))).collect()
+}
+
+/// The object's pixels, given what is known: mixtures and cuts in turn. Nothing where one side runs out of pixels.
+pub fn segment(picture: &RgbImage, known: &[Known]) -> Option<Vec<bool>> {
+    let (w, h) = (picture.width() as usize, picture.height() as usize);
+    let colors: Vec<[f64; 3]> = picture.pixels().map(|p| p.0.map(f64::from)).collect();
+    let mut object: Vec<bool> = known.iter().map(|k| matches!(k, Known::Object | Known::Maybe)).collect();
+    let edges = contrasts(&colors, [w, h]);
+    for round in 0..ROUNDS {
+        let of =
+            |side: bool| -> Vec<[f64; 3]> { (0..w * h).filter(|i| object[*i] == side).map(|i| colors[i]).collect() };
+        let (inside, outside) = (of(true), of(false));
+        if inside.is_empty() || outside.is_empty() {
+            return None;
+        }
+        let (inside, outside) = (Mixture::of(&inside, COMPONENTS[0], 1), Mixture::of(&outside, COMPONENTS[1], 2));
+        let mut grid = Grid::new([w, h]);
+        for &(i, d, cost) in &edges {
+            grid.set_edge(i, d, cost);
+        }
+        let sure = (UNIT * SMOOTHNESS * 16.0) as i64;
+        for (i, known) in known.iter().enumerate() {
+            match known {
+                Known::Object => grid.set_terminals(i, sure, 0),
+                Known::Background => grid.set_terminals(i, 0, sure),
+                _ => {
+                    let cost = |mixture: &Mixture| (UNIT * mixture.cost(colors[i])) as i64;
+                    grid.set_terminals(i, cost(&outside), cost(&inside));
+                }
+            }
+        }
+        let labels = grid.cut();
+        if labels == object && round > 0 {
+            break;
+        }
+        object = labels;
+    }
+    object.iter().any(|v| *v).then_some(object)
+}
+
+/// A picture's size with the longer side at most [`SIDE`].
+fn reduced(size: [u32; 2]) -> [u32; 2] {
+    let longest = size[0].max(size[1]);
+    if longest <= SIDE {
+        size
+    } else {
+        size.map(|n| (u64::from(n) * u64::from(SIDE) / u64::from(longest)).max(1) as u32)
+    }
+}
+
+fn to_mask(object: Vec<bool>, from: [u32; 2], to: [u32; 2]) -> GrayImage {
+    let raw = object.into_iter().map(|v| if v { 255 } else { 0 }).collect();
+    let mask = GrayImage::from_raw(from[0], from[1], raw).expect("a label per pixel");
+    let mask = masks::without_specks(&mask, SPECK);
+    masks::threshold(&masks::parts(&mask, from), from, to, 0.5)
+}
+
+/// The object in a box (x0, y0 and one past x1, y1). Its surroundings, as wide again as the box, are what it is told from.
+/// Nothing if nothing in the box differs from them.
+pub fn from_box(picture: &RgbImage, bounds: [u32; 4]) -> Option<GrayImage> {
+    let full = [picture.width(), picture.height()];
+    let [x0, y0, x1, y1] = bounds;
+    let (wide, high) = (x1 - x0, y1 - y0);
+    let low = [x0.saturating_sub(wide.div_ceil(2)), y0.saturating_sub(high.div_ceil(2))];
+    let far = [(x1 + wide.div_ceil(2)).min(full[0]), (y1 + high.div_ceil(2)).min(full[1])];
+    let around = image::imageops::crop_imm(picture, low[0], low[1], far[0] - low[0], far[1] - low[1]).to_image();
+    let whole = [around.width(), around.height()];
+    let size = reduced(whole);
+    let small = resample::photograph(&around, size);
+    let inside = |i: u32, axis: usize| {
+        let at = (f64::from(i) + 0.5) * f64::from(whole[axis]) / f64::from(size[axis]) + f64::from(low[axis]);
+        at > f64::from(bounds[axis]) && at < f64::from(bounds[axis + 2])
+    };
+    let known: Vec<Known> = (0..size[0] * size[1])
+        .map(|i| {
+            let boxed = inside(i % size[0], 0) && inside(i / size[0], 1);
+            if boxed { Known::Maybe } else { Known::Background }
+        })
+        .collect();
+    let cut = to_mask(segment(&small, &known)?, size, whole);
+    let mut mask = GrayImage::new(full[0], full[1]);
+    image::imageops::replace(&mut mask, &cut, i64::from(low[0]), i64::from(low[1]));
+    // Where the reduced pixels of the box's border reach over it.
+    for (x, y, v) in mask.enumerate_pixels_mut() {
+        if x < x0 || y < y0 || x >= x1 || y >= y1 {
+            *v = Luma([0]);
+        }
+    }
+    mask.as_raw().iter().any(|v| *v != 0).then_some(mask)
+}
+
+/// Strokes on a picture.
+#[derive(Clone, Debug)]
+pub struct Strokes {
+    known: Vec<Known>,
+    size: [u32; 2],
+}
+
+impl Strokes {
+    /// Reads them: white or green is the object, black or red is not, grey or transparent says nothing. `size` is the
+    /// photograph's.
+    ///
+    /// # Errors
+    /// An unreadable file, one of other proportions than the photograph, one without a stroke on the object.
+    pub fn read(path: &Path, size: [u32; 2]) -> Result<Self, Error> {
+        let picture = scene::decode(path)?.into_rgba8();
+        let found = [picture.width(), picture.height()];
+        let ratio = |s: [u32; 2]| f64::from(s[0]) / f64::from(s[1]);
+        if (ratio(found) / ratio(size) - 1.0).abs() > 0.02 {
+            return Err(scene::Error::MaskSize { path: path.to_owned(), size: found, picture: size }.into());
+        }
+        let known = picture.pixels().map(|p| {
+            let [r, g, b, a] = p.0.map(i32::from);
+            if a < 128 {
+                Known::MaybeBackground
+            } else if g > r + 60 && g > 100 || r > 220 && g > 220 && b > 220 {
+                Known::Object
+            } else if r > g + 60 && r > 100 || r < 35 && g < 35 && b < 35 {
+                Known::Background
+            } else {
+                Known::MaybeBackground
+            }
+        });
+        let strokes = Self { known: known.collect(), size: found };
+        if !strokes.known.contains(&Known::Object) {
+            let what = "no stroke is white or green; draw at least one on the object".into();
+            return Err(Error::File { path: path.to_owned(), what });
+        }
+        Ok(strokes)
+    }
+}
+
+/// The object that the strokes mean. Without a stroke beside it, the picture's border is what it is told from.
+pub fn from_strokes(picture: &RgbImage, strokes: &Strokes) -> GrayImage {
+    let full = [picture.width(), picture.height()];
+    let size = reduced(full);
+    let small = resample::photograph(picture, size);
+    let [sw, sh] = strokes.size;
+    let mut known = vec![Known::MaybeBackground; (size[0] * size[1]) as usize];
+    for (i, stroke) in strokes.known.iter().enumerate().filter(|(_, k)| **k != Known::MaybeBackground) {
+        let (x, y) = (i as u32 % sw, i as u32 / sw);
+        known[(y * size[1] / sh * size[0] + x * size[0] / sw) as usize] = *stroke;
+    }
+    if !known.contains(&Known::Background) {
+        for x in 0..size[0] {
+            for y in (0..size[1]).filter(|y| x == 0 || x + 1 == size[0] || *y == 0 || y + 1 == size[1]) {
+                known[(y * size[0] + x) as usize] = Known::Background;
+            }
+        }
+    }
+    // The strokes themselves are object even where the cut finds nothing.
+    let object = segment(&small, &known).unwrap_or_else(|| known.iter().map(|k| *k == Known::Object).collect());
+    to_mask(object, size, full)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// All labellings of a small grid, by their cost.
+    fn cheapest(size: [usize; 2], terminals: &[[i64; 2]], edges: &[(usize, usize, i32)]) -> (i64, Vec<u32>) {
+        let n = size[0] * size[1];
+        let cost = |labels: u32| {
+            let on = |i: usize| labels >> i & 1 == 1;
+            let own: i64 = (0..n).map(|i| terminals[i][usize::from(on(i))]).sum();
+            own + edges.iter().filter(|(i, j, _)| on(*i) != on(*j)).map(|e| i64::from(e.2)).sum::<i64>()
+        };
+        let least = (0..1u32 << n).map(cost).min().unwrap();
+        (least, (0..1 << n).filter(|l| cost(*l) == least).collect())
+    }
+
+    /// Random grids of 3 x 4 against every one of their 4,096 labellings.
+    #[test]
+    fn the_cut_is_the_cheapest_labelling() {
+        let mut rng = Pcg64::new(5, 5);
+        let size = [3, 4];
+        for _ in 0..200 {
+            let mut grid = Grid::new(size);
+            let (mut terminals, mut edges) = (vec![], vec![]);
+            for i in 0..12 {
+                // Of background and of object.
+                let costs = [rng.random_range(0..9i64), rng.random_range(0..9i64)];
+                grid.set_terminals(i, costs[0], costs[1]);
+                terminals.push(costs);
+                for d in 4..8 {
+                    let cost = rng.random_range(0..6);
+                    if let Some(j) = grid.neighbour(i, d) {
+                        grid.set_edge(i, d, cost);
+                        edges.push((i, j, cost));
+                    }
+                }
+            }
+            let (_, best) = cheapest(size, &terminals, &edges);
+            let labels = grid.cut().iter().enumerate().map(|(i, on)| u32::from(*on) << i).sum::<u32>();
+            assert!(best.contains(&labels), "{labels:b} is not among {best:?}");
+        }
+    }
+
+    /// A textured disc on a textured ground, boxed loosely.
+    fn disc() -> (RgbImage, impl Fn(u32, u32) -> bool) {
+        let inside = |x: u32, y: u32| (f64::from(x) - 60.0).powi(2) + (f64::from(y) - 45.0).powi(2) < 22.0f64.powi(2);
+        let picture = RgbImage::from_fn(128, 96, |x, y| {
+            let noise = ((x * 7 + y * 13) % 17) as u8;
+            image::Rgb(if inside(x, y) { [170 + noise, 60 + noise, 40] } else { [60 + noise, 90 + noise, 120] })
+        });
+        (picture, inside)
+    }
+
+    fn wrong(mask: &GrayImage, inside: &impl Fn(u32, u32) -> bool) -> usize {
+        mask.enumerate_pixels().filter(|(x, y, v)| (v.0[0] != 0) != inside(*x, *y)).count()
+    }
+
+    #[test]
+    fn a_box_becomes_its_object() {
+        let (picture, inside) = disc();
+        let mask = from_box(&picture, [30, 15, 92, 76]).expect("there is something in it");
+        // The disc has about 140 border pixels, which may fall to either side.
+        assert!(wrong(&mask, &inside) < 40, "{}", wrong(&mask, &inside));
+        // Nothing but ground.
+        let flat = RgbImage::from_pixel(64, 64, image::Rgb([90, 90, 90]));
+        assert!(from_box(&flat, [20, 20, 40, 40]).is_none());
+    }
+
+    #[test]
+    fn strokes_become_their_object() {
+        let (picture, inside) = disc();
+        let mut strokes = image::RgbaImage::new(128, 96);
+        for i in 0..12 {
+            strokes.put_pixel(52 + i, 45, image::Rgba([0, 255, 0, 255]));
+            strokes.put_pixel(10 + i, 10, image::Rgba([255, 0, 0, 255]));
+        }
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("strokes.png");
+        strokes.save(&path).unwrap();
+        let read = Strokes::read(&path, [256, 192]).unwrap();
+        assert_eq!(read.known.iter().filter(|k| **k == Known::Object).count(), 12);
+        let mask = from_strokes(&picture, &read);
+        assert!(wrong(&mask, &inside) < 40);
+        image::RgbaImage::new(128, 96).save(&path).unwrap();
+        assert!(Strokes::read(&path, [128, 96]).unwrap_err().to_string().contains("no stroke"));
+        assert!(Strokes::read(&path, [96, 128]).is_err());
+    }
+}

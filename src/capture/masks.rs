@@ -1,0 +1,298 @@
+//! Masks for all views from masks of a few: the Gaussians vote.
+//!
+//! In a view with a mask, a Gaussian's share in the pixels inside, over its share in all pixels, says how much of it is
+//! the object. Rendered into another view in place of the colours and divided by what covers the pixel, these shares are
+//! the object's part of each pixel.
+
+use image::{GrayImage, Luma};
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
+
+use super::splats::Splats;
+use crate::gpu::Error;
+use crate::scene::{Camera, View, resample};
+
+/// Anchors seen less than this (pixels) in the masked views count as unseen: what shines through the object.
+const SEEN: f32 = 1.0;
+/// Votes (pixels) that a Gaussian's surroundings have beside its own.
+const PRIOR: f32 = 1.0;
+/// Anchors seen in no masked view are taken to be what so many seen ones are that are near them and look like them.
+const NEIGHBOURS: usize = 8;
+/// Colours that differ by this are as far apart as anchors [`REACH`] times their spacing away from each other.
+const COLOR: f32 = 0.08;
+/// See [`COLOR`].
+const REACH: f32 = 6.0;
+/// Views that are asked for the Gaussians' colours.
+const COLORED: usize = 6;
+/// A pixel less covered than this shows nothing that could be the object.
+const COVERED: f32 = 0.1;
+
+/// A pixel of which more than this part is the object belongs to the carried mask. Below a half: along the object's rim
+/// lie Gaussians that no masked view has seen, and a mask that is too narrow leaves a ghost where one that is too wide
+/// leaves nothing.
+pub const OBJECT: f32 = 0.35;
+
+/// The votes of the masked views.
+pub struct Votes {
+    inside: Vec<f32>,
+    all: Vec<f32>,
+}
+
+/// What the votes say of each Gaussian.
+pub struct Shares {
+    /// By name: how much of it is the object, 0 to 1.
+    pub object: Vec<f32>,
+    /// By name: whether a masked view has seen it, or another Gaussian of its anchor.
+    pub seen: Vec<bool>,
+}
+
+/// A view as the votes see it.
+pub struct Carried {
+    /// `[pixel]` the object's part, 0 to 1.
+    pub object: Vec<f32>,
+    /// `[pixel]` the part of what covers it that the masked views have seen, 0 to 1.
+    pub evidence: Vec<f32>,
+}
+
+impl Votes {
+    /// None yet.
+    pub fn new(splats: &Splats) -> Self {
+        Self { inside: vec![0.0; splats.len()], all: vec![0.0; splats.len()] }
+    }
+
+    /// Adds a view's: `inside` is the mask's part of each pixel, 0 to 1.
+    ///
+    /// # Errors
+    /// When the device has no room, or is lost.
+    pub fn add(&mut self, splats: &mut Splats, camera: &Camera, inside: &[f32]) -> Result<(), Error> {
+        let weights: Vec<[f32; 3]> = inside.iter().map(|part| [*part, 1.0, 0.0]).collect();
+        for (name, [inside, all, _]) in splats.shares(camera, &weights)? {
+            self.inside[name as usize] += inside;
+            self.all[name as usize] += all;
+        }
+        Ok(())
+    }
+
+    /// Counts them. `positions` and `colors` are the anchors': a Gaussian that no masked view has seen votes as its anchor
+    /// does, and an anchor that none has seen as those which are near it and look like it. What stands behind the object is
+    /// as near to it as its own other side, but seldom of its colour.
+    pub fn count(&self, positions: &[[f32; 3]], colors: &[[f32; 3]]) -> Shares {
+        let offsets = self.all.len() / positions.len().max(1);
+        let of_anchors: Vec<[f32; 2]> = (0..positions.len())
+            .map(|a| {
+                let range = a * offsets..(a + 1) * offsets;
+                [self.inside[range.clone()].iter().sum(), self.all[range].iter().sum()]
+            })
+            .collect();
+        let seen: Vec<usize> = (0..positions.len()).filter(|a| of_anchors[*a][1] > SEEN).collect();
+        let spacing = spacing(positions);
+        let place = |a: usize| -> [f32; 6] {
+            std::array::from_fn(|i| if i < 3 { positions[a][i] / (REACH * spacing) } else { colors[a][i - 3] / COLOR })
+        };
+        let tree: ImmutableKdTree<f32, 6> =
+            ImmutableKdTree::new_from_slice(&seen.iter().map(|a| place(*a)).collect::<Vec<_>>());
+        let around = |a: usize| -> f32 {
+            let Some(count) = std::num::NonZero::new(NEIGHBOURS.min(seen.len())) else { return 0.0 };
+            let near = tree.nearest_n::<SquaredEuclidean>(&place(a), count);
+            let votes = near.iter().map(|n| of_anchors[seen[n.item as usize]]);
+            votes.map(|[inside, all]| inside / all).sum::<f32>() / count.get() as f32
+        };
+        let mut shares =
+            Shares { object: Vec::with_capacity(self.all.len()), seen: Vec::with_capacity(self.all.len()) };
+        for (a, [inside, all]) in of_anchors.iter().copied().enumerate() {
+            let seen = all > SEEN;
+            let prior = if seen { inside / all } else { around(a) };
+            for g in a * offsets..(a + 1) * offsets {
+                let share = (self.inside[g] + PRIOR * prior) / (self.all[g] + PRIOR);
+                shares.object.push(share.clamp(0.0, 1.0));
+                shares.seen.push(seen);
+            }
+        }
+        shares
+    }
+}
+
+/// Median distance of some anchors to the next.
+fn spacing(positions: &[[f32; 3]]) -> f32 {
+    let Some(two) = std::num::NonZero::new(2).filter(|_| positions.len() > 1) else { return 1.0 };
+    let tree: ImmutableKdTree<f32, 3> = ImmutableKdTree::new_from_slice(positions);
+    let some = positions.iter().step_by(positions.len().div_ceil(1000));
+    let mut distances: Vec<f32> =
+        some.filter_map(|p| tree.nearest_n::<SquaredEuclidean>(p, two).last().map(|n| n.distance.sqrt())).collect();
+    distances.sort_unstable_by(f32::total_cmp);
+    distances[distances.len() / 2].max(f32::MIN_POSITIVE)
+}
+
+/// The anchors' mean colours, from some views; grey where none has an anchor.
+///
+/// # Errors
+/// When the device has no room, or is lost.
+pub fn colors(splats: &mut Splats, views: &[View]) -> Result<Vec<[f32; 3]>, Error> {
+    let offsets = splats.offsets();
+    let mut sums = vec![[0f32; 4]; splats.len() / offsets];
+    for view in views.iter().step_by(views.len().div_ceil(COLORED).max(1)) {
+        for (name, color) in splats.colors(&view.camera)? {
+            let sum = &mut sums[name as usize / offsets];
+            (0..3).for_each(|c| sum[c] += color[c]);
+            sum[3] += 1.0;
+        }
+    }
+    Ok(sums.into_iter().map(|s| if s[3] > 0.0 { std::array::from_fn(|c| s[c] / s[3]) } else { [0.5; 3] }).collect())
+}
+
+impl Shares {
+    /// Rendered into a view.
+    ///
+    /// # Errors
+    /// When the device has no room, or is lost.
+    pub fn carry(&self, splats: &mut Splats, camera: &Camera) -> Result<Carried, Error> {
+        let look = |name: u32, _| {
+            let name = name as usize;
+            Some([self.object[name], f32::from(self.seen[name]), 0.0])
+        };
+        let drawn = splats.paint(camera, look)?;
+        let of = |channel: usize| {
+            let covered = drawn.transmittance.iter().map(|left| 1.0 - left);
+            let parts = drawn.rgb.iter().zip(covered);
+            parts.map(|(rgb, covered)| if covered < COVERED { 0.0 } else { rgb[channel] / covered }).collect()
+        };
+        Ok(Carried { object: of(0), evidence: of(1) })
+    }
+}
+
+impl Carried {
+    /// Which part of the object's pixels the masked views have not seen; nothing where the object is out of view.
+    pub fn thinness(&self) -> Option<f64> {
+        let object = || self.object.iter().zip(&self.evidence).filter(|(object, _)| **object > 0.5);
+        let unseen = object().filter(|(_, evidence)| **evidence < 0.5).count();
+        let all = object().count();
+        (all > 0).then(|| unseen as f64 / all as f64)
+    }
+}
+
+/// The mask where more than the part `least` of a pixel is the object: `parts` (width, height `from`) brought to the size
+/// `to`.
+pub fn threshold(parts: &[f32], from: [u32; 2], to: [u32; 2], least: f32) -> GrayImage {
+    let large = resample::map(parts, from, to);
+    GrayImage::from_fn(to[0], to[1], |x, y| Luma([if large[(y * to[0] + x) as usize] > least { 255 } else { 0 }]))
+}
+
+/// The mask's part of each pixel of a picture of the size `to`.
+pub fn parts(mask: &GrayImage, to: [u32; 2]) -> Vec<f32> {
+    let values: Vec<f32> = mask.as_raw().iter().map(|v| f32::from(*v != 0)).collect();
+    resample::map(&values, [mask.width(), mask.height()], to)
+}
+
+/// Takes away specks: 8-connected pieces of less than `share` of the largest one.
+pub fn without_specks(mask: &GrayImage, share: f64) -> GrayImage {
+    let (w, h) = (mask.width() as usize, mask.height() as usize);
+    let raw = mask.as_raw();
+    let mut label = vec![0usize; w * h];
+    let mut sizes = vec![0usize];
+    for start in 0..w * h {
+        if raw[start] == 0 || label[start] != 0 {
+            continue;
+        }
+        let this = sizes.len();
+        sizes.push(0);
+        let mut stack = vec![start];
+        label[start] = this;
+        while let Some(at) = stack.pop() {
+            sizes[this] += 1;
+            let (x, y) = (at % w, at / w);
+            for v in y.saturating_sub(1)..(y + 2).min(h) {
+                for u in x.saturating_sub(1)..(x + 2).min(w) {
+                    let next = v * w + u;
+                    if raw[next] != 0 && label[next] == 0 {
+                        label[next] = this;
+                        stack.push(next);
+                    }
+                }
+            }
+        }
+    }
+    let least = share * sizes.iter().copied().max().unwrap_or(0) as f64;
+    let raw = label.iter().map(|l| if *l != 0 && sizes[*l] as f64 >= least { 255 } else { 0 }).collect();
+    GrayImage::from_raw(mask.width(), mask.height(), raw).expect("a value per pixel")
+}
+
+/// Intersection over union of two masks of one size; 1 if both are empty.
+pub fn iou(a: &GrayImage, b: &GrayImage) -> f64 {
+    let (mut both, mut any) = (0u64, 0u64);
+    for (a, b) in a.as_raw().iter().zip(b.as_raw()) {
+        both += u64::from(*a != 0 && *b != 0);
+        any += u64::from(*a != 0 || *b != 0);
+    }
+    if any == 0 { 1.0 } else { both as f64 / any as f64 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn mask(rows: &[&str]) -> GrayImage {
+        let (w, h) = (rows[0].len() as u32, rows.len() as u32);
+        GrayImage::from_fn(w, h, |x, y| Luma([if rows[y as usize].as_bytes()[x as usize] == b'#' { 255 } else { 0 }]))
+    }
+
+    #[test]
+    fn overlap() {
+        let (a, b) = (mask(&["##.", "##."]), mask(&[".##", ".##"]));
+        assert_eq!(iou(&a, &b), 2.0 / 6.0);
+        assert_eq!((iou(&a, &a), iou(&a, &mask(&["...", "..."]))), (1.0, 0.0));
+        assert_eq!(iou(&mask(&["..."]), &mask(&["..."])), 1.0);
+    }
+
+    #[test]
+    fn specks_go_and_pieces_stay() {
+        let found = without_specks(&mask(&["###...", "###..#", ".....#", "#....#"]), 0.3);
+        // Six, three (half of six) and one, which is less than 0.3 of six.
+        assert_eq!(found, mask(&["###...", "###..#", ".....#", "......"]));
+        assert_eq!(without_specks(&mask(&["..."]), 0.5), mask(&["..."]));
+    }
+
+    #[test]
+    fn sizes_change_by_area_and_back() {
+        let large = mask(&["##..", "##..", "#...", "...."]);
+        let small = parts(&large, [2, 2]);
+        assert_eq!(small, [1.0, 0.0, 0.25, 0.0]);
+        assert_eq!(threshold(&small, [2, 2], [2, 2], 0.5), mask(&["#.", ".."]));
+    }
+
+    /// Four anchors of two Gaussians each: inside, outside, and two that were not seen, as near to the one as to the other,
+    /// but of their colours.
+    #[test]
+    fn votes_are_counted_by_gaussian_anchor_and_likeness() {
+        let votes = Votes {
+            inside: vec![20.0, 0.0, 0.0, 1.0, 0.0, 0.2, 0.0, 0.0],
+            all: vec![20.0, 0.0, 19.0, 1.0, 0.0, 0.2, 0.0, 0.0],
+        };
+        let positions = [[0.0; 3], [1.0, 0.0, 0.0], [0.5, 0.1, 0.0], [0.5, -0.1, 0.0]];
+        let (red, grey) = ([0.8, 0.2, 0.1], [0.5; 3]);
+        let shares = votes.count(&positions, &[red, grey, grey, red]);
+        let near = |a: f32, b: f32| (a - b).abs() < 1e-6;
+        assert!(near(shares.object[0], 1.0) && near(shares.object[1], 1.0));
+        // (0 + 0.05) / 20 and (1 + 0.05) / 2, with the anchor's 1 / 20 as a vote of one pixel.
+        assert!(near(shares.object[2], 0.0025) && near(shares.object[3], 0.525));
+        // With two seen anchors only, both are asked: half of each.
+        assert!(near(shares.object[6], 0.525));
+        assert_eq!(shares.seen, [true, true, true, true, false, false, false, false]);
+        // Nobody was seen at all.
+        let votes = Votes { inside: vec![0.0; 2], all: vec![0.0; 2] };
+        assert_eq!(votes.count(&[[0.0; 3]], &[grey]).object, [0.0; 2]);
+    }
+
+    /// Among many seen anchors of two colours, one that was not seen follows those of its own colour.
+    #[test]
+    fn unseen_anchors_follow_their_like() {
+        let n = 40;
+        let positions: Vec<[f32; 3]> = (0..n).map(|i| [(i / 2) as f32 * 0.1, (i % 2) as f32 * 0.05, 0.0]).collect();
+        let colors: Vec<[f32; 3]> = (0..n).map(|i| if i % 2 == 0 { [0.8, 0.2, 0.1] } else { [0.5; 3] }).collect();
+        let mut votes = Votes { inside: vec![0.0; n], all: vec![10.0; n] };
+        (0..n).step_by(2).for_each(|i| votes.inside[i] = 10.0);
+        for unseen in [20, 21] {
+            (votes.inside[unseen], votes.all[unseen]) = (0.0, 0.0);
+        }
+        let shares = votes.count(&positions, &colors);
+        assert_eq!((shares.object[20], shares.object[21]), (1.0, 0.0));
+    }
+}

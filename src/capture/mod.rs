@@ -1,0 +1,620 @@
+#![doc = include_str!("README.md")]
+
+pub mod depth;
+pub mod doctor;
+pub mod fit;
+pub mod graph_cut;
+pub mod masks;
+pub mod patchmatch;
+pub mod poses;
+pub mod record;
+pub mod reference;
+pub mod sheet;
+pub mod splats;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use image::GrayImage;
+
+use crate::gpu::{self, Gpu};
+use crate::scene::{self, Scene, resample};
+use crate::train::checkpoint::Fingerprint;
+
+use fit::Fit;
+use poses::Capture;
+use record::{Batch, Folder, Inputs};
+use splats::Splats;
+
+/// Why a capture cannot become a scene. Each message is one sentence that says what is wrong and what to do.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The operating system refused.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// The system's words.
+        source: std::io::Error,
+    },
+    /// A file or folder that contradicts itself or the others.
+    #[error("{}: {what}", path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong and what to do.
+        what: String,
+    },
+    /// What was asked for cannot be.
+    #[error("{0}")]
+    Request(String),
+    /// Photographs, model, masks.
+    #[error(transparent)]
+    Scene(#[from] scene::Error),
+    /// The device.
+    #[error(transparent)]
+    Gpu(#[from] gpu::Error),
+    /// The fit.
+    #[error("the fit to the photographs: {0}")]
+    Fit(#[from] crate::train::run::Error),
+    /// The fit's files.
+    #[error(transparent)]
+    Model(#[from] crate::model::files::Error),
+    /// Photographs alone, and no COLMAP.
+    #[error(
+        "{}: no sparse/ with a COLMAP model, no transforms.json, and the program colmap is not installed to find the cameras \
+         with; install it (Debian: apt install colmap), or bring a model",
+        folder.display()
+    )]
+    NoPoses {
+        /// The photographs.
+        folder: PathBuf,
+    },
+    /// The `colmap` program gave up.
+    #[error("colmap {command} failed: {what}")]
+    Colmap {
+        /// Its command.
+        command: String,
+        /// The last line it wrote.
+        what: String,
+    },
+}
+
+/// The steps, in their order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Step {
+    /// Photographs and cameras in the plain layout.
+    Poses,
+    /// A short plain fit, which the others look at.
+    Fit,
+    /// The object in every view.
+    Masks,
+    /// Depth priors.
+    Depth,
+    /// The reference view without the object.
+    Reference,
+}
+
+impl Step {
+    /// All of them.
+    pub const ALL: [Self; 5] = [Self::Poses, Self::Fit, Self::Masks, Self::Depth, Self::Reference];
+
+    /// Its name in the record and on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Poses => "poses",
+            Self::Fit => "fit",
+            Self::Masks => "masks",
+            Self::Depth => "depth",
+            Self::Reference => "reference",
+        }
+    }
+}
+
+/// How the user says what the object is in a view.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Evidence {
+    /// A mask, not 0 on the object.
+    Mask(PathBuf),
+    /// A box around it: x0, y0 and one past x1, y1, in pixels of the photograph.
+    Box([u32; 4]),
+    /// A picture of strokes: white or green on the object, black or red beside it, transparent or grey elsewhere.
+    Strokes(PathBuf),
+}
+
+/// What to make of which photographs.
+#[derive(Clone, Debug)]
+pub struct Request {
+    /// Folder of the photographs.
+    pub photographs: PathBuf,
+    /// Folder of the scene.
+    pub out: PathBuf,
+    /// The object, by the name of a view.
+    pub object: Vec<(String, Evidence)>,
+    /// Name of the reference view; otherwise the one whose hole is seen best by others.
+    pub reference: Option<String>,
+    /// The steps to run, whose inputs must be there; all if empty.
+    pub only: Vec<Step>,
+    /// Steps of the fit.
+    pub fit_steps: u32,
+    /// The longer side of the pictures that the fit is made with, pixels.
+    pub fit_side: u32,
+    /// Whether depth priors are written, NaN where nothing is known.
+    pub depth: bool,
+    /// Seed of every random choice.
+    pub seed: u64,
+}
+
+impl Request {
+    /// A request for everything with the default sizes.
+    pub fn new(photographs: impl Into<PathBuf>, out: impl Into<PathBuf>) -> Self {
+        Self {
+            photographs: photographs.into(),
+            out: out.into(),
+            object: vec![],
+            reference: None,
+            only: vec![],
+            fit_steps: 600,
+            fit_side: 256,
+            depth: false,
+            seed: 0,
+        }
+    }
+
+    fn wants(&self, step: Step) -> bool {
+        if self.only.is_empty() { step != Step::Depth || self.depth } else { self.only.contains(&step) }
+    }
+}
+
+/// Watches a preparation: progress bars.
+pub trait Watch {
+    /// A step begins, of so many units.
+    fn begin(&mut self, _step: Step, _units: u64) {}
+    /// So many units of it are done.
+    fn at(&mut self, _unit: u64) {}
+    /// A step has ended.
+    fn end(&mut self) {}
+    /// Something worth a line.
+    fn say(&mut self, _line: &str) {}
+    /// Whether to end; asked during the fit.
+    fn interrupted(&mut self) -> Option<crate::train::run::Signal> {
+        None
+    }
+}
+
+/// Watches nothing.
+pub struct Silent;
+impl Watch for Silent {}
+
+/// Width and height of a picture file.
+pub(crate) fn picture_size(path: &Path) -> Result<[u32; 2], Error> {
+    let failed = |source| Error::Io { path: path.to_owned(), source };
+    let reader = image::ImageReader::open(path).map_err(failed)?.with_guessed_format().map_err(failed)?;
+    let (w, h) = reader
+        .into_dimensions()
+        .map_err(|source| Error::Scene(scene::Error::Picture { path: path.to_owned(), source }))?;
+    Ok([w, h])
+}
+
+/// Makes a scene of photographs.
+///
+/// # Errors
+/// See [`Error`]. What steps before have written stays.
+pub fn prepare(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<(), Error> {
+    let mut capture = poses::find(&request.photographs)?;
+    // In a scene that is made in its own capture's folder the masks may be the program's; `corrected` tells them apart.
+    let own = request.out.join("masks").canonicalize();
+    capture.masks.retain(|_, (path, _)| {
+        !path.canonicalize().is_ok_and(|path| own.as_ref().is_ok_and(|own| path.starts_with(own)))
+    });
+    // Mistakes in what the user named are found before anything is written.
+    let mut object = given(&capture, request)?;
+    let mut folder = Folder::open(&request.out)?;
+    object.extend(corrected(&folder, &capture, &object)?);
+    if object.is_empty() && request.wants(Step::Masks) && request.only.is_empty() {
+        return Err(Error::Request(
+            "what is to be removed? name one view and its mask, --mask NAME=FILE.png, or a box around the object, --box \
+             NAME=x0,y0,x1,y1"
+                .into(),
+        ));
+    }
+    let mut preparation = Preparation { gpu, request, folder: &mut folder, watch };
+    if request.wants(Step::Poses) {
+        preparation.poses(&capture)?;
+    }
+    if request.only.iter().all(|step| *step == Step::Poses) && !request.only.is_empty() {
+        return Ok(());
+    }
+    let scene = preparation.small()?;
+    if scene.train.len() < 3 {
+        return Err(Error::Request(format!(
+            "{}: {} photographs with a camera are too few; three are the least that can agree on anything",
+            request.photographs.display(),
+            scene.train.len()
+        )));
+    }
+    if let Some(name) = request.reference.as_ref().filter(|name| !scene.train.iter().any(|v| v.name == **name)) {
+        return Err(no_such_view(name, "--reference", scene.train.iter().map(|v| v.name.as_str())));
+    }
+    let fit = preparation.fit(&scene)?;
+    let mut splats = Splats::new(gpu, &fit.anchors, &fit.weights, &fit.settings.render)?;
+    let masked = |preparation: &Preparation<'_>| preparation.masks_on_disk(&scene);
+    if request.wants(Step::Masks) {
+        preparation.masks(&scene, &fit, &mut splats, &object)?;
+    }
+    if request.wants(Step::Depth) {
+        let masks = masked(&preparation)?;
+        preparation.depth(&scene, &mut splats, &masks)?;
+    }
+    if request.wants(Step::Reference) {
+        let masks = masked(&preparation)?;
+        preparation.reference(&scene, &fit, &mut splats, &masks)?;
+    }
+    Ok(())
+}
+
+/// A mask that was given or derived from a box, as large as the photograph, and what it was made from.
+struct Given {
+    mask: GrayImage,
+    from: String,
+}
+
+fn no_such_view<'a>(name: &str, option: &str, views: impl Iterator<Item = &'a str>) -> Error {
+    let names: Vec<&str> = views.collect();
+    let near = names.iter().max_by(|a, b| strsim::jaro(a, name).total_cmp(&strsim::jaro(b, name)));
+    let hint = near.map_or_else(String::new, |near| format!(" (did you mean {near}?)"));
+    Error::Request(format!("{option} {name}: no photograph has this name{hint}"))
+}
+
+/// The masks that the user named.
+fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>, Error> {
+    let mut all = BTreeMap::new();
+    for (name, (path, inverted)) in &capture.masks {
+        // Masks of no photograph are not this scene's.
+        let Some(photograph) = capture.photographs.get(name) else { continue };
+        let size = picture_size(photograph)?;
+        let mut mask = scene::mask(path, 1)?;
+        if *inverted {
+            mask.iter_mut().for_each(|v| *v = 255 - *v);
+        }
+        // Of those that came with the photographs an empty one is a view without the object.
+        let mask = checked(path, mask, size, true)?;
+        all.insert(name.clone(), Given { mask, from: format!("{}", path.display()) });
+    }
+    for (name, evidence) in &request.object {
+        let stem = scene::stem(name).to_owned();
+        let option = match evidence {
+            Evidence::Mask(_) => "--mask",
+            Evidence::Box(_) => "--box",
+            Evidence::Strokes(_) => "--strokes",
+        };
+        let Some(photograph) = capture.photographs.get(&stem) else {
+            return Err(no_such_view(name, option, capture.photographs.keys().map(String::as_str)));
+        };
+        let size = picture_size(photograph)?;
+        let given = match evidence {
+            Evidence::Mask(path) => {
+                let mask = checked(path, scene::mask(path, 1)?, size, false)?;
+                Given { mask, from: format!("--mask {}", path.display()) }
+            }
+            Evidence::Box(bounds) => {
+                let [x0, y0, x1, y1] = *bounds;
+                if x0 >= x1 || y0 >= y1 || x1 > size[0] || y1 > size[1] {
+                    return Err(Error::Request(format!(
+                        "--box {name}={x0},{y0},{x1},{y1}: not a box within the photograph, which is {}x{}; give x0,y0,x1,y1 \
+                         with x0 < x1 and y0 < y1",
+                        size[0], size[1]
+                    )));
+                }
+                let picture = scene::photograph(photograph, 1)?;
+                let mask = graph_cut::from_box(&picture, *bounds).ok_or_else(|| {
+                    Error::Request(format!(
+                        "--box {name}={x0},{y0},{x1},{y1}: nothing in the box differs from what is around it; draw it closer, \
+                         or give a mask"
+                    ))
+                })?;
+                Given { mask, from: format!("--box {x0},{y0},{x1},{y1} and a graph cut") }
+            }
+            Evidence::Strokes(path) => {
+                let picture = scene::photograph(photograph, 1)?;
+                let strokes = graph_cut::Strokes::read(path, size)?;
+                Given {
+                    mask: graph_cut::from_strokes(&picture, &strokes),
+                    from: format!("--strokes {}", path.display()),
+                }
+            }
+        };
+        all.insert(stem, given);
+    }
+    Ok(all)
+}
+
+/// Masks in the scene's folder that are not the program's own: the user has put or corrected them there.
+fn corrected(
+    folder: &Folder,
+    capture: &Capture,
+    given: &BTreeMap<String, Given>,
+) -> Result<BTreeMap<String, Given>, Error> {
+    let masks = folder.root().join("masks");
+    let mut all = BTreeMap::new();
+    if !masks.is_dir() {
+        return Ok(all);
+    }
+    for (name, path) in scene::pictures(&masks)? {
+        let relative = path.strip_prefix(folder.root()).unwrap_or(&path).to_string_lossy().into_owned();
+        let Some(photograph) = capture.photographs.get(&name) else { continue };
+        if !given.contains_key(&name) && folder.is_users(&relative)? {
+            let mask = checked(&path, scene::mask(&path, 1)?, picture_size(photograph)?, true)?;
+            all.insert(name, Given { mask, from: USERS.into() });
+        }
+    }
+    Ok(all)
+}
+
+/// A mask as large as its photograph that is neither full nor, unless that is allowed, empty.
+fn checked(path: &Path, mask: GrayImage, size: [u32; 2], may_be_empty: bool) -> Result<GrayImage, Error> {
+    let found = [mask.width(), mask.height()];
+    let refuse = |what: String| Err(Error::File { path: path.to_owned(), what });
+    if found != size {
+        let ratio = |s: [u32; 2]| f64::from(s[0]) / f64::from(s[1]);
+        if (ratio(found) / ratio(size) - 1.0).abs() > 0.01 {
+            return Err(scene::Error::MaskSize { path: path.to_owned(), size: found, picture: size }.into());
+        }
+    }
+    let mask = if found == size { mask } else { resample::nearest(&mask, size) };
+    let object = mask.as_raw().iter().filter(|v| **v != 0).count();
+    if object == mask.as_raw().len() {
+        return refuse("the mask covers the whole picture; the object must be the part that is not black".into());
+    }
+    if object == 0 && !may_be_empty {
+        return refuse("the mask is empty; paint the object in any colour but black".into());
+    }
+    Ok(mask)
+}
+
+/// A preparation under way.
+struct Preparation<'a> {
+    gpu: &'a Gpu,
+    request: &'a Request,
+    folder: &'a mut Folder,
+    watch: &'a mut dyn Watch,
+}
+
+impl Preparation<'_> {
+    /// Whether a step has nothing to do, which is said.
+    fn skips(&mut self, step: Step, inputs: &str) -> bool {
+        let fresh = self.folder.is_fresh(step.name(), inputs);
+        if fresh {
+            self.watch.say(&format!("{}: nothing has changed", step.name()));
+        }
+        fresh
+    }
+
+    fn write(&mut self, step: Step, inputs: String, batch: Batch) -> Result<(), Error> {
+        for note in &batch.notes {
+            self.watch.say(&format!("{}: {note}", step.name()));
+        }
+        let kept = self.folder.write(step.name(), inputs, batch)?;
+        if let Some(first) = kept.first() {
+            let many = if kept.len() > 1 { format!(" and {} more", kept.len() - 1) } else { String::new() };
+            self.watch.say(&format!("{}: {first}{many} not written: the user's own file is there", step.name()));
+        }
+        Ok(())
+    }
+
+    fn poses(&mut self, capture: &Capture) -> Result<(), Error> {
+        let inputs = capture.inputs()?;
+        if self.skips(Step::Poses, &inputs) {
+            return Ok(());
+        }
+        self.watch.begin(Step::Poses, 1);
+        let watch = &mut *self.watch;
+        let batch = capture.collect(&self.request.out, &mut |line| watch.say(line))?;
+        self.write(Step::Poses, inputs, batch)?;
+        self.watch.end();
+        Ok(())
+    }
+
+    /// The scene at the size of the fit, without anything but photographs, cameras and points.
+    fn small(&mut self) -> Result<Scene, Error> {
+        self.load(self.request.fit_side)
+    }
+
+    /// The photographs with their cameras, the longer side of the largest at most about `side` pixels.
+    fn load(&self, side: u32) -> Result<Scene, Error> {
+        let images = self.folder.root().join(poses::IMAGES);
+        let mut longest = 1;
+        for path in scene::pictures(&images)?.values() {
+            longest = longest.max(picture_size(path)?.into_iter().max().unwrap_or(1));
+        }
+        let downscale = ((f64::from(longest) / f64::from(side)).round() as u32).max(1);
+        let config =
+            scene::Config { downscale, masks: false, priors: false, reference: false, ..scene::Config::default() };
+        let mut scene = scene::load(self.folder.root(), &config)?;
+        scene.test.clear();
+        Ok(scene)
+    }
+
+    fn fit(&mut self, scene: &Scene) -> Result<Fit, Error> {
+        let settings = fit::settings(self.request, scene.points.len());
+        let fingerprint = serde_json::to_string(&Fingerprint::of(scene)).expect("names and hashes");
+        let inputs = Inputs::default().with(fingerprint).with(settings.to_toml()).finish();
+        if self.skips(Step::Fit, &inputs) {
+            return Fit::read(self.folder.root(), settings);
+        }
+        if !self.request.wants(Step::Fit) && self.folder.record().steps.contains_key(Step::Fit.name()) {
+            self.watch.say("fit: the photographs or the settings have changed since; the fit is made again");
+        }
+        self.watch.begin(Step::Fit, u64::from(settings.train.iterations));
+        let (batch, fit) = fit::make(self.gpu, scene, settings, self.watch)?;
+        self.write(Step::Fit, inputs, batch)?;
+        self.watch.end();
+        Ok(fit)
+    }
+
+    /// What of the fit counts as input of a step behind it.
+    fn fit_hash(&self) -> String {
+        self.folder.record().steps.get(Step::Fit.name()).map_or_else(String::new, |step| {
+            step.files.values().map(|file| file.hash.as_str()).collect::<Vec<_>>().join(" ")
+        })
+    }
+
+    fn masks(
+        &mut self,
+        scene: &Scene,
+        fit: &Fit,
+        splats: &mut Splats,
+        given: &BTreeMap<String, Given>,
+    ) -> Result<(), Error> {
+        let mut inputs = Inputs::default().with(self.fit_hash());
+        for (name, Given { mask, from }) in given {
+            inputs = inputs.with(name).with(mask.as_raw()).with(from);
+        }
+        let inputs = inputs.finish();
+        if self.skips(Step::Masks, &inputs) {
+            return Ok(());
+        }
+        let posed = |name: &str| scene.train.iter().any(|view| view.name == name);
+        if let Some(name) = given.keys().find(|name| !posed(name)) {
+            return Err(Error::Request(format!(
+                "{name}: the model has no camera for this photograph; mask another one"
+            )));
+        }
+        if given.is_empty() {
+            return Err(Error::Request("no view has a mask yet: name one with --mask NAME=FILE.png".into()));
+        }
+        let files = scene::pictures(&self.folder.root().join(poses::IMAGES))?;
+        self.watch.begin(Step::Masks, (given.len() + scene.train.len()) as u64);
+        let mut votes = masks::Votes::new(splats);
+        let mut unit = 0;
+        for view in &scene.train {
+            if let Some(Given { mask, .. }) = given.get(&view.name) {
+                votes.add(splats, &view.camera, &masks::parts(mask, view.camera.size))?;
+                unit += 1;
+                self.watch.at(unit);
+            }
+        }
+        let colors = masks::colors(splats, &scene.train)?;
+        let shares = votes.count(&fit.anchors.position, &colors);
+        let mut batch = Batch::default();
+        let names: Vec<&str> = given.keys().map(String::as_str).collect();
+        let from = format!("carried from {}", abridged(&names));
+        let (mut thin, mut shown): (Vec<(f64, &str)>, usize) = (vec![], 0);
+        for view in &scene.train {
+            let path = format!("masks/{}.png", view.name);
+            let mask = match given.get(&view.name) {
+                Some(Given { mask, from }) => {
+                    if from != USERS {
+                        batch.gray(path, mask, from.clone());
+                    }
+                    mask.clone()
+                }
+                None => {
+                    let carried = shares.carry(splats, &view.camera)?;
+                    let mask = masks::threshold(
+                        &carried.object,
+                        view.camera.size,
+                        picture_size(&files[&view.name])?,
+                        masks::OBJECT,
+                    );
+                    let mask = masks::without_specks(&mask, SPECK);
+                    thin.extend(carried.thinness().map(|part| (part, view.name.as_str())));
+                    batch.gray(path, &mask, from.clone());
+                    mask
+                }
+            };
+            shown += usize::from(mask.as_raw().iter().any(|v| *v != 0));
+            unit += 1;
+            self.watch.at(unit);
+        }
+        if shown < 3 {
+            batch.notes.push(format!(
+                "the object is in {shown} of {} views only: what is behind it is hardly seen from elsewhere",
+                scene.train.len()
+            ));
+        }
+        thin.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let weak: Vec<&(f64, &str)> = thin.iter().filter(|(part, _)| *part > THIN).collect();
+        if let Some((part, name)) = weak.first() {
+            batch.notes.push(format!(
+                "{} views show sides of the object that the given masks do not; please mask {name} as well (--mask {name}=...): \
+                 {:.0} % of the object there were not seen",
+                weak.len(),
+                100.0 * part
+            ));
+        }
+        batch.figures.insert("views with the object".into(), shown as f64);
+        self.write(Step::Masks, inputs, batch)?;
+        self.watch.end();
+        Ok(())
+    }
+
+    /// The masks that the scene has now, by view, as large as the photographs; an error unless all are there.
+    fn masks_on_disk(&self, scene: &Scene) -> Result<Vec<GrayImage>, Error> {
+        let folder = self.folder.root().join("masks");
+        let files = if folder.is_dir() { scene::pictures(&folder)? } else { BTreeMap::new() };
+        let read = |view: &scene::View| {
+            let path = files.get(&view.name).ok_or_else(|| Error::File {
+                path: folder.clone(),
+                what: format!("there is no mask of {}; run the step masks first", view.name),
+            })?;
+            Ok(scene::mask(path, 1)?)
+        };
+        scene.train.iter().map(read).collect()
+    }
+
+    fn inputs_behind_masks(&self, masks: &[GrayImage]) -> Inputs {
+        masks.iter().fold(Inputs::default().with(self.fit_hash()), |inputs, mask| inputs.with(mask.as_raw()))
+    }
+
+    fn depth(&mut self, scene: &Scene, splats: &mut Splats, masks: &[GrayImage]) -> Result<(), Error> {
+        let inputs = self.inputs_behind_masks(masks).finish();
+        if self.skips(Step::Depth, &inputs) {
+            return Ok(());
+        }
+        self.watch.begin(Step::Depth, 2 * scene.train.len() as u64);
+        let batch = depth::make(scene, splats, masks, self.watch)?;
+        self.write(Step::Depth, inputs, batch)?;
+        self.watch.end();
+        Ok(())
+    }
+
+    fn reference(&mut self, scene: &Scene, fit: &Fit, splats: &mut Splats, masks: &[GrayImage]) -> Result<(), Error> {
+        let named = self.request.reference.clone().unwrap_or_default();
+        let inputs = self.inputs_behind_masks(masks).with(named).with([u8::from(self.request.depth)]).finish();
+        if self.skips(Step::Reference, &inputs) {
+            return Ok(());
+        }
+        let fine = self.load(reference::SIDE)?;
+        self.watch.begin(Step::Reference, 2 * scene.train.len() as u64 + 4);
+        let task = reference::Task {
+            scene,
+            fine: &fine,
+            root: self.folder.root(),
+            masks,
+            named: self.request.reference.as_deref(),
+            depth: self.request.depth,
+            seed: self.request.seed,
+        };
+        let batch = reference::make(&task, fit, splats, self.watch)?;
+        self.write(Step::Reference, inputs, batch)?;
+        self.watch.end();
+        Ok(())
+    }
+}
+
+/// A view shows a side of the object that no masked view shows if more than this part of the object there is unseen.
+const THIN: f64 = 0.3;
+/// Pieces of a carried mask that are smaller than this share of its largest piece are taken away.
+const SPECK: f64 = 0.02;
+
+/// What the masks of the user's own are made from.
+const USERS: &str = "the user's own";
+/// The first names of a list.
+fn abridged(names: &[&str]) -> String {
+    match names {
+        [] => "nothing".into(),
+        [.., _] if names.len() <= 3 => names.join(", "),
+        _ => format!("{} and {} more", names[..2].join(", "), names.len() - 2),
+    }
+}

@@ -1,0 +1,544 @@
+//! Photographs and their cameras: an existing COLMAP model, nerfstudio's `transforms.json`, or photographs alone through
+//! the `colmap` program.
+
+use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use glam::{DMat3, DQuat, DVec3, dvec3};
+use rand::RngExt;
+use rand_pcg::Pcg64;
+use serde::Deserialize;
+
+use super::Error;
+use super::record::{self, Batch, Inputs};
+use crate::scene::{self, undistort};
+
+/// Where a scene keeps its photographs and its model.
+pub const IMAGES: &str = "images";
+const MODEL: &str = "sparse/0";
+/// Kept as they are where a capture has them.
+const TEST: [&str; 2] = ["test_images", "test_masks"];
+
+/// What was given.
+#[derive(Debug)]
+pub struct Capture {
+    folder: PathBuf,
+    source: Source,
+    /// Photographs by name: the path below their folder, without extension.
+    pub photographs: BTreeMap<String, PathBuf>,
+    /// Masks that came with the photographs, and whether they are 0 on the object.
+    pub masks: BTreeMap<String, (PathBuf, bool)>,
+    depths: BTreeMap<String, PathBuf>,
+}
+
+#[derive(Debug)]
+enum Source {
+    /// Files of a COLMAP model.
+    Colmap(Vec<PathBuf>),
+    Transforms {
+        file: PathBuf,
+        transforms: Box<Transforms>,
+        /// Name of each frame's photograph.
+        names: Vec<String>,
+    },
+    /// The folder of the photographs.
+    Photographs(PathBuf),
+}
+
+/// nerfstudio's `transforms.json`, as far as it is read.
+#[derive(Debug, Deserialize)]
+struct Transforms {
+    #[serde(flatten)]
+    lens: Lens,
+    camera_model: Option<String>,
+    frames: Vec<Frame>,
+    ply_file_path: Option<String>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Frame {
+    file_path: String,
+    transform_matrix: Vec<Vec<f64>>,
+    mask_path: Option<String>,
+    depth_file_path: Option<String>,
+    #[serde(flatten)]
+    lens: Lens,
+}
+
+/// Intrinsics; those of a frame win over those of all.
+#[derive(Clone, Copy, Debug, Default, Deserialize)]
+struct Lens {
+    w: Option<f64>,
+    h: Option<f64>,
+    fl_x: Option<f64>,
+    fl_y: Option<f64>,
+    camera_angle_x: Option<f64>,
+    cx: Option<f64>,
+    cy: Option<f64>,
+    k1: Option<f64>,
+    k2: Option<f64>,
+    k3: Option<f64>,
+    p1: Option<f64>,
+    p2: Option<f64>,
+}
+
+/// A camera of OPENCV's model and a pose, as COLMAP writes them.
+#[derive(Clone, Debug, PartialEq)]
+struct Shot {
+    name: String,
+    size: [u32; 2],
+    /// fx fy cx cy k1 k2 p1 p2.
+    parameters: [f64; 8],
+    /// World to camera.
+    rotation: DQuat,
+    translation: DVec3,
+}
+
+/// Finds out what a folder of photographs comes with.
+///
+/// # Errors
+/// No photographs; a `transforms.json` that cannot be read or names files that are not there.
+pub fn find(folder: &Path) -> Result<Capture, Error> {
+    if !folder.is_dir() {
+        return Err(Error::File { path: folder.to_owned(), what: "there is no such folder".into() });
+    }
+    let transforms = folder.join("transforms.json");
+    let model = model_files(folder);
+    if model.is_none() && transforms.is_file() {
+        return from_transforms(folder, &transforms);
+    }
+    let images = ["images", "images_2", "images_4", "images_8"].map(|name| folder.join(name));
+    let images = images.into_iter().find(|path| path.is_dir()).unwrap_or_else(|| folder.to_owned());
+    let photographs = scene::pictures(&images)?;
+    if photographs.is_empty() {
+        return Err(scene::Error::NoImages { scene: folder.to_owned() }.into());
+    }
+    let masks = if images == folder { BTreeMap::new() } else { existing(&folder.join("masks"))? };
+    let masks = masks.into_iter().map(|(name, path)| (name, (path, false))).collect();
+    let source = model.map_or(Source::Photographs(images), Source::Colmap);
+    Ok(Capture { folder: folder.to_owned(), source, photographs, masks, depths: BTreeMap::new() })
+}
+
+fn existing(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Error> {
+    if folder.is_dir() { Ok(scene::pictures(folder)?) } else { Ok(BTreeMap::new()) }
+}
+
+/// The files of the model under `folder`, if there is one.
+fn model_files(folder: &Path) -> Option<Vec<PathBuf>> {
+    let stems = ["cameras", "images", "points3D"];
+    ["sparse/0", "sparse"].map(|name| folder.join(name)).into_iter().find_map(|model| {
+        let files = |stem: &str| ["bin", "txt", "ply"].map(|e| model.join(stem).with_extension(e));
+        let found: Vec<PathBuf> = stems.iter().flat_map(|stem| files(stem)).filter(|path| path.is_file()).collect();
+        let has = |stem: &str| found.iter().any(|path| path.file_stem().is_some_and(|s| s == stem));
+        (has("cameras") && has("images")).then_some(found)
+    })
+}
+
+impl Capture {
+    /// Where the cameras come from, in words.
+    pub fn origin(&self) -> String {
+        match &self.source {
+            Source::Colmap(_) => "the COLMAP model that came with the photographs".into(),
+            Source::Transforms { file, .. } => format!("{}", file.display()),
+            Source::Photographs(_) => "the program colmap, from the photographs alone".into(),
+        }
+    }
+
+    /// Whether the scene is to be made in the capture's own folder.
+    fn in_place(&self, out: &Path) -> bool {
+        let canonical = |path: &Path| path.canonicalize().ok();
+        canonical(&self.folder).is_some_and(|own| canonical(out) == Some(own))
+    }
+
+    /// The hash of all that [`Capture::collect`] reads.
+    ///
+    /// # Errors
+    /// A file that cannot be read.
+    pub fn inputs(&self) -> Result<String, Error> {
+        let mut inputs = Inputs::default();
+        let mut add = |name: &str, path: &Path| -> Result<(), Error> {
+            inputs = std::mem::take(&mut inputs).with(name).with(record::hash(path)?);
+            Ok(())
+        };
+        self.photographs.iter().chain(&self.depths).try_for_each(|(name, path)| add(name, path))?;
+        match &self.source {
+            Source::Colmap(files) => files.iter().try_for_each(|path| add("model", path))?,
+            Source::Transforms { file, transforms, .. } => {
+                add("transforms", file)?;
+                if let Some(points) = &transforms.ply_file_path {
+                    add("points", &self.folder.join(points))?;
+                }
+            }
+            Source::Photographs(_) => {}
+        }
+        for folder in TEST {
+            existing(&self.folder.join(folder))?.iter().try_for_each(|(name, path)| add(name, path))?;
+        }
+        Ok(inputs.finish())
+    }
+
+    /// The photographs and the model in the plain layout, for a scene in `out`.
+    ///
+    /// # Errors
+    /// Unreadable files; poses that cannot be found.
+    pub fn collect(&self, out: &Path, say: &mut dyn FnMut(&str)) -> Result<Batch, Error> {
+        let mut batch = Batch::default();
+        let in_place = self.in_place(out);
+        if !in_place || matches!(self.source, Source::Photographs(_) | Source::Transforms { .. }) {
+            for (name, path) in &self.photographs {
+                let extension = path.extension().map_or_else(|| "png".into(), |e| e.to_string_lossy().to_lowercase());
+                let target = format!("{IMAGES}/{name}.{extension}");
+                if out.join(&target).canonicalize().ok() != path.canonicalize().ok() || !out.join(&target).exists() {
+                    batch.copy(target, path, "the photographs");
+                }
+            }
+        }
+        for (name, path) in &self.depths {
+            let extension = path.extension().map_or_else(|| "png".into(), |e| e.to_string_lossy().to_lowercase());
+            batch.copy(format!("depth/{name}.{extension}"), path, "transforms.json: depth_file_path");
+        }
+        if !in_place {
+            for folder in TEST {
+                for path in existing(&self.folder.join(folder))?.values() {
+                    let relative = path.strip_prefix(&self.folder).unwrap_or(path);
+                    batch.copy(relative.to_string_lossy(), path, "the photographs");
+                }
+            }
+        }
+        match &self.source {
+            Source::Colmap(files) => {
+                for path in files.iter().filter(|_| !in_place) {
+                    let name = path.file_name().unwrap_or_default().to_string_lossy();
+                    batch.copy(format!("{MODEL}/{name}"), path, self.origin());
+                }
+            }
+            Source::Transforms { file, transforms, names } => {
+                self.collect_transforms(file, transforms, names, &mut batch)?;
+            }
+            Source::Photographs(folder) => self.collect_colmap(folder, &mut batch, say)?,
+        }
+        Ok(batch)
+    }
+
+    fn collect_transforms(
+        &self,
+        file: &Path,
+        transforms: &Transforms,
+        names: &[String],
+        batch: &mut Batch,
+    ) -> Result<(), Error> {
+        let mut shots = vec![];
+        for (i, (frame, name)) in transforms.frames.iter().zip(names).enumerate() {
+            let refuse =
+                |what: String| Error::File { path: file.to_owned(), what: format!("frame {i} ({name}): {what}") };
+            let picture = &self.photographs[name];
+            let size = super::picture_size(picture)?;
+            shots.push(shot(frame, transforms.lens, name, size).map_err(refuse)?);
+        }
+        let (cameras, images) = model_text(&shots);
+        batch.bytes(format!("{MODEL}/cameras.txt"), cameras.into_bytes(), self.origin());
+        batch.bytes(format!("{MODEL}/images.txt"), images.into_bytes(), self.origin());
+        match &transforms.ply_file_path {
+            Some(points) => {
+                batch.copy(format!("{MODEL}/points3D.ply"), &self.folder.join(points), "transforms.json: ply_file_path")
+            }
+            None => {
+                let text = random_points(&shots);
+                batch.bytes(
+                    format!("{MODEL}/points3D.txt"),
+                    text.into_bytes(),
+                    "drawn at random in front of the cameras",
+                );
+                batch.notes.push(
+                    "transforms.json names no ply_file_path: the fit starts from random points in front of the cameras"
+                        .into(),
+                );
+            }
+        }
+        Ok(())
+    }
+
+    /// Structure from motion by the `colmap` program, step by step and without a display.
+    fn collect_colmap(&self, images: &Path, batch: &mut Batch, say: &mut dyn FnMut(&str)) -> Result<(), Error> {
+        let help = Command::new("colmap").arg("help").env("QT_QPA_PLATFORM", "offscreen").output();
+        if help.is_err() {
+            return Err(Error::NoPoses { folder: self.folder.clone() });
+        }
+        let work = tempfile::tempdir().map_err(|source| Error::Io { path: std::env::temp_dir(), source })?;
+        let (database, models) = (work.path().join("database.db"), work.path().join("sparse"));
+        std::fs::create_dir_all(&models).map_err(|source| Error::Io { path: models.clone(), source })?;
+        let mut sizes = vec![];
+        for path in self.photographs.values() {
+            sizes.push(super::picture_size(path)?);
+        }
+        sizes.sort_unstable();
+        sizes.dedup();
+        if sizes.len() > 1 {
+            batch.notes.push(format!(
+                "the photographs have {} different sizes: each photograph gets a camera of its own",
+                sizes.len()
+            ));
+        }
+        let single = if sizes.len() == 1 { "1" } else { "0" };
+        // Newer versions have renamed the options: what a version has is in its help.
+        let without_gpu = |command: &str, names: [&'static str; 2]| -> Vec<OsString> {
+            let text = Command::new("colmap").args([command, "--help"]).env("QT_QPA_PLATFORM", "offscreen").output();
+            let text = text.map(|out| String::from_utf8_lossy(&out.stdout).into_owned()).unwrap_or_default();
+            let known = names.into_iter().find(|name| text.contains(&name[2..]));
+            known.into_iter().flat_map(|name| [name.into(), "0".into()]).collect()
+        };
+        let option = |name: &str, value: &std::ffi::OsStr| [OsString::from(name), value.to_owned()];
+        let (database, models) = (option("--database_path", database.as_ref()), models);
+        let pictures = option("--image_path", images.as_ref());
+        let camera = [
+            option("--ImageReader.single_camera", single.as_ref()),
+            option("--ImageReader.camera_model", "SIMPLE_RADIAL".as_ref()),
+        ];
+        say("poses: features of the photographs (colmap feature_extractor)");
+        let on_cpu = without_gpu("feature_extractor", ["--FeatureExtraction.use_gpu", "--SiftExtraction.use_gpu"]);
+        run_colmap("feature_extractor", &[&database, &pictures, camera.as_flattened(), &on_cpu].concat())?;
+        // All pairs, as long as there are not too many of them; then those of neighbouring names.
+        let matcher = if self.photographs.len() <= 200 { "exhaustive_matcher" } else { "sequential_matcher" };
+        say(&format!("poses: matches between the photographs (colmap {matcher})"));
+        let on_cpu = without_gpu(matcher, ["--FeatureMatching.use_gpu", "--SiftMatching.use_gpu"]);
+        run_colmap(matcher, &[&database[..], &on_cpu].concat())?;
+        say("poses: cameras and points (colmap mapper)");
+        let output = option("--output_path", models.as_ref());
+        run_colmap("mapper", &[&database[..], &pictures, &output].concat())?;
+        // The mapper may leave several models that it could not join.
+        let found = std::fs::read_dir(&models).into_iter().flatten().flatten().filter_map(|entry| {
+            // images.bin begins with how many there are.
+            let count = std::fs::read(entry.path().join("images.bin")).ok()?.first_chunk().copied()?;
+            Some((u64::from_le_bytes(count) as usize, entry.path()))
+        });
+        let Some((count, best)) = found.max() else {
+            let what = "colmap found no cameras: the photographs need texture, sharpness and much overlap".into();
+            return Err(Error::File { path: self.folder.clone(), what });
+        };
+        if count < self.photographs.len() {
+            batch.notes.push(format!("colmap placed {count} of {} photographs", self.photographs.len()));
+        }
+        for name in ["cameras.bin", "images.bin", "points3D.bin"] {
+            let path = best.join(name);
+            let bytes = std::fs::read(&path).map_err(|source| Error::Io { path, source })?;
+            batch.bytes(format!("{MODEL}/{name}"), bytes, self.origin());
+        }
+        Ok(())
+    }
+}
+
+fn run_colmap(command: &str, arguments: &[OsString]) -> Result<(), Error> {
+    let output = Command::new("colmap")
+        .arg(command)
+        .args(arguments)
+        .env("QT_QPA_PLATFORM", "offscreen")
+        .stdin(Stdio::null())
+        .output()
+        .map_err(|source| Error::Io { path: "colmap".into(), source })?;
+    if output.status.success() {
+        return Ok(());
+    }
+    let text = [output.stdout, output.stderr].concat();
+    let text = String::from_utf8_lossy(&text);
+    let last = text.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("it said nothing").trim();
+    Err(Error::Colmap { command: command.to_owned(), what: last.to_owned() })
+}
+
+fn from_transforms(folder: &Path, file: &Path) -> Result<Capture, Error> {
+    let refuse = |what: String| Error::File { path: file.to_owned(), what };
+    let text = std::fs::read(file).map_err(|source| Error::Io { path: file.to_owned(), source })?;
+    let transforms: Transforms =
+        serde_json::from_slice(&text).map_err(|error| refuse(format!("not nerfstudio's transforms.json: {error}")))?;
+    if let Some(model) = transforms.camera_model.as_deref()
+        && !["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"].contains(&model)
+    {
+        return Err(refuse(format!("camera_model is {model}; undistort the photographs to OPENCV or PINHOLE first")));
+    }
+    if transforms.frames.is_empty() {
+        return Err(refuse("there are no frames".into()));
+    }
+    let mut capture = Capture {
+        folder: folder.to_owned(),
+        source: Source::Photographs(folder.to_owned()),
+        photographs: BTreeMap::new(),
+        masks: BTreeMap::new(),
+        depths: BTreeMap::new(),
+    };
+    let mut names = vec![];
+    let below = |path: &str| {
+        let plain = path.trim_start_matches("./");
+        let given = folder.join(plain);
+        // Some writers leave the extension out.
+        let candidates =
+            ["png", "jpg", "jpeg", "PNG", "JPG"].map(|e| PathBuf::from(format!("{}.{e}", given.display())));
+        std::iter::once(given.clone()).chain(candidates).find(|path| path.is_file()).ok_or_else(|| {
+            refuse(format!("{} is not there; paths are read below {}", given.display(), folder.display()))
+        })
+    };
+    for frame in &transforms.frames {
+        let picture = below(&frame.file_path)?;
+        let relative = picture.strip_prefix(folder).unwrap_or(&picture).to_string_lossy().into_owned();
+        let name = scene::stem(relative.strip_prefix("images/").unwrap_or(&relative)).to_owned();
+        if let Some(path) = &frame.mask_path {
+            // nerfstudio trains on what is not black: black is what is to be left out.
+            capture.masks.insert(name.clone(), (below(path)?, true));
+        }
+        if let Some(path) = &frame.depth_file_path {
+            capture.depths.insert(name.clone(), below(path)?);
+        }
+        if capture.photographs.insert(name.clone(), picture).is_some() {
+            return Err(refuse(format!("two frames show {name}")));
+        }
+        names.push(name);
+    }
+    capture.source = Source::Transforms { file: file.to_owned(), transforms: Box::new(transforms), names };
+    Ok(capture)
+}
+
+/// A frame's camera: nerfstudio's poses are camera to world with OpenGL's axes (y up, z backward).
+fn shot(frame: &Frame, all: Lens, name: &str, size: [u32; 2]) -> Result<Shot, String> {
+    let own = frame.lens;
+    let (w, h) = (f64::from(size[0]), f64::from(size[1]));
+    let given = [own.w.or(all.w).unwrap_or(w), own.h.or(all.h).unwrap_or(h)];
+    let angle = own.camera_angle_x.or(all.camera_angle_x).map(|angle| given[0] / (2.0 * (angle / 2.0).tan()));
+    let fx = own.fl_x.or(own.fl_y).or(all.fl_x).or(all.fl_y).or(angle).ok_or("no fl_x and no camera_angle_x")?;
+    let fy = own.fl_y.or(own.fl_x).or(all.fl_y).unwrap_or(fx);
+    let of = |pick: fn(&Lens) -> Option<f64>| pick(&own).or_else(|| pick(&all));
+    if of(|l| l.k3).is_some_and(|k3| k3 != 0.0) {
+        return Err("k3 is not 0; undistort the photographs first".into());
+    }
+    // Intrinsics may be those of larger photographs.
+    let scale = [w / given[0], h / given[1]];
+    let parameters = [
+        fx * scale[0],
+        fy * scale[1],
+        of(|l| l.cx).unwrap_or(given[0] / 2.0) * scale[0],
+        of(|l| l.cy).unwrap_or(given[1] / 2.0) * scale[1],
+        of(|l| l.k1).unwrap_or(0.0),
+        of(|l| l.k2).unwrap_or(0.0),
+        of(|l| l.p1).unwrap_or(0.0),
+        of(|l| l.p2).unwrap_or(0.0),
+    ];
+    let rows: Vec<&Vec<f64>> = frame.transform_matrix.iter().take(3).collect();
+    if rows.len() < 3 || rows.iter().any(|row| row.len() != 4 || row.iter().any(|v| !v.is_finite())) {
+        return Err("transform_matrix is not 4 x 4 numbers".into());
+    }
+    let column = |k: usize| dvec3(rows[0][k], rows[1][k], rows[2][k]);
+    let axes = DMat3::from_cols(column(0), -column(1), -column(2));
+    if (axes.determinant() - 1.0).abs() > 1e-3 {
+        return Err("transform_matrix does not hold a rotation".into());
+    }
+    let rotation = DQuat::from_mat3(&axes).normalize().inverse();
+    Ok(Shot { name: name.to_owned(), size, parameters, rotation, translation: -(rotation * column(3)) })
+}
+
+/// `cameras.txt` and `images.txt`, a camera for each photograph.
+fn model_text(shots: &[Shot]) -> (String, String) {
+    let (mut cameras, mut images) = (String::new(), String::new());
+    for (i, shot) in shots.iter().enumerate() {
+        let Shot { name, size: [w, h], parameters, rotation: q, translation: t } = shot;
+        let parameters: Vec<String> = parameters.iter().map(f64::to_string).collect();
+        let id = i + 1;
+        writeln!(cameras, "{id} OPENCV {w} {h} {}", parameters.join(" ")).expect("a string takes everything");
+        let pose = format!("{} {} {} {} {} {} {}", q.w, q.x, q.y, q.z, t.x, t.y, t.z);
+        writeln!(images, "{id} {pose} {id} {name}\n").expect("a string takes everything");
+    }
+    (cameras, images)
+}
+
+/// How many points are drawn where a capture has none.
+const RANDOM_POINTS: u32 = 20_000;
+
+/// `points3D.txt` with points on the rays of random pixels, their disparities uniform about that of what the cameras look
+/// at: the point nearest to all optical axes.
+fn random_points(shots: &[Shot]) -> String {
+    let center = |shot: &Shot| -(shot.rotation.inverse() * shot.translation);
+    let axis = |shot: &Shot| shot.rotation.inverse() * DVec3::Z;
+    let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
+    for shot in shots {
+        let d = axis(shot);
+        let across = DMat3::IDENTITY - DMat3::from_cols(d * d.x, d * d.y, d * d.z);
+        normal += across;
+        right += across * center(shot);
+    }
+    let mean = shots.iter().map(center).sum::<DVec3>() / shots.len() as f64;
+    let spread = shots.iter().map(|shot| (center(shot) - mean).length()).fold(0.0, f64::max);
+    let focus = normal.inverse() * right;
+    let mut depths: Vec<f64> = shots.iter().map(|shot| (focus - center(shot)).dot(axis(shot))).collect();
+    depths.sort_unstable_by(f64::total_cmp);
+    let depth = depths[depths.len() / 2];
+    // Cameras that look past each other have no such point: what they see is then a few times as far as they stand apart.
+    let depth = if depth.is_finite() && depth > 0.1 * spread { depth } else { 4.0 * spread.max(1e-3) };
+    let mut rng = Pcg64::new(0, 11);
+    let mut text = String::new();
+    for id in 1..=RANDOM_POINTS {
+        let shot = &shots[rng.random_range(0..shots.len())];
+        let [fx, fy, cx, cy, lens @ ..] = shot.parameters;
+        let pixel: [f64; 2] = std::array::from_fn(|i| rng.random_range(0.0..f64::from(shot.size[i])));
+        let Some([x, y]) = undistort([(pixel[0] - cx) / fx, (pixel[1] - cy) / fy], lens) else { continue };
+        let z = depth / rng.random_range(0.25..2.5);
+        let p = shot.rotation.inverse() * (dvec3(x * z, y * z, z) - shot.translation);
+        writeln!(text, "{id} {} {} {} 128 128 128 0", p.x, p.y, p.z).expect("a string takes everything");
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn frame(json: &str) -> Frame {
+        serde_json::from_str(json).unwrap()
+    }
+
+    /// A camera at (1, 2, 3) with OpenGL's axes along the world's looks along -z: what stands before it at (1, 2, 0) is at
+    /// depth 3 in the middle, and what is above it in the world is above it in the picture, at a smaller row.
+    #[test]
+    fn axes_are_turned() {
+        let frame = frame(
+            r#"{"file_path": "a.png", "transform_matrix": [[1,0,0,1],[0,1,0,2],[0,0,1,3],[0,0,0,1]], "fl_x": 50}"#,
+        );
+        let shot = shot(&frame, Lens::default(), "a", [40, 30]).unwrap();
+        let seen = |p: DVec3| shot.rotation * p + shot.translation;
+        assert!((seen(dvec3(1.0, 2.0, 0.0)) - dvec3(0.0, 0.0, 3.0)).length() < 1e-12);
+        assert!((seen(dvec3(1.5, 2.0, 0.0)) - dvec3(0.5, 0.0, 3.0)).length() < 1e-12);
+        assert!((seen(dvec3(1.0, 2.5, 0.0)) - dvec3(0.0, -0.5, 3.0)).length() < 1e-12);
+        assert_eq!(shot.parameters, [50.0, 50.0, 20.0, 15.0, 0.0, 0.0, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn intrinsics_are_scaled_and_a_frames_own_win() {
+        let all: Lens = serde_json::from_str(r#"{"w": 80, "h": 60, "fl_x": 100, "cx": 44, "k1": 0.1}"#).unwrap();
+        let pose = "[[1,0,0,0],[0,1,0,0],[0,0,1,0]]";
+        let own = frame(&format!(r#"{{"file_path": "a", "transform_matrix": {pose}, "k1": 0.2}}"#));
+        let shot_of = |frame: &Frame| shot(frame, all, "a", [40, 30]);
+        assert_eq!(shot_of(&own).unwrap().parameters, [50.0, 50.0, 22.0, 15.0, 0.2, 0.0, 0.0, 0.0]);
+        let angle: Lens = serde_json::from_str(r#"{"camera_angle_x": 1.5707963267948966}"#).unwrap();
+        assert!((shot(&own, angle, "a", [40, 30]).unwrap().parameters[0] - 20.0).abs() < 1e-12);
+        for (json, what) in [
+            (r#"{"file_path": "a", "transform_matrix": [[1,0,0],[0,1,0],[0,0,1]]}"#, "4 x 4"),
+            (r#"{"file_path": "a", "transform_matrix": [[2,0,0,0],[0,1,0,0],[0,0,1,0]]}"#, "rotation"),
+            (&format!(r#"{{"file_path": "a", "transform_matrix": {pose}, "k3": 1}}"#), "k3"),
+        ] {
+            assert!(shot_of(&frame(json)).unwrap_err().contains(what), "{json}");
+        }
+        assert!(shot(&own, Lens::default(), "a", [40, 30]).unwrap_err().contains("fl_x"));
+    }
+
+    #[test]
+    fn random_points_stand_before_the_cameras() {
+        let pose = "[[1,0,0,0],[0,1,0,0],[0,0,1,0]]";
+        let frame = frame(&format!(r#"{{"file_path": "a", "transform_matrix": {pose}, "fl_x": 40}}"#));
+        let shot = shot(&frame, Lens::default(), "a", [40, 30]).unwrap();
+        let text = random_points(&[shot.clone()]);
+        assert_eq!(text.lines().count(), RANDOM_POINTS as usize);
+        for line in text.lines() {
+            let v: Vec<f64> = line.split(' ').skip(1).take(3).map(|word| word.parse().unwrap()).collect();
+            let p = shot.rotation * dvec3(v[0], v[1], v[2]) + shot.translation;
+            assert!(p.z > 0.0 && (p.x / p.z).abs() < 0.5 + 1e-9 && (p.y / p.z).abs() < 0.375 + 1e-9, "{line}");
+        }
+    }
+}

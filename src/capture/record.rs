@@ -1,0 +1,321 @@
+//! `prepare.json`: which step made which file from what, and whose a file is.
+//!
+//! A file is the program's own as long as it has the hash that the record names; whatever else lies in the folder is the
+//! user's and is never written over. A step whose inputs hash to the same value as last time is skipped.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::File;
+use std::io::{self, Cursor, Write as _};
+use std::path::{Path, PathBuf};
+
+use atomic_write_file::AtomicWriteFile;
+use image::{GrayImage, ImageFormat, RgbImage};
+use serde::{Deserialize, Serialize};
+
+use super::Error;
+
+/// The record's file within a prepared scene.
+pub const RECORD: &str = "prepare.json";
+
+/// A file of the program's own.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FileRecord {
+    /// blake3 of its bytes.
+    pub hash: String,
+    /// What it was made from, in words.
+    pub from: String,
+}
+
+/// A step that has ended.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct StepRecord {
+    /// blake3 of everything that the step read.
+    pub inputs: String,
+    /// Its files by their path below the scene.
+    pub files: BTreeMap<String, FileRecord>,
+    /// One line each: what was found out.
+    pub notes: Vec<String>,
+    /// Figures by name.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub figures: BTreeMap<String, f64>,
+}
+
+/// The contents of `prepare.json`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Record {
+    /// Version of the program that wrote it last.
+    pub version: String,
+    /// Steps by name.
+    pub steps: BTreeMap<String, StepRecord>,
+    /// Hashes of files that a step was about to write when this was written: they are the program's own, too.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub pending: BTreeMap<String, String>,
+}
+
+/// blake3 of parts, each with its length, as hexadecimal digits.
+#[derive(Default)]
+pub struct Inputs(blake3::Hasher);
+
+impl Inputs {
+    /// Adds a part.
+    pub fn with(mut self, part: impl AsRef<[u8]>) -> Self {
+        let part = part.as_ref();
+        self.0.update(&(part.len() as u64).to_le_bytes());
+        self.0.update(part);
+        self
+    }
+
+    /// The hash of all parts and of the program's version, by which steps may change.
+    pub fn finish(self) -> String {
+        self.with(env!("CARGO_PKG_VERSION")).0.finalize().to_hex().to_string()
+    }
+}
+
+/// blake3 of a file as hexadecimal digits.
+///
+/// # Errors
+/// A file that cannot be read.
+pub fn hash(path: &Path) -> Result<String, Error> {
+    let failed = |source| Error::Io { path: path.to_owned(), source };
+    let mut hasher = blake3::Hasher::new();
+    io::copy(&mut File::open(path).map_err(failed)?, &mut hasher).map_err(failed)?;
+    Ok(hasher.finalize().to_hex().to_string())
+}
+
+/// What a step writes, all of it at once.
+#[derive(Default)]
+pub struct Batch {
+    files: BTreeMap<String, (Content, String)>,
+    /// See [`StepRecord::notes`].
+    pub notes: Vec<String>,
+    /// See [`StepRecord::figures`].
+    pub figures: BTreeMap<String, f64>,
+}
+
+enum Content {
+    Bytes(Vec<u8>),
+    Copy(PathBuf),
+}
+
+impl Batch {
+    /// A file of these bytes at a path below the scene, and what it was made from.
+    pub fn bytes(&mut self, path: impl Into<String>, bytes: Vec<u8>, from: impl Into<String>) {
+        self.files.insert(path.into(), (Content::Bytes(bytes), from.into()));
+    }
+
+    /// A copy of a file.
+    pub fn copy(&mut self, path: impl Into<String>, source: &Path, from: impl Into<String>) {
+        self.files.insert(path.into(), (Content::Copy(source.to_owned()), from.into()));
+    }
+
+    /// A picture as PNG.
+    pub fn rgb(&mut self, path: impl Into<String>, picture: &RgbImage, from: impl Into<String>) {
+        let mut bytes = Cursor::new(vec![]);
+        picture.write_to(&mut bytes, ImageFormat::Png).expect("a picture is encoded into memory");
+        self.bytes(path, bytes.into_inner(), from);
+    }
+
+    /// A mask as PNG.
+    pub fn gray(&mut self, path: impl Into<String>, picture: &GrayImage, from: impl Into<String>) {
+        let mut bytes = Cursor::new(vec![]);
+        picture.write_to(&mut bytes, ImageFormat::Png).expect("a picture is encoded into memory");
+        self.bytes(path, bytes.into_inner(), from);
+    }
+
+    /// A float32 map (row-major, width and height in `size`) as NumPy file.
+    pub fn npy(&mut self, path: impl Into<String>, size: [u32; 2], values: Vec<f32>, from: impl Into<String>) {
+        let shape = (size[1] as usize, size[0] as usize);
+        let array = ndarray::Array2::from_shape_vec(shape, values).expect("a value per pixel");
+        let mut bytes = vec![];
+        ndarray_npy::WriteNpyExt::write_npy(&array, &mut bytes).expect("an array is encoded into memory");
+        self.bytes(path, bytes, from);
+    }
+}
+
+/// A scene's folder and its record.
+pub struct Folder {
+    root: PathBuf,
+    record: Record,
+}
+
+impl Folder {
+    /// Opens the folder, making it if it is missing.
+    ///
+    /// # Errors
+    /// A folder that cannot be made; a record that cannot be read.
+    pub fn open(root: &Path) -> Result<Self, Error> {
+        std::fs::create_dir_all(root).map_err(|source| Error::Io { path: root.to_owned(), source })?;
+        let path = root.join(RECORD);
+        let record = match std::fs::read(&path) {
+            Ok(text) => serde_json::from_slice(&text).map_err(|error| {
+                let what = format!("not a record of prepare ({error}); move it away to start again");
+                Error::File { path: path.clone(), what }
+            })?,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Record::default(),
+            Err(source) => return Err(Error::Io { path, source }),
+        };
+        Ok(Self { root: root.to_owned(), record })
+    }
+
+    /// The folder.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// What is known of it.
+    pub fn record(&self) -> &Record {
+        &self.record
+    }
+
+    /// Whether a path below the scene holds a file that the program has not written, or that was changed since.
+    ///
+    /// # Errors
+    /// A file that cannot be read.
+    pub fn is_users(&self, path: &str) -> Result<bool, Error> {
+        let file = self.root.join(path);
+        if !file.exists() {
+            return Ok(false);
+        }
+        let found = hash(&file)?;
+        let recorded = self.record.steps.values().filter_map(|step| step.files.get(path)).map(|file| &file.hash);
+        Ok(!recorded.chain(self.record.pending.get(path)).any(|hash| *hash == found))
+    }
+
+    /// Whether a step has nothing to do: its inputs are those of last time and its files are there.
+    pub fn is_fresh(&self, step: &str, inputs: &str) -> bool {
+        self.record.steps.get(step).is_some_and(|record| {
+            record.inputs == inputs && record.files.keys().all(|path| self.root.join(path).is_file())
+        })
+    }
+
+    /// Writes what a step made, each file whole or not at all, and takes away what it made before and no more. A file of the
+    /// user's stays as it is. Returns the paths that were kept for that reason.
+    ///
+    /// # Errors
+    /// A file that cannot be read or written; the files written before stay, and are written over the next time.
+    pub fn write(&mut self, step: &str, inputs: String, batch: Batch) -> Result<Vec<String>, Error> {
+        let Batch { files, notes, figures } = batch;
+        let mut kept = vec![];
+        let mut new = StepRecord { inputs, files: BTreeMap::new(), notes, figures };
+        let mut todo = vec![];
+        for (path, (content, from)) in files {
+            let hash = match &content {
+                Content::Bytes(bytes) => blake3::hash(bytes).to_hex().to_string(),
+                Content::Copy(source) => hash(source)?,
+            };
+            if self.is_users(&path)? {
+                // The same bytes may have been put there by hand: they stay, and stay the user's.
+                kept.push(path);
+                continue;
+            }
+            new.files.insert(path.clone(), FileRecord { hash, from });
+            todo.push((path, content));
+        }
+        self.record.pending = new.files.iter().map(|(path, file)| (path.clone(), file.hash.clone())).collect();
+        self.save()?;
+        for (path, content) in todo {
+            let target = self.root.join(&path);
+            let write = || -> io::Result<()> {
+                if let Some(folder) = target.parent() {
+                    std::fs::create_dir_all(folder)?;
+                }
+                let mut file = AtomicWriteFile::open(&target)?;
+                match &content {
+                    Content::Bytes(bytes) => file.write_all(bytes)?,
+                    Content::Copy(source) => drop(io::copy(&mut File::open(source)?, &mut file)?),
+                }
+                file.commit()
+            };
+            write().map_err(|source| Error::Io { path: target.clone(), source })?;
+        }
+        let old: BTreeSet<String> =
+            self.record.steps.get(step).map(|old| old.files.keys().cloned().collect()).unwrap_or_default();
+        for path in old.into_iter().filter(|path| !new.files.contains_key(path)) {
+            if self.root.join(&path).exists() && !self.is_users(&path)? {
+                let file = self.root.join(&path);
+                std::fs::remove_file(&file).map_err(|source| Error::Io { path: file, source })?;
+            }
+        }
+        self.record.steps.insert(step.to_owned(), new);
+        self.record.pending.clear();
+        self.save()?;
+        Ok(kept)
+    }
+
+    fn save(&mut self) -> Result<(), Error> {
+        env!("CARGO_PKG_VERSION").clone_into(&mut self.record.version);
+        let path = self.root.join(RECORD);
+        let text = serde_json::to_string_pretty(&self.record).expect("plain maps and strings") + "\n";
+        let write = || -> io::Result<()> {
+            let mut file = AtomicWriteFile::open(&path)?;
+            file.write_all(text.as_bytes())?;
+            file.commit()
+        };
+        write().map_err(|source| Error::Io { path: path.clone(), source })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn batch(files: &[(&str, &str)]) -> Batch {
+        let mut batch = Batch::default();
+        for (path, text) in files {
+            batch.bytes(*path, text.as_bytes().to_vec(), "a test");
+        }
+        batch
+    }
+
+    #[test]
+    fn steps_are_skipped_and_the_users_files_stay() {
+        let dir = tempfile::tempdir().unwrap();
+        let read = |path: &str| std::fs::read_to_string(dir.path().join(path)).unwrap();
+        let mut folder = Folder::open(dir.path()).unwrap();
+        assert!(!folder.is_fresh("masks", "1"));
+        assert!(
+            folder.write("masks", "1".into(), batch(&[("masks/a", "one"), ("masks/b", "two")])).unwrap().is_empty()
+        );
+        assert!(folder.is_fresh("masks", "1") && !folder.is_fresh("masks", "2"));
+
+        // Another program run sees the same.
+        let mut folder = Folder::open(dir.path()).unwrap();
+        assert!(folder.is_fresh("masks", "1") && !folder.is_users("masks/a").unwrap());
+
+        // A file that was changed by hand is the user's, and so is one that was never the program's.
+        std::fs::write(dir.path().join("masks/a"), "mine").unwrap();
+        std::fs::write(dir.path().join("masks/c"), "mine, too").unwrap();
+        assert!(folder.is_users("masks/a").unwrap() && folder.is_users("masks/c").unwrap());
+        let kept = folder.write("masks", "2".into(), batch(&[("masks/a", "x"), ("masks/c", "y")])).unwrap();
+        assert_eq!(kept, ["masks/a", "masks/c"]);
+        assert_eq!((read("masks/a").as_str(), read("masks/c").as_str()), ("mine", "mine, too"));
+        // What the step made before and does not make any more is gone.
+        assert!(!dir.path().join("masks/b").exists());
+
+        // A file that is missing is made again.
+        folder.write("masks", "3".into(), batch(&[("masks/d", "four")])).unwrap();
+        std::fs::remove_file(dir.path().join("masks/d")).unwrap();
+        assert!(!folder.is_fresh("masks", "3"));
+    }
+
+    /// A run that was killed between its files and its record leaves files of its own, not the user's.
+    #[test]
+    fn a_killed_step_is_repeated() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut folder = Folder::open(dir.path()).unwrap();
+        folder.record.pending.insert("a".into(), blake3::hash(b"half").to_hex().to_string());
+        folder.save().unwrap();
+        std::fs::write(dir.path().join("a"), "half").unwrap();
+        let mut folder = Folder::open(dir.path()).unwrap();
+        assert!(folder.write("fit", "1".into(), batch(&[("a", "whole")])).unwrap().is_empty());
+        assert_eq!(std::fs::read(dir.path().join("a")).unwrap(), b"whole");
+    }
+
+    #[test]
+    fn a_record_that_is_none_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join(RECORD), "[]").unwrap();
+        let error = Folder::open(dir.path()).err().unwrap().to_string();
+        assert!(error.contains("prepare.json: not a record of prepare"), "{error}");
+    }
+}

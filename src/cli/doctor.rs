@@ -1,0 +1,82 @@
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, bail};
+use atomic_write_file::AtomicWriteFile;
+
+use super::pictures;
+use crate::capture::doctor::{self, Report, Severity};
+use crate::capture::sheet;
+
+/// Look over a scene before training: masks, names, sizes, depth, reference, exposure
+///
+/// Problems and notes go to stdout, the worst first. A contact sheet of all views with their masks, as PNG and as a page,
+/// goes into the folder that --sheet names.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  gscream-vk doctor scene
+  gscream-vk doctor scene --sheet sheet
+  gscream-vk doctor scene --json | jq .findings
+  gscream-vk doctor carried --masks truth/masks
+
+Exit codes: 0 no problem was found, 1 problems, 2 the arguments make no sense.")]
+pub(super) struct Args {
+    /// Folder of the scene
+    #[arg(value_name = "SCENE")]
+    scene: PathBuf,
+    /// Print the findings and the figures of every view as JSON
+    #[arg(long)]
+    json: bool,
+    /// Folder for sheet.png and sheet.html
+    #[arg(long, value_name = "DIR")]
+    sheet: Option<PathBuf>,
+    /// Folder of other masks to compare the scene's with: intersection over union
+    #[arg(long, value_name = "DIR")]
+    masks: Option<PathBuf>,
+}
+
+pub(super) fn run(args: &Args) -> anyhow::Result<()> {
+    let (report, scene) = doctor::examine(&args.scene, args.masks.as_deref())?;
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&report)?);
+    } else {
+        print!("{}", text(&report));
+    }
+    if let (Some(folder), Some(scene)) = (&args.sheet, &scene) {
+        let sheet = sheet::draw(scene);
+        let rgb: Vec<[f32; 3]> = sheet.picture.pixels().map(|p| p.0.map(|v| f32::from(v) / 255.0)).collect();
+        pictures::write_png(&folder.join(sheet::PICTURE), [sheet.picture.width(), sheet.picture.height()], &rgb)?;
+        let page = folder.join(sheet::PAGE);
+        write(&page, &sheet::page(&args.scene.display().to_string(), &sheet, &report))
+            .with_context(|| format!("{}: cannot be written", page.display()))?;
+        eprintln!("wrote {} and {} in {}", sheet::PICTURE, sheet::PAGE, folder.display());
+    }
+    match report.problems() {
+        0 => Ok(()),
+        1 => bail!("{}: 1 problem", args.scene.display()),
+        count => bail!("{}: {count} problems", args.scene.display()),
+    }
+}
+
+fn text(report: &Report) -> String {
+    let mut text = String::new();
+    for finding in &report.findings {
+        let kind = if finding.severity == Severity::Problem { "problem" } else { "note" };
+        let view = finding.view.as_ref().map_or_else(String::new, |view| format!("{view}: "));
+        text += &format!("{kind:<8} {:<10} {view}{}\n", finding.check, finding.message);
+    }
+    if let Some([mean, least]) = report.iou {
+        let views = report.views.iter().filter(|view| view.iou.is_some()).count();
+        text += &format!("masks agree with the others: mean IoU {mean:.3}, least {least:.3}, {views} views\n");
+    }
+    if report.problems() == 0 {
+        text += "nothing wrong was found\n";
+    }
+    text
+}
+
+fn write(path: &Path, text: &str) -> std::io::Result<()> {
+    let mut file = AtomicWriteFile::open(path)?;
+    file.write_all(text.as_bytes())?;
+    file.commit()
+}

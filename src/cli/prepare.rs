@@ -1,0 +1,174 @@
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::Context as _;
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::shared::DeviceArgs;
+use crate::capture::{self, Evidence, Request, Step, Watch};
+use crate::train::run::Signal;
+
+/// Make a scene of photographs and one mask: cameras, masks for all views, a reference view without the object
+///
+/// PHOTOS is a folder of photographs, alone or with what is known of their cameras: a COLMAP model in sparse/ (photographs
+/// in images/), or nerfstudio's transforms.json. For photographs alone the program colmap is asked, where it is installed.
+/// The scene gets the plain layout, which `train` takes.
+///
+/// The steps are poses, fit, masks, depth and reference. A step whose inputs have not changed is skipped, a file that was
+/// changed or put there by hand stays, and a mask corrected by hand counts as one that was given. prepare.json says what
+/// every file was made from, prepare/provenance.png where each pixel of the reference is from.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  gscream-vk prepare photos --out scene --mask IMG_0012=box.png
+  gscream-vk prepare photos --out scene --box IMG_0012=310,220,540,470
+  gscream-vk prepare photos --out scene --mask IMG_0012=a.png --mask IMG_0040=b.png --reference IMG_0025
+  gscream-vk prepare photos --out scene --only masks --mask IMG_0012=better.png")]
+pub(super) struct Args {
+    /// Folder of photographs
+    #[arg(value_name = "PHOTOS")]
+    photographs: PathBuf,
+    /// Folder of the scene; may be PHOTOS itself
+    #[arg(long, value_name = "SCENE")]
+    out: PathBuf,
+    /// Mask of one view: a picture that is not black on the object; may be given many times
+    #[arg(long, value_name = "NAME=FILE", value_parser = mask)]
+    mask: Vec<(String, Evidence)>,
+    /// Box around the object in one view, in pixels of the photograph: x0,y0 and one past x1,y1; may be given many times
+    #[arg(long = "box", value_name = "NAME=x0,y0,x1,y1", value_parser = bounds)]
+    bounds: Vec<(String, Evidence)>,
+    /// Picture of strokes on one view: white or green on the object, black or red beside it, else grey or transparent
+    #[arg(long, value_name = "NAME=FILE", value_parser = strokes)]
+    strokes: Vec<(String, Evidence)>,
+    /// View to become the reference [default: the one whose hole is seen best by others]
+    #[arg(long, value_name = "NAME")]
+    reference: Option<String>,
+    /// Run this step alone, with what those before it left; may be given many times
+    #[arg(long, value_name = "STEP", value_parser = step)]
+    only: Vec<Step>,
+    /// Also write the fit's own depth as priors, nothing (NaN) where views disagree
+    #[arg(long)]
+    depth: bool,
+    /// Steps of the fit
+    #[arg(long, value_name = "N", default_value_t = 600, value_parser = clap::value_parser!(u32).range(1..))]
+    fit_steps: u32,
+    /// Longer side of the pictures that the fit is made with, pixels
+    #[arg(long, value_name = "PIXELS", default_value_t = 256, value_parser = clap::value_parser!(u32).range(32..))]
+    fit_side: u32,
+    /// Seed of every random choice
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    seed: u32,
+    #[command(flatten)]
+    device: DeviceArgs,
+}
+
+fn named(text: &str) -> Result<(String, String), String> {
+    let (name, value) = text.split_once('=').ok_or("must be NAME=..., where NAME is a photograph's")?;
+    if name.is_empty() || value.is_empty() {
+        return Err("must be NAME=..., where NAME is a photograph's".into());
+    }
+    Ok((name.to_owned(), value.to_owned()))
+}
+
+fn mask(text: &str) -> Result<(String, Evidence), String> {
+    named(text).map(|(name, file)| (name, Evidence::Mask(file.into())))
+}
+
+fn strokes(text: &str) -> Result<(String, Evidence), String> {
+    named(text).map(|(name, file)| (name, Evidence::Strokes(file.into())))
+}
+
+fn bounds(text: &str) -> Result<(String, Evidence), String> {
+    let (name, numbers) = named(text)?;
+    let numbers: Vec<u32> = numbers
+        .split(',')
+        .map(|word| word.trim().parse().map_err(|_| format!("'{word}' is no whole number of pixels")))
+        .collect::<Result<_, _>>()?;
+    let bounds = numbers.try_into().map_err(|_| "a box is four numbers: x0,y0,x1,y1")?;
+    Ok((name, Evidence::Box(bounds)))
+}
+
+fn step(text: &str) -> Result<Step, String> {
+    let names: Vec<&str> = Step::ALL.iter().map(|step| step.name()).collect();
+    Step::ALL.into_iter().find(|step| step.name() == text).ok_or(format!("the steps are {}", names.join(", ")))
+}
+
+pub(super) fn run(args: &Args) -> anyhow::Result<()> {
+    let began = Instant::now();
+    let object = [&args.mask, &args.bounds, &args.strokes].into_iter().flatten().cloned().collect();
+    let request = Request {
+        object,
+        reference: args.reference.clone(),
+        only: args.only.clone(),
+        depth: args.depth,
+        fit_steps: args.fit_steps,
+        fit_side: args.fit_side,
+        seed: args.seed.into(),
+        ..Request::new(&args.photographs, &args.out)
+    };
+    args.device.with_gpu(|gpu| {
+        let stop = Arc::new(AtomicBool::new(false));
+        for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+            signal_hook::flag::register_conditional_shutdown(signal, 130, Arc::clone(&stop))
+                .and_then(|_| signal_hook::flag::register(signal, Arc::clone(&stop)))
+                .context("signals cannot be listened to")?;
+        }
+        let mut watch = Bars { bar: None, began: Instant::now(), step: None, stop };
+        let result = capture::prepare(gpu, &request, &mut watch);
+        if let Some(bar) = watch.bar.take() {
+            bar.finish_and_clear();
+        }
+        Ok(result?)
+    })?;
+    println!(
+        "{}: ready after {:.0} s; gscream-vk doctor looks at it, train trains it",
+        args.out.display(),
+        began.elapsed().as_secs_f64()
+    );
+    Ok(())
+}
+
+/// A bar for each step.
+struct Bars {
+    bar: Option<ProgressBar>,
+    began: Instant,
+    step: Option<Step>,
+    stop: Arc<AtomicBool>,
+}
+
+impl Watch for Bars {
+    fn begin(&mut self, step: Step, units: u64) {
+        let style = ProgressStyle::with_template("{msg:>9} {wide_bar} {pos}/{len}, {eta} left")
+            .unwrap_or_else(|_| ProgressStyle::default_bar());
+        let bar = ProgressBar::new(units).with_style(style).with_message(step.name());
+        bar.enable_steady_tick(Duration::from_millis(250));
+        (self.bar, self.began, self.step) = (Some(bar), Instant::now(), Some(step));
+    }
+
+    fn at(&mut self, unit: u64) {
+        if let Some(bar) = &self.bar {
+            bar.set_position(unit);
+        }
+    }
+
+    fn end(&mut self) {
+        if let Some(bar) = self.bar.take() {
+            bar.finish_and_clear();
+        }
+        if let Some(step) = self.step.take() {
+            eprintln!("{}: {:.1} s", step.name(), self.began.elapsed().as_secs_f64());
+        }
+    }
+
+    fn say(&mut self, line: &str) {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| eprintln!("{line}")),
+            None => eprintln!("{line}"),
+        }
+    }
+
+    fn interrupted(&mut self) -> Option<Signal> {
+        self.stop.load(Ordering::Relaxed).then_some(Signal::Interrupt)
+    }
+}

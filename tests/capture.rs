@@ -1,0 +1,344 @@
+//! From photographs to a scene, on the built-in one: what is made is compared with what is known exactly.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use assert_cmd::cargo::cargo_bin_cmd;
+use gscream_vk::capture::{self, Evidence, Request, Step, Watch};
+use gscream_vk::gpu::testing;
+use gscream_vk::scene::{self, Camera, synthetic};
+use image::{GrayImage, Luma, RgbImage};
+use tempfile::TempDir;
+
+const VIEWS: u32 = 10;
+
+/// `full/`: a small built-in scene with everything it has; `photos/`: its photographs and its model alone.
+fn capture() -> TempDir {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let full = folder.path().join("full");
+    let options =
+        synthetic::Options { seed: 2, width: 112, height: 84, train_views: VIEWS, test_views: 2, points: 2000 };
+    synthetic::write(&full, &options).expect("a writable folder");
+    for part in ["images", "sparse/0"] {
+        let to = folder.path().join("photos").join(part);
+        fs::create_dir_all(&to).expect("a writable folder");
+        for file in fs::read_dir(full.join(part)).expect("a folder").flatten() {
+            fs::copy(file.path(), to.join(file.file_name())).expect("a writable folder");
+        }
+    }
+    folder
+}
+
+fn mask(path: &Path) -> GrayImage {
+    image::open(path).expect("a mask").into_luma8()
+}
+
+fn name(view: u32) -> String {
+    format!("train_{view:03}")
+}
+
+fn truth(folder: &TempDir, view: u32) -> PathBuf {
+    folder.path().join("full/masks").join(name(view) + ".png")
+}
+
+/// The smallest box around the object, and so many pixels more on each side.
+fn bounds(mask: &GrayImage, more: u32) -> [u32; 4] {
+    let on = || mask.enumerate_pixels().filter(|p| p.2.0[0] != 0);
+    let (xs, ys) = (|| on().map(|p| p.0), || on().map(|p| p.1));
+    let low = |v: Option<u32>| v.expect("an object").saturating_sub(more);
+    let high = |v: Option<u32>, end: u32| (v.expect("an object") + 1 + more).min(end);
+    [low(xs().min()), low(ys().min()), high(xs().max(), mask.width()), high(ys().max(), mask.height())]
+}
+
+/// Keeps what is said.
+#[derive(Default)]
+struct Lines(Vec<String>);
+
+impl Watch for Lines {
+    fn say(&mut self, line: &str) {
+        self.0.push(line.to_owned());
+    }
+}
+
+fn ious(folder: &TempDir, scene: &Path, given: &[u32]) -> Vec<f64> {
+    let others = (0..VIEWS).filter(|view| !given.contains(view));
+    let of = |view| {
+        let carried = mask(&scene.join("masks").join(name(view) + ".png"));
+        capture::masks::iou(&carried, &mask(&truth(folder, view)))
+    };
+    others.map(of).collect()
+}
+
+/// Root mean square difference of two pictures where the mask is on.
+fn difference(a: &RgbImage, b: &RgbImage, mask: &GrayImage) -> f64 {
+    let on = || a.pixels().zip(b.pixels()).zip(mask.pixels()).filter(|(_, m)| m.0[0] != 0);
+    let sum: f64 =
+        on().flat_map(|((a, b), _)| a.0.into_iter().zip(b.0)).map(|(a, b)| (f64::from(a) - f64::from(b)).powi(2)).sum();
+    (sum / (3.0 * on().count() as f64)).sqrt()
+}
+
+/// One box becomes a scene: masks for all views, a reference whose hole shows what is behind the object; a second time
+/// there is nothing to do, and what was corrected by hand stays and counts.
+#[test]
+fn one_box_becomes_a_scene() {
+    let folder = capture();
+    let gpu = testing::gpu();
+    let out = folder.path().join("scene");
+    let given = VIEWS / 2;
+    let around = bounds(&mask(&truth(&folder, given)), 4);
+    let mut request = Request::new(folder.path().join("photos"), &out);
+    request.object = vec![(name(given), Evidence::Box(around))];
+    (request.fit_steps, request.fit_side, request.depth) = (250, 112, true);
+    // The view of which the built-in scene knows what is behind the object.
+    request.reference = Some(name(given));
+    let mut lines = Lines::default();
+    capture::prepare(&gpu, &request, &mut lines).expect("a scene");
+
+    // The cut at the object's own edge, a line of about 100 pixels around some 800.
+    let own = capture::masks::iou(&mask(&out.join("masks").join(name(given) + ".png")), &mask(&truth(&folder, given)));
+    let others = ious(&folder, &out, &[given]);
+    let mean = others.iter().sum::<f64>() / others.len() as f64;
+    println!("the cut's IoU {own:.3}, carried {mean:.3}: {others:.3?}; {:?}", lines.0);
+    assert!(own > 0.85 && mean > 0.8, "the cut's IoU {own:.3}, the others' {mean:.3}: {others:.3?}");
+
+    // The scene is one that training takes, with a reference; without its priors, whose NaN say that nothing is known.
+    let config = scene::Config { priors: false, ..scene::Config::default() };
+    let scene = scene::load(&out, &config).expect("a scene");
+    let reference = scene.reference.as_ref().expect("a reference");
+    let view = &scene.train[reference.view];
+    assert_eq!(scene.train.len(), VIEWS as usize);
+    assert!(scene.train.iter().all(|view| view.mask.is_some()));
+
+    // Behind the object: nearer to the truth than the photograph, whose hole shows the object.
+    let (found, object) = (&reference.image, &view.image);
+    let exact =
+        image::open(folder.path().join("full/reference").join(name(given) + ".png")).expect("a picture").into_rgb8();
+    let hole = view.mask.as_ref().expect("a mask");
+    let (ours, before) = (difference(found, &exact, hole), difference(object, &exact, hole));
+    println!("reference: {ours:.1} levels off the truth, the photograph {before:.1}");
+    assert!(ours < 0.5 * before, "{ours:.1} of {before:.1}");
+    let outside = GrayImage::from_fn(hole.width(), hole.height(), |x, y| {
+        let near = (-4..=4i32).any(|dy| {
+            (-4..=4i32).any(|dx| {
+                let (u, v) = (x as i32 + dx, y as i32 + dy);
+                let inside = u >= 0 && v >= 0 && u < hole.width() as i32 && v < hole.height() as i32;
+                inside && hole.get_pixel(u as u32, v as u32).0[0] != 0
+            })
+        });
+        Luma([u8::from(!near)])
+    });
+    assert_eq!(difference(found, object, &outside), 0.0, "beside the hole the photograph stays as it is");
+
+    // Nothing is made twice.
+    let written = |path: &str| fs::metadata(out.join(path)).and_then(|m| m.modified()).expect("a file");
+    let before = written("masks/train_000.png");
+    let mut lines = Lines::default();
+    capture::prepare(&gpu, &request, &mut lines).expect("the same scene");
+    let fresh = Step::ALL.map(|step| format!("{}: nothing has changed", step.name()));
+    assert_eq!(lines.0, fresh);
+    assert_eq!(written("masks/train_000.png"), before);
+
+    // A mask corrected by hand stays as it is, and the others are carried from it, too.
+    let corrected = out.join("masks").join(name(0) + ".png");
+    fs::copy(truth(&folder, 0), &corrected).expect("a writable folder");
+    request.only = vec![Step::Masks];
+    capture::prepare(&gpu, &request, &mut Lines::default()).expect("the masks alone");
+    assert_eq!(fs::read(&corrected).expect("a mask"), fs::read(truth(&folder, 0)).expect("a mask"));
+    let record = fs::read_to_string(out.join("prepare.json")).expect("a record");
+    assert!(record.contains("carried from train_000, train_005"), "{record}");
+    let again = ious(&folder, &out, &[0, given]);
+    assert!(again.iter().sum::<f64>() / again.len() as f64 > mean - 0.02, "{again:.3?}");
+}
+
+// ---------------------------------------------------------------- transforms.json
+
+/// nerfstudio's file of these cameras.
+fn transforms(views: &[(String, Camera)]) -> serde_json::Value {
+    let frames: Vec<_> = views
+        .iter()
+        .map(|(name, camera)| {
+            let r = camera.rotation.map(|row| row.map(f64::from));
+            let center = camera.center();
+            // Columns: right, up and backward.
+            let row = |i: usize| serde_json::json!([r[0][i], -r[1][i], -r[2][i], center[i]]);
+            serde_json::json!({
+                "file_path": format!("./images/{name}.png"),
+                "transform_matrix": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
+            })
+        })
+        .collect();
+    let Camera { focal, principal, distortion: d, size, .. } = views[0].1;
+    serde_json::json!({
+        "camera_model": "OPENCV", "w": size[0], "h": size[1], "fl_x": focal[0], "fl_y": focal[1],
+        "cx": principal[0], "cy": principal[1], "k1": d[0], "k2": d[1], "p1": d[2], "p2": d[3], "frames": frames,
+    })
+}
+
+#[test]
+fn cameras_of_nerfstudio_are_the_same() {
+    let folder = capture();
+    let full = scene::load(&folder.path().join("full"), &scene::Config::default()).expect("a scene");
+    let views: Vec<(String, Camera)> = full.train.iter().map(|view| (view.name.clone(), view.camera)).collect();
+    let photos = folder.path().join("photos");
+    fs::remove_dir_all(photos.join("sparse")).expect("a folder");
+    fs::write(photos.join("transforms.json"), transforms(&views).to_string()).expect("a writable folder");
+    let mut request = Request::new(&photos, folder.path().join("scene"));
+    request.only = vec![Step::Poses];
+    let mut lines = Lines::default();
+    capture::prepare(&testing::gpu(), &request, &mut lines).expect("poses");
+    assert!(lines.0.iter().any(|line| line.contains("random points")), "{:?}", lines.0);
+    let scene = scene::load(&request.out, &scene::Config::default()).expect("a scene");
+    assert_eq!(scene.train.len(), views.len());
+    for (view, (name, camera)) in scene.train.iter().zip(&views) {
+        assert_eq!(view.name, *name);
+        // Through a quaternion and back: float32 rotations are orthogonal to 1e-7.
+        for point in [[0.3, 0.2, 0.9], [-0.5, 1.4, 0.1]] {
+            let [a, b] = [&view.camera, camera].map(|camera| camera.project(point).expect("in front"));
+            assert!((a[0] - b[0]).abs() < 1e-3 && (a[1] - b[1]).abs() < 1e-3, "{name}: {a:?} {b:?}");
+        }
+    }
+}
+
+// ---------------------------------------------------------------- the commands
+
+struct Outcome {
+    code: i32,
+    stdout: String,
+    stderr: String,
+}
+
+fn run(folder: &Path, arguments: &str) -> Outcome {
+    let output = cargo_bin_cmd!("gscream-vk")
+        .current_dir(folder)
+        .env("XDG_CACHE_HOME", folder.join("cache"))
+        // Without colmap, whether it is installed here or not.
+        .env("PATH", folder)
+        .env_remove("RUST_LOG")
+        .args(arguments.split_whitespace())
+        .output()
+        .expect("the program starts");
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).expect("UTF-8");
+    Outcome {
+        code: output.status.code().expect("an exit code"),
+        stdout: text(output.stdout),
+        stderr: text(output.stderr),
+    }
+}
+
+#[test]
+fn mistakes_are_one_sentence_and_write_nothing() {
+    let folder = capture();
+    let at = folder.path();
+    let save = |name: &str, value: u8, size: (u32, u32)| {
+        GrayImage::from_pixel(size.0, size.1, Luma([value])).save(at.join(name)).expect("a writable folder");
+    };
+    save("empty.png", 0, (112, 84));
+    save("full.png", 255, (112, 84));
+    save("other.png", 255, (84, 84));
+    fs::write(at.join("text.png"), "not a picture").expect("a writable folder");
+    fs::create_dir_all(at.join("nothing")).expect("a writable folder");
+    fs::create_dir_all(at.join("alone")).expect("a writable folder");
+    fs::copy(at.join("photos/images/train_000.png"), at.join("alone/a.png")).expect("a writable folder");
+    fs::create_dir_all(at.join("nerf")).expect("a writable folder");
+    let frame = r#"{"fl_x": 1, "frames": [{"file_path": "a.png", "transform_matrix": []}]}"#;
+    fs::write(at.join("nerf/transforms.json"), frame).expect("a writable folder");
+    for (arguments, code, says) in [
+        ("prepare nowhere --out scene --mask a=full.png", 1, "nowhere: there is no such folder"),
+        ("prepare nothing --out scene --mask a=full.png", 1, "nothing: no pictures"),
+        ("prepare alone --out scene --box a=10,10,90,70", 1, "the program colmap is not installed"),
+        ("prepare nerf --out scene --mask a=full.png", 1, "nerf/a.png is not there"),
+        ("prepare photos --out scene", 1, "what is to be removed?"),
+        (
+            "prepare photos --out scene --mask train_01=full.png",
+            1,
+            "no photograph has this name (did you mean train_001?)",
+        ),
+        ("prepare photos --out scene --mask train_001=empty.png", 1, "empty.png: the mask is empty"),
+        ("prepare photos --out scene --mask train_001=full.png", 1, "full.png: the mask covers the whole picture"),
+        (
+            "prepare photos --out scene --mask train_001=other.png",
+            1,
+            "other.png: the mask is 84x84 but its picture is 112x84",
+        ),
+        ("prepare photos --out scene --mask train_001=text.png", 1, "text.png: not a readable picture"),
+        ("prepare photos --out scene --mask train_001=gone.png", 1, "gone.png"),
+        (
+            "prepare photos --out scene --box train_001=50,10,40,70",
+            1,
+            "not a box within the photograph, which is 112x84",
+        ),
+        ("prepare photos --out scene --box train_001=5,10,40", 2, "a box is four numbers"),
+        ("prepare photos --out scene --mask train_001", 2, "must be NAME=..."),
+        ("prepare photos --out scene --only colour", 2, "the steps are poses, fit, masks, depth, reference"),
+        ("doctor nowhere", 1, "nowhere"),
+    ] {
+        let outcome = run(at, arguments);
+        assert_eq!(outcome.code, code, "{arguments}: {}", outcome.stderr);
+        let said = format!("{}{}", outcome.stdout, outcome.stderr);
+        assert!(said.contains(says), "{arguments}: {said}");
+        let sentences = outcome.stderr.lines().filter(|line| line.starts_with("error")).count();
+        assert_eq!(sentences, 1, "{arguments}: {}", outcome.stderr);
+        // Without cameras there may be an empty folder and a record, but no file of a scene.
+        assert!(!at.join("scene/images").exists(), "{arguments} has written something");
+    }
+}
+
+#[test]
+fn the_doctor_tells_right_from_wrong() {
+    let folder = capture();
+    let at = folder.path();
+    let well = run(at, "doctor full --sheet sheet");
+    assert_eq!(well.code, 0, "{}{}", well.stdout, well.stderr);
+    assert!(well.stdout.contains("nothing wrong was found"), "{}", well.stdout);
+    let page = fs::read_to_string(at.join("sheet/sheet.html")).expect("a page");
+    assert!(page.contains("train_005 (reference)") && at.join("sheet/sheet.png").is_file());
+    let same = run(at, "doctor full --masks full/masks");
+    assert!(same.stdout.contains("mean IoU 1.000, least 1.000, 10 views"), "{}", same.stdout);
+
+    let problems = |says: &[&str]| {
+        let outcome = run(at, "doctor full --json");
+        assert_eq!(outcome.code, 1, "{says:?}: {}{}", outcome.stdout, outcome.stderr);
+        let report: serde_json::Value = serde_json::from_str(&outcome.stdout).expect("JSON");
+        let findings = report["findings"].as_array().expect("findings").clone();
+        let found: Vec<String> = findings
+            .iter()
+            .filter(|f| f["severity"] == "problem")
+            .map(|f| f["message"].as_str().expect("a sentence").to_owned())
+            .collect();
+        for says in says {
+            assert!(found.iter().any(|line| line.contains(says)), "{says}: {found:?}");
+        }
+    };
+    // Depth that is called disparity.
+    fs::rename(at.join("full/depth"), at.join("full/disparity")).expect("a folder");
+    problems(&["priors run against the sparse points", "they are depth, not disparity"]);
+    fs::rename(at.join("full/disparity"), at.join("full/depth")).expect("a folder");
+    // A mask of nothing that is there, and one that is missing.
+    fs::rename(truth(&folder, 1), at.join("full/masks/stray.png")).expect("a mask");
+    problems(&["belong to no picture", "1 of 10 views have no mask (first: train_001)"]);
+    fs::rename(at.join("full/masks/stray.png"), truth(&folder, 1)).expect("a mask");
+    // A photograph that is darker than the others.
+    let dark = at.join("full/images/train_003.png");
+    let bright = image::open(&dark).expect("a picture").into_rgb8();
+    RgbImage::from_fn(112, 84, |x, y| image::Rgb(bright.get_pixel(x, y).0.map(|v| (f64::from(v) * 0.7) as u8)))
+        .save(&dark)
+        .expect("a writable folder");
+    problems(&["1 of 10 photographs differ in brightness", "most: train_003"]);
+    bright.save(&dark).expect("a writable folder");
+    // A reference that was moved, and one that still shows the object.
+    let reference = at.join("full/reference/train_005.png");
+    let exact = image::open(&reference).expect("a picture").into_rgb8();
+    RgbImage::from_fn(112, 84, |x, y| *exact.get_pixel((x + 2).min(111), y)).save(&reference).expect("a folder");
+    problems(&["shifted against its photograph by about -2, 0 pixels"]);
+    fs::copy(at.join("full/images/train_005.png"), &reference).expect("a folder");
+    problems(&["still shows the object"]);
+    exact.save(&reference).expect("a writable folder");
+    // Masks the other way round.
+    for view in 0..VIEWS {
+        let path = truth(&folder, view);
+        let mut mask = mask(&path);
+        mask.iter_mut().for_each(|v| *v = 255 - *v);
+        mask.save(&path).expect("a writable folder");
+    }
+    problems(&["they seem to be 0 on the object"]);
+}
