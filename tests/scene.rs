@@ -689,7 +689,7 @@ fn priors_may_have_gaps() {
     save_npy(dir.path().join("depth/a.npy"), &map);
     let read = |downscale| {
         let config = Config { downscale, ..Default::default() };
-        load(dir.path(), &config).expect("it loads").train[0].prior.clone().expect("a prior").values
+        scene::load(dir.path(), &config).expect("it loads").train[0].prior.clone().expect("a prior").values
     };
     let [w, _] = SIZE.map(|n| n as usize);
     let (whole, half) = (read(1), read(2));
