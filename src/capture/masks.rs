@@ -246,7 +246,7 @@ mod tests {
     fn specks_go_and_pieces_stay() {
         let found = without_specks(&mask(&["###...", "###..#", ".....#", "#....#"]), 0.3);
         // Six, three (half of six) and one, which is less than 0.3 of six.
-        assert_eq!(found, mask(&["###...", "###..#", ".....#", "......"]));
+        assert_eq!(found, mask(&["###...", "###..#", ".....#", ".....#"]));
         assert_eq!(without_specks(&mask(&["..."]), 0.5), mask(&["..."]));
     }
 
