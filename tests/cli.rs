@@ -429,7 +429,9 @@ fn a_run_with_the_truth_as_reference_is_judged_and_judged_again() {
     // Stored pictures know what was seen, but neither depth nor the train views.
     succeeds(folder, "eval run --pictures --json stored.json");
     let stored = read("stored.json");
-    assert_eq!(stored["mean"]["outside_seen"], trained["mean"]["outside_seen"]);
+    // Drawn before the model was written, whose scales are rounded once more in the units of the scene's files.
+    let psnr = |report: &serde_json::Value| report["mean"]["outside_seen"]["psnr"].as_f64().expect("a number");
+    assert!((psnr(&stored) - psnr(&trained)).abs() < 1e-3, "{} {}", psnr(&stored), psnr(&trained));
     assert!(stored["mean"].get("geometry").is_none() && stored.get("residues").is_none());
     // Depth maps in another unit, in a folder of the user's.
     fs::create_dir(folder.join("millimetres")).expect("writable");

@@ -543,17 +543,18 @@ pub const TABLE: &[Formula] = &[
     Formula {
         pass: "losses/frame",
         variants: &["masked", "masked_depth"],
-        derivation: "per pixel picture 4, target 12 B, 9 operations; with masks a weight 4 B and 2, with depth two more 8 B and 7",
+        derivation: "per pixel picture 4, target 12 B, 9 operations; with masks a weight 4 B and 3, with depth the prior and three more 16 B and 9",
         work: |c, d| {
             let (masked, depth) = (if_so(d.is("masked")), if_so(d.is("depth")));
-            work((16.0 + 4.0 * masked + 8.0 * depth) * c.pixels, (9.0 + 2.0 * masked + 7.0 * depth) * c.pixels, 0.0)
+            work((16.0 + 4.0 * masked + 16.0 * depth) * c.pixels, (9.0 + 3.0 * masked + 9.0 * depth) * c.pixels, 0.0)
         },
     },
     Formula {
         pass: "losses/photometric_rows",
-        variants: &[],
-        derivation: "per pixel rgb twice 24, moments 48 B; per channel difference and terms 8, window 11 x 4, variances 10 operations",
-        work: |c, _| work(72.0 * c.pixels, 3.0 * 62.0 * c.pixels, 0.0),
+        variants: &["outside"],
+        derivation: "per pixel rgb twice 24, moments 48 B, with weights 4; per channel difference and terms 8, window 11 x 4, \
+                     variances 10 operations",
+        work: |c, d| work((72.0 + 4.0 * if_so(d.is("outside"))) * c.pixels, 3.0 * 62.0 * c.pixels, 0.0),
     },
     Formula {
         pass: "losses/photometric_columns",
@@ -570,7 +571,7 @@ pub const TABLE: &[Formula] = &[
     },
     Formula {
         pass: "losses/photometric_gradient",
-        variants: &["weighted", "l1", "l1_weighted"],
+        variants: &["weighted", "weighted_outside", "l1", "l1_weighted"],
         derivation: "per pixel rgb, target and gradient 36 B, 18 operations for L1; with SSIM 36 B and per channel a window of 11 x 3 \
                      and 5 operations more; with weights 4 B",
         work: |c, d| {

@@ -10,7 +10,7 @@ use super::{Device, Record};
 use crate::report::statistics::Spread;
 
 /// Kernels that are no part of a step: growing and pruning, and what measures.
-const NO_STEP: [&str; 3] = ["densify/grow", "densify/prune", "bench/"];
+const NO_STEP: [&str; 4] = ["densify/grow", "densify/prune", "export/", "bench/"];
 /// Primitives that only those use.
 const UNUSED: [&str; 1] = ["primitives/reduce"];
 

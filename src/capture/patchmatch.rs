@@ -315,9 +315,12 @@ pub fn fill(canvas: &mut Canvas, seed: u64) {
     }
 }
 
+/// For each pixel the middle of its source patch, and how much the patches differ on the whole.
+type Matches = (Vec<usize>, f32);
+
 /// From the smallest scale, the first, to the largest; its colours, and how much its patches differ from their sources.
 fn ascend(scales: Vec<Canvas>, rng: &mut Pcg64) -> (Vec<[f32; 3]>, f32) {
-    let mut coarser: Option<(Canvas, Option<(Vec<usize>, f32)>)> = None;
+    let mut coarser: Option<(Canvas, Option<Matches>)> = None;
     for mut scale in scales {
         let [w, h] = scale.size;
         let mut guess = None;

@@ -533,7 +533,7 @@ mod tests {
         let pose = "[[1,0,0,0],[0,1,0,0],[0,0,1,0]]";
         let frame = frame(&format!(r#"{{"file_path": "a", "transform_matrix": {pose}, "fl_x": 40}}"#));
         let shot = shot(&frame, Lens::default(), "a", [40, 30]).unwrap();
-        let text = random_points(&[shot.clone()]);
+        let text = random_points(std::slice::from_ref(&shot));
         assert_eq!(text.lines().count(), RANDOM_POINTS as usize);
         for line in text.lines() {
             let v: Vec<f64> = line.split(' ').skip(1).take(3).map(|word| word.parse().unwrap()).collect();

@@ -619,7 +619,7 @@ mod tests {
     fn means_are_over_what_is_known() {
         let mut map = vec![f32::NAN; 11 * 9];
         (map[4 * 11 + 5], map[4 * 11 + 9]) = (1.0, 4.0);
-        let means = average(&map, &[4 * 11 + 5, 4 * 11 + 0, 0], [11, 9]);
+        let means = average(&map, &[4 * 11 + 5, 4 * 11, 0], [11, 9]);
         assert_eq!(means[0], 2.5);
         assert!(means[1].is_nan() && means[2].is_nan());
         // Five pixels to the left of the first value: out of reach by one; four: in reach.

@@ -379,13 +379,13 @@ impl Fingerprint {
     /// The first part in which `self`, a checkpoint's, differs from the scene at hand.
     fn difference(&self, scene: &Self) -> Option<String> {
         let find = |parts: &Self, name: &str| parts.0.iter().find(|(n, _)| n == name).map(|(_, hash)| hash.clone());
-        let changed = self.0.iter().find_map(|(name, hash)| match find(scene, name) {
-            None => Some(format!("the {name} is not there")),
-            Some(other) if other != *hash => Some(format!("the {name} is another")),
-            Some(_) => None,
-        });
+        // What came or went comes first: the unit is found from all views, so that it changes the others' poses as well.
+        let gone = self.0.iter().find(|(name, _)| find(scene, name).is_none());
         let added = || scene.0.iter().find(|(name, _)| find(self, name).is_none());
-        changed.or_else(|| added().map(|(name, _)| format!("the {name} is new")))
+        let changed = || self.0.iter().find(|(name, hash)| find(scene, name).is_some_and(|other| other != *hash));
+        gone.map(|(name, _)| format!("the {name} is not there"))
+            .or_else(|| added().map(|(name, _)| format!("the {name} is new")))
+            .or_else(|| changed().map(|(name, _)| format!("the {name} is another")))
     }
 }
 

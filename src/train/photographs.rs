@@ -10,7 +10,7 @@ use image::{GrayImage, RgbImage};
 use super::plan::Plan;
 use crate::gpu::{Buffer, Error, Gpu};
 use crate::losses;
-use crate::scene::{Camera, PriorKind, Scene, reduced, resample};
+use crate::scene::{self, Camera, PriorKind, Scene, reduced, resample};
 use crate::stage;
 
 /// One training view on the device.
@@ -84,10 +84,8 @@ pub fn upload(gpu: &Gpu, scene: &Scene, plan: &Plan, reduction: u32) -> Result<V
         let mask = mask.as_deref();
         let prior = match prior.filter(|_| plan.depth_losses(reference.is_some()).any()) {
             Some(prior) => {
-                let mut values = prior.in_own_range();
-                if smaller {
-                    values = resample::map(&values, full, size);
-                }
+                let reduced = smaller.then(|| resample::map(&prior.values, full, size));
+                let mut values = reduced.map_or_else(|| prior.in_own_range(), |values| scene::in_own_range(&values));
                 let gaps = values.iter().any(|v| v.is_nan());
                 values.iter_mut().filter(|v| v.is_nan()).for_each(|v| *v = losses::NO_PRIOR);
                 let values = gpu.stage(stage::PICTURES, || gpu.upload("prior", &values))?;

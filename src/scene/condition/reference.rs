@@ -64,7 +64,7 @@ pub(super) fn guess_prior(scene: &mut Scene) {
         near.select_nth_unstable_by(NEIGHBORS - 1, |a, b| a.0.total_cmp(&b.0));
         near.truncate(NEIGHBORS);
         let reach = near.iter().fold(1.0_f64, |m, (d, _)| m.max(*d));
-        let weighted: Vec<(f64, [f64; 2], f64)> = near
+        let weighted: Vec<Weighted> = near
             .iter()
             .map(|(d, s)| {
                 let other = color(s.pixel);
@@ -82,12 +82,14 @@ pub(super) fn guess_prior(scene: &mut Scene) {
     scene.notes.push(format!("reference {name}: it has no prior; its depth is guessed from the points around it"));
 }
 
+/// A weight, a place, and the value there.
+type Weighted = (f64, [f64; 2], f64);
+
 /// The value at the origin of a plane through weighted values, its slope held small by a ridge of a tenth of the spread's
 /// weight, within the values' range.
-fn plane(weighted: &[(f64, [f64; 2], f64)], reach: f64) -> f64 {
+fn plane(weighted: &[Weighted], reach: f64) -> f64 {
     let total: f64 = weighted.iter().map(|(w, ..)| w).sum();
-    let mean =
-        |value: &dyn Fn(&(f64, [f64; 2], f64)) -> f64| weighted.iter().map(|s| s.0 * value(s)).sum::<f64>() / total;
+    let mean = |value: &dyn Fn(&Weighted) -> f64| weighted.iter().map(|s| s.0 * value(s)).sum::<f64>() / total;
     let (mx, my, mv) = (mean(&|s| s.1[0]), mean(&|s| s.1[1]), mean(&|s| s.2));
     let ridge = 0.1 * reach;
     let xx = mean(&|s| (s.1[0] - mx).powi(2)) + ridge;
@@ -159,7 +161,7 @@ pub(super) fn outrank(scene: &mut Scene, depth: Option<&[f32]>, enough: u32) {
         *to = Luma([lowered(*m, *n)]);
     }
     scene.train[at].mask = Some(new);
-    if hole > 0 {
+    if seen > 0 {
         let percent = 100.0 * seen as f64 / hole as f64;
         scene.notes.push(format!(
             "{percent:.0} % of the reference's hole is seen past the object by {enough} views or more, which outrank the \
