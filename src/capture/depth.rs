@@ -130,7 +130,7 @@ pub fn agreed(maps: &[DepthMap], of: usize) -> Vec<f32> {
     values.map(|(i, depth)| if depth.is_finite() && keep(i, *depth) { *depth } else { f32::NAN }).collect()
 }
 
-/// The mask at the size of a picture, enlarged by [`MARGIN`].
+/// The mask at the size of a picture, enlarged by a margin.
 pub fn enlarged(mask: &GrayImage, size: [u32; 2]) -> GrayImage {
     let small = resample::mask(mask, size);
     let radius = (MARGIN * f64::from(size[0].max(size[1]))).ceil() as u32;
