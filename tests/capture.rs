@@ -104,7 +104,7 @@ fn one_box_becomes_a_scene() {
     // The scene is one that training takes, with a reference; without its priors, whose NaN say that nothing is known.
     let config = scene::Config { priors: false, ..scene::Config::default() };
     let scene = scene::load(&out, &config).expect("a scene");
-    let reference = scene.reference.as_ref().expect("a reference");
+    let reference = scene.references.first().expect("a reference");
     let view = &scene.train[reference.view];
     assert_eq!(scene.train.len(), VIEWS as usize);
     assert!(scene.train.iter().all(|view| view.mask.is_some()));

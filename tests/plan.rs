@@ -91,7 +91,7 @@ fn every_combination_has_what_it_needs_and_nothing_else() {
         let plan = Plan::new(&scene, &settings);
         let forecast = rehearsed(&gpu, &scene, &settings);
         let reference = wanted.reference && wanted.masks;
-        assert_eq!(plan.reference, reference.then_some(3), "{wanted:?}");
+        assert_eq!(plan.references, Vec::from_iter(reference.then_some(3)), "{wanted:?}");
         let present = |name: &str| match name {
             stage::ATTENTION => wanted.attention && wanted.masks,
             stage::DEPTH | stage::DEPTH_GRADIENT => wanted.priors,

@@ -334,7 +334,7 @@ fn the_plain_layout_is_read() {
         assert_eq!((prior.kind, &prior.values), (PriorKind::Depth, &depth(SIZE).into_raw_vec_and_offset().0));
     }
     assert!(scene.test[0].prior.is_none());
-    let reference = scene.reference.as_ref().unwrap();
+    let reference = scene.references.first().unwrap();
     assert_eq!((reference.view, reference.prior.as_ref().unwrap().kind), (1, PriorKind::Depth));
     insta::assert_debug_snapshot!(scene.notes, @r#"
     [
@@ -345,6 +345,22 @@ fn the_plain_layout_is_read() {
 }
 
 #[test]
+fn a_scene_may_have_several_references() {
+    let dir = plain();
+    save(dir.path().join("reference/a.png"), &picture(SIZE));
+    let scene = load(&dir);
+    let found: Vec<_> = scene.references.iter().map(|r| (r.view, r.prior.is_some())).collect();
+    assert_eq!(found, [(0, false), (1, true)]);
+    assert_note!(scene, "reference view a with no prior; reference view b with depth prior");
+    assert_eq!(scene.reference_of(1).unwrap().view, 1);
+    assert!(scene.reference_of(2).is_none());
+    // Another picture is one in place of all.
+    let config = Config { reference_file: "reference/a.png".into(), ..Config::default() };
+    let one = scene::load(dir.path(), &config).unwrap();
+    assert_eq!(one.references.iter().map(|r| r.view).collect::<Vec<_>>(), [0]);
+}
+
+#[test]
 fn what_is_absent_is_said() {
     let without = |folders: &[&str]| {
         let dir = plain();
@@ -352,14 +368,14 @@ fn what_is_absent_is_said() {
         load(&dir)
     };
     let scene = without(&["reference"]);
-    assert!(scene.reference.is_none());
+    assert!(scene.references.is_empty());
     assert_note!(scene, "the hole is left unsupervised");
     let scene = without(&["masks"]);
-    assert!(scene.reference.is_none() && scene.train.iter().all(|v| v.mask.is_none()));
+    assert!(scene.references.is_empty() && scene.train.iter().all(|v| v.mask.is_none()));
     assert_note!(scene, "reference/b.png is not used: without masks there is no hole");
     assert_note!(scene, "no masks: every pixel is trained on");
     let scene = without(&["depth"]);
-    assert!(scene.train.iter().all(|v| v.prior.is_none()) && scene.reference.as_ref().unwrap().prior.is_some());
+    assert!(scene.train.iter().all(|v| v.prior.is_none()) && scene.references.first().unwrap().prior.is_some());
     assert_note!(scene, "reference/b.npy is taken as depth (there is no prior of that view to compare with)");
     assert_note!(scene, "3 of 3 train views have no depth prior");
     let scene = without(&["test_images", "test_masks"]);
@@ -396,14 +412,14 @@ fn switches_leave_things_out() {
     let dir = plain();
     let with = |config: Config| scene::load(dir.path(), &config).unwrap();
     let scene = with(Config { masks: false, ..Config::default() });
-    assert!(scene.reference.is_none() && scene.train.iter().all(|v| v.mask.is_none() && v.prior.is_some()));
+    assert!(scene.references.is_empty() && scene.train.iter().all(|v| v.mask.is_none() && v.prior.is_some()));
     assert!(scene.test[0].mask.is_some(), "test masks are for the figures, not for training");
     assert_note!(scene, "the train masks are ignored, as configured");
     let scene = with(Config { priors: false, ..Config::default() });
     assert!(scene.train.iter().all(|v| v.mask.is_some() && v.prior.is_none()));
-    assert!(scene.reference.as_ref().unwrap().prior.is_none());
+    assert!(scene.references.first().unwrap().prior.is_none());
     let scene = with(Config { reference: false, ..Config::default() });
-    assert!(scene.reference.is_none());
+    assert!(scene.references.is_empty());
     assert_note!(scene, "the reference view is ignored, as configured");
     assert!(refusal_with(&dir, &Config { downscale: 0, ..Config::default() }).contains("downscale is 0"));
 }
@@ -419,7 +435,7 @@ fn views_are_held_out_only_where_the_layout_has_no_test_views() {
     let scene = every(2).unwrap();
     assert_eq!((names(&scene.train), names(&scene.test)), ("bc".into(), "a".into()));
     assert_note!(scene, "1 of 3 views are held out for testing; they show the object");
-    assert_eq!(scene.train[scene.reference.unwrap().view].name, "b");
+    assert_eq!(scene.train[scene.references[0].view].name, "b");
     // All but the reference, which always trains.
     let scene = every(1).unwrap();
     assert_eq!((names(&scene.train), names(&scene.test)), ("b".into(), "ac".into()));
@@ -448,7 +464,7 @@ fn a_clean_test_view_can_be_the_reference() {
     for name in ["t", "t.png"] {
         let scene = scene::load(dir.path(), &with(name, "")).unwrap();
         assert_eq!((names(&scene.train), names(&scene.test)), ("abct".into(), "u".into()));
-        let reference = scene.reference.as_ref().unwrap();
+        let reference = scene.references.first().unwrap();
         assert_eq!((reference.view, reference.prior.is_none()), (3, true));
         assert_eq!(reference.image.as_raw(), clean.as_raw());
         assert_eq!(scene.train[3].image.as_raw(), clean.as_raw());
@@ -460,7 +476,7 @@ fn a_clean_test_view_can_be_the_reference() {
 
     // Its prior: under its name, a given file, or none.
     let kind = |config: &Config| {
-        scene::load(dir.path(), config).unwrap().reference.unwrap().prior.map(|p| (p.kind, p.values[0]))
+        scene::load(dir.path(), config).unwrap().references.remove(0).prior.map(|p| (p.kind, p.values[0]))
     };
     save_npy(at("depth/t.npy"), &Array2::from_elem((SIZE[1] as usize, SIZE[0] as usize), 3.0f32));
     save_npy(at("other_disparity.npy"), &Array2::from_elem((SIZE[1] as usize, SIZE[0] as usize), 4.0f32));
@@ -478,7 +494,7 @@ fn a_clean_test_view_can_be_the_reference() {
     for config in [Config { reference: false, ..with("t", "") }, Config { masks: false, ..with("t", "") }] {
         let scene = scene::load(dir.path(), &config).unwrap();
         assert_eq!((names(&scene.train), names(&scene.test)), ("abc".into(), "u".into()));
-        assert!(scene.reference.is_none());
+        assert!(scene.references.is_empty());
         assert_note!(scene, "t is neither trained on nor tested");
     }
     // Views are not held out in the place of test views that are gone.
@@ -522,7 +538,7 @@ fn other_priors_and_another_reference_take_the_place_of_the_delivered() {
     let prior = scene.train[0].prior.as_ref().unwrap();
     assert_eq!((prior.kind, prior.values[0]), (PriorKind::Disparity, 2.0));
     assert!(scene.train[1].prior.is_none() && scene.train[2].prior.is_none(), "no mixture of two models");
-    let prior = scene.reference.as_ref().unwrap().prior.as_ref().unwrap();
+    let prior = scene.references.first().unwrap().prior.as_ref().unwrap();
     assert_eq!((prior.kind, prior.values[0]), (PriorKind::Disparity, 3.0));
     let scene = scene::load(dir.path(), &priors(at("metric").to_str().unwrap())).unwrap();
     assert_eq!(scene.train[1].prior.as_ref().unwrap().kind, PriorKind::Depth);
@@ -531,7 +547,7 @@ fn other_priors_and_another_reference_take_the_place_of_the_delivered() {
     let reference = |file: &str| Config { reference_file: file.into(), ..Config::default() };
     let view = |file: &str| {
         let scene = scene::load(dir.path(), &reference(file)).unwrap();
-        let reference = scene.reference.unwrap();
+        let reference = &scene.references[0];
         assert_eq!(reference.image.as_raw(), grey.as_raw());
         (scene.train[reference.view].name.clone(), reference.prior.is_some())
     };
@@ -549,7 +565,7 @@ fn other_priors_and_another_reference_take_the_place_of_the_delivered() {
     gone: there is no such folder
     empty: no prior has the name of a train view; name them after the photographs
     gone.png: No such file or directory (os error 2)
-    scene.reference_file and scene.truth_reference are both set; a scene has one reference
+    scene.reference_file and scene.truth_reference are both set; name one of the two
     lama.png: no train view has this name; name the inpainted picture after the view it replaces
     ");
 }
@@ -572,7 +588,7 @@ fn true_depth_of_test_views_is_read() {
     // Without a prior of its own, it is that of a clean reference.
     let config = Config { truth_reference: "t".into(), ..Config::default() };
     save_npy(dir.path().join("test_depth/t.npy"), &depth_of_one());
-    let truth = scene::load(dir.path(), &config).unwrap().reference.unwrap().prior.unwrap();
+    let truth = scene::load(dir.path(), &config).unwrap().references.remove(0).prior.unwrap();
     assert_eq!((truth.kind, truth.values[9]), (PriorKind::Depth, 1.0));
 }
 
@@ -595,7 +611,6 @@ fn contradictions_are_refused() {
     all.push(with(&|d| remove(d, "masks/b.png")));
     all.push(with(&|d| fs::rename(d.join("reference/b.png"), d.join("reference/x.png")).unwrap()));
     all.push(with(&|d| fs::rename(d.join("reference/b.png"), d.join("reference/t.png")).unwrap()));
-    all.push(with(&|d| save(d.join("reference/a.png"), &picture(SIZE))));
     all.push(with(&|d| save(d.join("reference/b.png"), &picture([32, 18]))));
     all.push(with(&|d| save_npy(d.join("reference/b_depth.npy"), &depth(SIZE))));
     all.push(with(&|d| save(d.join("images/a.png"), &picture([36, 64]))));
@@ -619,7 +634,6 @@ fn contradictions_are_refused() {
     reference/b.png: the inpainted view has no mask; add the mask of b, or remove the picture
     reference/x.png: no train view has this name; name the inpainted picture after the view it replaces
     reference/t.png: no train view has this name; name the inpainted picture after the view it replaces
-    reference: 2 pictures (a, b, ...); a scene has one reference view: keep one
     reference/b.png: the inpainted picture is 32x18 but its view is 64x36; both must have the same size
     reference/b_depth.npy: the reference has a second prior, reference/b.npy; keep one
     images/a.png: the picture is 36x64 but its camera is 64x36, and no one scale explains both sides; was it cropped or rotated?
@@ -787,7 +801,7 @@ fn priors_of_another_size_are_resampled() {
 
 #[test]
 fn the_kind_of_the_reference_prior_is_found() {
-    let kind = |scene: &Scene| scene.reference.as_ref().unwrap().prior.as_ref().unwrap().kind;
+    let kind = |scene: &Scene| scene.references.first().unwrap().prior.as_ref().unwrap().kind;
     let with = |file: &str, values: Array2<f32>| {
         let dir = plain();
         fs::remove_file(dir.path().join("reference/b.npy")).unwrap();
@@ -992,7 +1006,7 @@ fn spin_nerfs_layout_is_found() {
         let covered = view.mask.as_ref().unwrap().as_raw().iter().filter(|v| **v == 255).count();
         assert_eq!(covered, if i == 62 { 48 * 27 } else { 16 * 9 }, "{}", view.name);
     }
-    assert!(scene.reference.is_none());
+    assert!(scene.references.is_empty());
     insta::assert_debug_snapshot!(scene.notes, @r#"
     [
         "SPIn-NeRF's layout: pictures in images_4/, train masks in images_4/label/",
@@ -1009,7 +1023,7 @@ fn spin_nerfs_layout_is_found() {
         save(dir.path().join(file), &picture([48, 27]));
         let scene = load(&dir);
         fs::remove_file(dir.path().join(file)).unwrap();
-        scene.train[scene.reference.expect(file).view].name.clone()
+        scene.train[scene.references.first().expect(file).view].name.clone()
     };
     let wanted = &names[69];
     for file in ["images_4/reference.png", "reference.jpg"] {
@@ -1072,11 +1086,11 @@ fn gscreams_copy_is_found() {
     assert_eq!((scene.train.len(), scene.test.len(), scene.points.len()), (60, 40, 1));
     assert!(scene.train.iter().all(|v| v.mask.is_some() && v.prior.as_ref().unwrap().kind == PriorKind::Depth));
     assert!(scene.test.iter().all(|v| v.mask.is_some() && v.prior.is_none()));
-    assert!(scene.reference.is_none());
+    assert!(scene.references.is_empty());
     assert_note!(scene, "GScream's copy of SPIn-NeRF: pictures in images_4/, recognised by lama_input/");
     save(at(format!("images_4/lama_images/{}.png", names[69])), &picture([48, 27]));
     let scene = load(&dir);
-    let reference = scene.reference.as_ref().unwrap();
+    let reference = scene.references.first().unwrap();
     assert_eq!((reference.view, reference.prior.as_ref().unwrap().kind), (29, PriorKind::Depth));
     assert_note!(scene, "the reference's depth is marigold_output/depth_npy/2022_138_pred.npy");
 }
@@ -1092,7 +1106,7 @@ fn the_synthetic_scene_is_read_by_the_same_loader() {
     }
     let scene = scene::load(&one.path().join("scene"), &Config::default()).unwrap();
     assert_eq!((scene.train.len(), scene.test.len(), scene.points.len()), (4, 2, 50));
-    let reference = scene.reference.as_ref().unwrap();
+    let reference = scene.references.first().unwrap();
     assert_eq!((reference.view, reference.prior.is_some()), (2, true));
     for view in scene.train.iter().chain(&scene.test) {
         assert_eq!(view.camera.size, [48, 37]);
@@ -1172,7 +1186,7 @@ fn spin_1_is_read() {
     let Some(dir) = capture("spin-1") else { return };
     let scene = scene::load(&dir, &Config::default()).unwrap();
     assert_eq!((scene.train.len(), scene.test.len(), scene.points.len()), (60, 10, 73437));
-    let reference = scene.reference.as_ref().unwrap();
+    let reference = scene.references.first().unwrap();
     assert_eq!(scene.train[reference.view].name, "20220819_104425");
     for view in scene.train.iter().chain(&scene.test) {
         assert_eq!((view.camera.size, view.image.dimensions()), ([1008, 567], (1008, 567)));
@@ -1203,7 +1217,7 @@ fn spin_1_is_read() {
     }
 
     let quarter = scene::load(&dir, &Config { downscale: 4, ..Config::default() }).unwrap();
-    let view = &quarter.train[quarter.reference.as_ref().unwrap().view];
+    let view = &quarter.train[quarter.references.first().unwrap().view];
     assert_eq!((view.camera.size, view.image.dimensions()), ([252, 142], (252, 142)));
     assert_eq!(view.prior.as_ref().unwrap().values.len(), 252 * 142);
     assert_eq!(quarter.radius, scene.radius);
@@ -1221,7 +1235,7 @@ fn fern_is_read() {
     let Some(dir) = capture("fern") else { return };
     let scene = scene::load(&dir, &Config { test_every: 8, ..Config::default() }).unwrap();
     assert_eq!((scene.train.len(), scene.test.len(), scene.points.len()), (17, 3, 10091));
-    assert!(scene.reference.is_none() && scene.train.iter().all(|v| v.mask.is_none() && v.prior.is_none()));
+    assert!(scene.references.is_empty() && scene.train.iter().all(|v| v.mask.is_none() && v.prior.is_none()));
     insta::assert_debug_snapshot!(scene.notes, @r#"
     [
         "plain layout: pictures in images/",

@@ -32,7 +32,7 @@ fn passes_and_barriers_of_a_step() {
     let whole = common::tiny();
     let bare = {
         let mut scene = whole.clone();
-        scene.reference = None;
+        scene.references.clear();
         scene.train.iter_mut().for_each(|view| (view.mask, view.prior) = (None, None));
         scene
     };

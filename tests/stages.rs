@@ -101,7 +101,11 @@ fn what_is_absent_has_no_pass_and_no_buffer() {
         let left_out = |what: &str| plan.left_out.iter().any(|left| left.what == what);
         assert_eq!((plan.masks, plan.depth, plan.depth_gradient), (wanted.masks, wanted.priors, wanted.priors));
         assert_eq!(plan.attention, wanted.attention && wanted.masks, "{wanted:?}");
-        assert_eq!((plan.growth, plan.reference), (wanted.growth, wanted.reference.then_some(3)), "{wanted:?}");
+        assert_eq!(
+            (plan.growth, plan.references),
+            (wanted.growth, Vec::from_iter(wanted.reference.then_some(3))),
+            "{wanted:?}"
+        );
         assert_eq!(left_out("pixel weights"), !plan.masks, "{wanted:?}");
         assert_eq!(left_out("reference view"), !wanted.reference, "{wanted:?}");
         assert_eq!(left_out("depth map, its gradient, alignment and depth losses"), !plan.depth, "{wanted:?}");

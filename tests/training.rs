@@ -240,6 +240,60 @@ fn training_learns_and_what_it_saves_draws_the_same_picture() {
     }
 }
 
+/// PSNR of the test views, whole and masked, of a short run on the tiny scene with its lengths and its priors in other
+/// units.
+fn figures_in_units(
+    gpu: &Gpu,
+    folder: &tempfile::TempDir,
+    config: &scene::Config,
+    lengths: f64,
+    priors: f64,
+) -> [f64; 2] {
+    let mut scene = common::load(folder, &scene::Config::default());
+    for view in scene.train.iter_mut().chain(&mut scene.test) {
+        view.camera.translation = view.camera.translation.map(|t| t * lengths);
+    }
+    for point in &mut scene.points {
+        point.position = point.position.map(|x| (f64::from(x) * lengths) as f32);
+    }
+    scene.radius = (f64::from(scene.radius) * lengths) as f32;
+    let of_views = scene.train.iter_mut().filter_map(|v| v.prior.as_mut());
+    for prior in of_views.chain(scene.references.iter_mut().filter_map(|r| r.prior.as_mut())) {
+        prior.values.iter_mut().for_each(|p| *p = (f64::from(*p) * priors) as f32);
+    }
+    scene::condition(&mut scene, config);
+    let mut settings = common::settings(48);
+    settings.model.voxel_factor = 2.0;
+    let report = train(gpu, &scene, &settings, None).summary.report.expect("there are test views");
+    let metrics = report.mean.expect("means").metrics;
+    [metrics.full.psnr, metrics.mask.expect("test masks").psnr]
+}
+
+/// Millimetres or miles, of the scene or of its depth priors: the same pictures.
+#[test]
+fn the_units_of_the_scene_and_of_its_priors_change_nothing() {
+    let gpu = testing::gpu();
+    let folder = common::folder();
+    let config = scene::Config::default();
+    let figures = |lengths, priors| figures_in_units(&gpu, &folder, &config, lengths, priors);
+    let [full, masked] = figures(1.0, 1.0);
+    // Powers of two round nothing: not a bit may differ.
+    for (lengths, priors) in
+        [(1.0 / 128.0, 1.0), (1024.0, 1.0), (1.0, 2f64.powi(-20)), (1.0, 2f64.powi(20)), (64.0, 64.0)]
+    {
+        assert_eq!(figures(lengths, priors), [full, masked], "lengths x {lengths}, priors x {priors}");
+    }
+    // Others round the input, which growing makes as much of as of another seed in the few pixels of a mask.
+    for (lengths, priors) in [(1e-2, 1.0), (1e3, 1.0), (1.0, 1e-6), (1.0, 1e3), (1.0, 1e6)] {
+        let [f, _] = figures(lengths, priors);
+        assert!((f - full).abs() < 0.1, "lengths x {lengths:e}, priors x {priors:e}: {f} dB instead of {full} dB");
+    }
+    // Where lengths are taken as they are, the same test fails.
+    let fixed = scene::Config { unit: 1.0, ..config.clone() };
+    let [f, _] = figures_in_units(&gpu, &folder, &fixed, 1e3, 1.0);
+    assert!((f - full).abs() > 1.0, "{f} dB in fixed units, {full} dB");
+}
+
 /// A real capture, or nothing and a line that says so.
 fn capture(name: &str, config: &scene::Config) -> Option<Scene> {
     let data = std::env::var_os("GSCREAM_DATA")
@@ -278,7 +332,7 @@ fn three_steps_of_a_capture_with_masks() {
     let Some(scene) = capture("spin-1", &config) else { return };
     let plan = three_steps(&scene, 12.0);
     assert!(plan.masks && plan.depth && plan.depth_gradient && plan.attention && plan.growth, "{plan:?}");
-    assert!(plan.reference.is_some(), "{plan:?}");
+    assert!(!plan.references.is_empty(), "{plan:?}");
 }
 
 #[test]
@@ -287,5 +341,5 @@ fn three_steps_of_photographs_alone() {
     let Some(scene) = capture("fern", &config) else { return };
     let plan = three_steps(&scene, 12.0);
     assert!(!plan.masks && !plan.depth && !plan.depth_gradient && !plan.attention && plan.growth, "{plan:?}");
-    assert!(plan.reference.is_none(), "{plan:?}");
+    assert!(plan.references.is_empty(), "{plan:?}");
 }

@@ -116,7 +116,7 @@ pub(super) fn record() -> Record {
             points: 100,
             masks: 3,
             priors: 0,
-            reference: true,
+            references: 1,
         }),
         warm_up: 50,
         ceilings,

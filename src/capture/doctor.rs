@@ -154,7 +154,7 @@ fn examine_scene(scene: &Scene, report: &mut Report) {
     mask_findings(scene, report);
     depth_findings(scene, report);
     exposure_findings(report);
-    if let Some(reference) = &scene.reference {
+    for reference in &scene.references {
         reference_findings(&scene.train[reference.view], reference, report);
     }
 }

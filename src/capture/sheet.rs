@@ -52,7 +52,7 @@ pub fn draw(scene: &Scene) -> Sheet {
         }
         cells.push((view.name.clone(), small));
     }
-    if let Some(reference) = &scene.reference {
+    for reference in &scene.references {
         let view = &scene.train[reference.view];
         let [w, h] = view.camera.size;
         let to = [WIDTH, ((u64::from(WIDTH) * u64::from(h) / u64::from(w)).max(1) as u32).min(height)];

@@ -93,9 +93,9 @@ pub(super) fn measure(
     Ok(Measured { report, seen })
 }
 
-/// Of every train view that shows the object, against the reference's picture as the view would show it.
+/// Of every train view that shows the object, against the first reference's picture as the view would show it.
 fn residues(scene: &Scene, train: &[Drawn], shown: &[Shown<'_>]) -> Vec<Residue> {
-    let Some(reference) = &scene.reference else { return vec![] };
+    let Some(reference) = scene.references.first() else { return vec![] };
     let from = shown[reference.view];
     let of = |at: usize| {
         let view = &scene.train[at];

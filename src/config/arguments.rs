@@ -39,7 +39,10 @@ pub struct SettingsArgs {
     /// reference is set aside. The built-in scene needs none of this: its reference is exact.
     #[arg(long, value_name = "NAME")]
     pub truth_reference: Option<String>,
-    /// Depth prior of that view, or `none` [default: the one under its name, if the scene has one]
+    /// Depth prior of that view, `stereo` or `none` [default: the one under its name, if the scene has one]
+    ///
+    /// `stereo` measures it over the other test views, which see the same place: what a monocular prior of that
+    /// photograph would say.
     #[arg(long, value_name = "FILE", requires = "truth_reference")]
     pub truth_prior: Option<PathBuf>,
 }
@@ -55,7 +58,7 @@ impl SettingsArgs {
         };
         // A run is evaluated from elsewhere, and the settings file knows the scene's folder only.
         let place = |path: &PathBuf| {
-            let word = path.as_os_str() == "none";
+            let word = path.as_os_str() == "none" || path.as_os_str() == "stereo";
             let path = if word { path.clone() } else { std::path::absolute(path).unwrap_or_else(|_| path.clone()) };
             path.to_string_lossy().into_owned()
         };

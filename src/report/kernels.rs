@@ -288,7 +288,7 @@ fn mark_dominated(figures: &mut [VariantFigures], times: &[Times]) {
 
 /// The reference view first, then others evenly over the rest.
 pub(crate) fn choose_views(scene: &Scene, views: usize) -> Scene {
-    let first = scene.reference.as_ref().map(|r| r.view);
+    let first = scene.references.first().map(|r| r.view);
     let others: Vec<usize> = (0..scene.train.len()).filter(|i| Some(*i) != first).collect();
     let wanted = views.max(1).min(scene.train.len()) - usize::from(first.is_some());
     let spread = (0..wanted).map(|i| others[i * others.len() / wanted]);
@@ -296,7 +296,7 @@ pub(crate) fn choose_views(scene: &Scene, views: usize) -> Scene {
     Scene {
         train: chosen.iter().map(|i| scene.train[*i].clone()).collect(),
         test: vec![],
-        reference: scene.reference.as_ref().map(|r| Reference { view: 0, ..r.clone() }),
+        references: scene.references.iter().take(1).map(|r| Reference { view: 0, ..r.clone() }).collect(),
         ..scene.clone()
     }
 }

@@ -102,8 +102,8 @@ pub struct SceneFacts {
     pub masks: usize,
     /// Views with a depth prior.
     pub priors: usize,
-    /// Whether there is an inpainted view.
-    pub reference: bool,
+    /// Inpainted views.
+    pub references: usize,
 }
 
 impl SceneFacts {
@@ -118,7 +118,7 @@ impl SceneFacts {
             points: scene.points.len(),
             masks: scene.train.iter().filter(|view| view.mask.is_some()).count(),
             priors: scene.train.iter().filter(|view| view.prior.is_some()).count(),
-            reference: scene.reference.is_some(),
+            references: scene.references.len(),
         }
     }
 }

@@ -158,7 +158,7 @@ fn facts(report: &Report) -> Markup {
                 tr { th { "Driver" } td { (device.driver) } }
                 tr { th { "Scene" } td {
                     (scene.train_views) " training views of " (width) " × " (height) " pixels, " (scene.masks) " masks, "
-                    (scene.priors) " depth priors, " @if scene.reference { "one" } @else { "no" } " inpainted view; "
+                    (scene.priors) " depth priors, " (inpainted(scene.references)) "; "
                     (scene.test_views) " held-out views; " (scene.points) " points"
                 } }
                 tr { th { "Program" } td { "gscream-vk " (report.version) } }
@@ -354,6 +354,15 @@ fn range(range: Option<[f64; 2]>, digits: usize) -> Markup {
     }
 }
 
+/// How many inpainted views, in words.
+fn inpainted(views: usize) -> String {
+    match views {
+        0 => "no inpainted view".into(),
+        1 => "one inpainted view".into(),
+        n => format!("{n} inpainted views"),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -465,7 +474,7 @@ mod tests {
                 points: 5000,
                 masks: 60,
                 priors: 0,
-                reference: false,
+                references: 0,
             },
             device,
             settings: crate::config::Settings::default(),

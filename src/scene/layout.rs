@@ -53,7 +53,8 @@ pub(super) struct Layout {
     pub train: Vec<Entry>,
     /// Their priors, if there are any, are of pictures without the object.
     pub test: Vec<Entry>,
-    pub reference: Option<ReferenceFiles>,
+    /// Inpainted pictures, sorted by name.
+    pub references: Vec<ReferenceFiles>,
     /// The kind of prior that this layout has, if it has any.
     pub kind: Option<PriorKind>,
     pub notes: Vec<String>,
@@ -67,7 +68,7 @@ type Index = BTreeMap<String, PathBuf>;
 /// Finds out how `scene` is laid out and lists its files.
 ///
 /// # Errors
-/// No pictures; two files of one name in a folder; `depth/` beside `disparity/`; a reference for no train view, or several.
+/// No pictures; two files of one name in a folder; `depth/` beside `disparity/`; a reference for no train view.
 pub(super) fn find(scene: &Path) -> Result<Layout, Error> {
     let spin_images =
         ["images_4", "images_2", "images_8", "images"].into_iter().find(|name| scene.join(name).join("label").is_dir());
@@ -126,9 +127,9 @@ fn plain(scene: &Path) -> Result<Layout, Error> {
         let all: Index = images.into_iter().chain(test_images).collect();
         notes.extend(strays(kind.folder(), &priors, &all));
     }
-    let reference = reference(&scene.join("reference"), &train)?;
+    let references = references(&scene.join("reference"), &train)?;
     let found = format!("plain layout: pictures in {folder}/");
-    Ok(Layout { found, train, test, reference, kind, notes, tall_test_mask: None })
+    Ok(Layout { found, train, test, references, kind, notes, tall_test_mask: None })
 }
 
 /// A note on files that belong to no picture.
@@ -153,12 +154,12 @@ fn spin_nerf(scene: &Path, folder: &str) -> Result<Layout, Error> {
     let test_mask =
         |name: &String| test_masks.get(name).or_else(|| test_masks.get(&format!("out_{:05}", position[name]))).cloned();
     let test = entries(&split.test, test_mask, |_| None);
-    let (reference, note) = spin_reference(scene, &images, &train, split.reference.as_deref())?;
+    let (references, note) = spin_reference(scene, &images, &train, split.reference.as_deref())?;
     Ok(Layout {
         found: format!("SPIn-NeRF's layout: pictures in {folder}/, train masks in {folder}/label/"),
         train,
         test,
-        reference,
+        references,
         kind: None,
         notes: split.notes.into_iter().chain(note).collect(),
         tall_test_mask: Some(SPIN_TALL_MASK),
@@ -190,12 +191,10 @@ fn gscream_copy(scene: &Path, by: &str) -> Result<Layout, Error> {
     let test_mask =
         |name: &String| test_masks.get(name).or_else(|| numbered.get(&format!("out_{:05}", position[name]))).cloned();
     let test = entries(&split.test, test_mask, prior);
-    let (mut reference, note) = spin_reference(scene, &images, &train, split.reference.as_deref())?;
+    let (mut references, note) = spin_reference(scene, &images, &train, split.reference.as_deref())?;
     let mut notes: Vec<String> = split.notes.into_iter().chain(note).collect();
-    if let Some(files) = &mut reference
-        && files.prior.is_none()
-        && let Some((path, kind)) = prior(&files.name)
-    {
+    for files in &mut references {
+        let Some((path, kind)) = prior(&files.name).filter(|_| files.prior.is_none()) else { continue };
         notes.push(format!(
             "the reference's depth is {}, as this layout has it (made from the inpainted picture)",
             relative(scene, &path)
@@ -206,7 +205,7 @@ fn gscream_copy(scene: &Path, by: &str) -> Result<Layout, Error> {
         found: format!("GScream's copy of SPIn-NeRF: pictures in {folder}/, recognised by {by}/"),
         train,
         test,
-        reference,
+        references,
         kind: (!depth.is_empty()).then_some(PriorKind::Depth),
         notes,
         tall_test_mask: Some(SPIN_TALL_MASK),
@@ -252,14 +251,15 @@ fn spin_reference(
     images: &Path,
     train: &[Entry],
     name: Option<&str>,
-) -> Result<(Option<ReferenceFiles>, Option<String>), Error> {
+) -> Result<(Vec<ReferenceFiles>, Option<String>), Error> {
     for folder in [scene.join("reference"), images.join("reference")] {
-        if let Some(found) = reference(&folder, train)? {
-            return Ok((Some(found), None));
+        let found = references(&folder, train)?;
+        if !found.is_empty() {
+            return Ok((found, None));
         }
     }
     let Some(name) = name else {
-        return Ok((None, Some("no reference/ with one inpainted picture was found".into())));
+        return Ok((vec![], Some("no reference/ with one inpainted picture was found".into())));
     };
     let mut candidates = Vec::new();
     for root in [images, scene] {
@@ -279,10 +279,10 @@ fn spin_reference(
     Ok(match found {
         Some(image) => {
             let note = format!("the reference is {}, taken for the benchmark's view {name}", relative(scene, &image));
-            (Some(ReferenceFiles { name: name.to_string(), image, prior: None }), Some(note))
+            (vec![ReferenceFiles { name: name.to_string(), image, prior: None }], Some(note))
         }
         None => (
-            None,
+            vec![],
             Some(format!(
                 "no inpainted picture of the benchmark's reference view was found (looked for reference/{name}.png and lama_images/{name}.png)"
             )),
@@ -290,41 +290,38 @@ fn spin_reference(
     })
 }
 
-/// The one inpainted picture in `folder`, its train view and its prior; `None` if there is no such folder or no picture.
+/// The inpainted pictures in `folder`, their train views and priors; none if there is no such folder or no picture.
 ///
-/// The prior is NAME_depth or NAME_disparity (`.npy`, `.exr`, `.png`), whose kind is said, or NAME (`.npy`, `.exr`).
-fn reference(folder: &Path, train: &[Entry]) -> Result<Option<ReferenceFiles>, Error> {
+/// A prior is NAME_depth or NAME_disparity (`.npy`, `.exr`, `.png`), whose kind is said, or NAME (`.npy`, `.exr`).
+fn references(folder: &Path, train: &[Entry]) -> Result<Vec<ReferenceFiles>, Error> {
     let kinds = [PriorKind::Depth, PriorKind::Disparity];
     let suffixed = |name: &str| kinds.into_iter().any(|k| name.ends_with(k.suffix()));
     let known = |name: &str| train.iter().any(|e| e.name == name);
     let mut pictures = index(folder, &PICTURES)?;
     pictures.retain(|name, _| known(name) || !suffixed(name));
-    if pictures.len() > 1 {
-        let names: Vec<&str> = pictures.keys().take(2).map(String::as_str).collect();
-        let what = format!(
-            "{} pictures ({}, ...); a scene has one reference view: keep one",
-            pictures.len(),
-            names.join(", ")
-        );
-        return Err(Error::File { path: folder.to_path_buf(), what });
-    }
-    let Some((name, image)) = pictures.into_iter().next() else {
-        return Ok(None);
-    };
-    if !known(&name) {
-        return Err(Error::ReferenceWithoutView { path: image });
-    }
+    let all = pictures.into_iter().map(|(name, image)| {
+        if !known(&name) {
+            return Err(Error::ReferenceWithoutView { path: image });
+        }
+        let prior = reference_prior(folder, &name)?;
+        Ok(ReferenceFiles { name, image, prior })
+    });
+    all.collect()
+}
+
+/// The prior of the inpainted picture of this name in `folder`, if it has one.
+fn reference_prior(folder: &Path, name: &str) -> Result<Option<ReferencePrior>, Error> {
+    let kinds = [PriorKind::Depth, PriorKind::Disparity];
     let said = kinds.into_iter().flat_map(|kind| {
         priors::EXTENSIONS.map(|e| (with_extension(&folder.join(format!("{name}{}", kind.suffix())), e), Some(kind)))
     });
-    let unsaid = ["npy", "exr"].into_iter().map(|e| (with_extension(&folder.join(&name), e), None));
+    let unsaid = ["npy", "exr"].into_iter().map(|e| (with_extension(&folder.join(name), e), None));
     let found: Vec<_> = said.chain(unsaid).filter(|(path, _)| path.is_file()).collect();
     if let [(first, _), (second, _), ..] = found.as_slice() {
         let what = format!("the reference has a second prior, {}; keep one", second.display());
         return Err(Error::File { path: first.clone(), what });
     }
-    let prior = found.into_iter().next().map(|(path, kind)| ReferencePrior { path, kind });
-    Ok(Some(ReferenceFiles { name, image, prior }))
+    Ok(found.into_iter().next().map(|(path, kind)| ReferencePrior { path, kind }))
 }
 
 /// What kind of prior a file's name says it is, by NAME_depth or NAME_disparity.

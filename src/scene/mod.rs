@@ -85,7 +85,8 @@ pub struct Config {
     /// delivered one: what was inpainted is then the truth. Its hole is its test mask. Empty for the delivered reference.
     pub truth_reference: String,
     /// Depth prior of that view: a file, in the scene's folder unless the path is absolute. Empty for the one under the
-    /// view's name among the scene's priors, or its true depth, if there is one; `none` for no prior.
+    /// view's name among the scene's priors, or its true depth, if there is one; `none` for no prior; `stereo` for depth
+    /// measured over the other test views, by [`condition`].
     pub truth_prior: String,
     /// Depth priors in place of the scene's own: a folder, in the scene's unless the path is absolute. Its name says
     /// `disparity`, or it is depth; `reference/` in it has the inpainted picture's. Empty for the scene's own.
@@ -119,6 +120,8 @@ impl Config {
 
 /// What [`Config::truth_prior`] says for no prior.
 const NO_PRIOR: &str = "none";
+/// What [`Config::truth_prior`] says for depth measured over the other test views.
+const STEREO_PRIOR: &str = "stereo";
 
 impl Default for Config {
     fn default() -> Self {
@@ -241,7 +244,7 @@ pub struct View {
     pub depth: Option<Vec<f32>>,
 }
 
-/// The train view whose hole was inpainted, or a view that never had one ([`Config::truth_reference`]).
+/// A train view whose hole was inpainted, or a view that never had one ([`Config::truth_reference`]).
 #[derive(Clone, Debug)]
 pub struct Reference {
     /// Index into [`Scene::train`]; that view has a mask that is not empty.
@@ -268,8 +271,8 @@ pub struct Scene {
     pub train: Vec<View>,
     /// Views to evaluate on, sorted by name.
     pub test: Vec<View>,
-    /// The inpainted view.
-    pub reference: Option<Reference>,
+    /// The inpainted views, sorted by [`Reference::view`]: one in most scenes, none where there is no hole to fill.
+    pub references: Vec<Reference>,
     /// Points of the sparse model; at least one.
     pub points: Vec<Point>,
     /// 1.1 x the largest distance of a train camera from the mean train camera, world units; 1 if that is zero.
@@ -421,23 +424,23 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     }
     // Only the reference needs the prior of a picture without the object.
     layout.test.iter_mut().for_each(|e| e.prior = None);
-    let mut reference = layout.reference.take();
-    if let (Some(files), true) = (&reference, no_masks) {
+    let mut references = std::mem::take(&mut layout.references);
+    if let (Some(files), true) = (references.first(), no_masks) {
         let file = layout::relative(dir, &files.image);
         notes.push(format!("{file} is not used: without masks there is no hole to fill"));
-        reference = None;
+        references.clear();
     }
-    if reference.is_some() && !(config.masks && config.reference) {
-        reference = None;
+    if !references.is_empty() && !(config.masks && config.reference) {
+        references.clear();
         notes.push("the reference view is ignored, as configured".into());
     }
-    if let Some(files) = &reference {
+    for files in &references {
         let entry = layout.train.iter().find(|e| e.name == files.name).expect("the layout's reference is a train view");
         if entry.mask.is_none() {
             return Err(Error::ReferenceWithoutMask { path: files.image.clone(), name: files.name.clone() });
         }
     }
-    if let (None, Some(name)) = (&reference, &truth) {
+    if let (true, Some(name)) = (references.is_empty(), &truth) {
         layout.train.retain(|e| e.name != *name);
         notes.push(format!("{name} is neither trained on nor tested, so that the figures are of the same views"));
     }
@@ -447,9 +450,9 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     }
     let no_priors = layout.train.iter().all(|e| e.prior.is_none());
     if !config.priors {
-        let any = !no_priors || reference.as_ref().is_some_and(|r| r.prior.is_some());
+        let any = !no_priors || references.iter().any(|r| r.prior.is_some());
         layout.train.iter_mut().for_each(|e| e.prior = None);
-        reference.iter_mut().for_each(|r| r.prior = None);
+        references.iter_mut().for_each(|r| r.prior = None);
         if any {
             notes.push("the depth priors are ignored, as configured: the depth losses are off".into());
         }
@@ -478,18 +481,15 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     };
     let mut train = posed(layout.train, "train");
     let mut test = posed(layout.test, "test");
-    if let Some(files) = &reference
-        && !train.iter().any(|e| e.name == files.name)
-    {
+    if let Some(files) = references.iter().find(|files| !train.iter().any(|e| e.name == files.name)) {
         let what = "the model has no pose for the view of this inpainted picture".into();
         return Err(Error::File { path: files.image.clone(), what });
     }
     if !clean_views && config.test_every > 0 {
-        let kept = reference.as_ref().map(|r| r.name.clone());
         let mut position = 0;
         (test, train) = train.into_iter().partition(|e| {
-            // The reference view always trains, and does not count.
-            let is_reference = Some(&e.name) == kept.as_ref();
+            // A reference view always trains, and does not count.
+            let is_reference = references.iter().any(|r| r.name == e.name);
             position += u32::from(!is_reference);
             !is_reference && (position - 1).is_multiple_of(config.test_every)
         });
@@ -542,25 +542,30 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     train.shrink_to_fit();
     let test: Vec<View> = loaded_test.into_iter().map(|l| l.view).collect();
 
-    let reference = match reference {
-        None => None,
-        Some(files) => {
-            let at = train.iter().position(|v| v.name == files.name).expect("the reference view is never held out");
-            let (loaded, note) =
-                read_reference(dir, &files, &train[at], &train_files[at], at, picture_sizes[at], layout.kind)?;
-            notes.extend(note);
-            Some(loaded)
-        }
-    };
-    summarise(&train, &test, reference.as_ref(), model.points.len(), config, &mut notes);
+    let mut read_references = vec![];
+    for files in references {
+        let at = train.iter().position(|v| v.name == files.name).expect("a reference view is never held out");
+        let (loaded, note) =
+            read_reference(dir, &files, &train[at], &train_files[at], at, picture_sizes[at], layout.kind)?;
+        notes.extend(note);
+        read_references.push(loaded);
+    }
+    let mut references = read_references;
+    references.sort_by_key(|r| r.view);
+    summarise(&train, &test, &references, model.points.len(), config, &mut notes);
     let radius = radius(&train);
     if radius.is_none() {
         notes.push("all train cameras stand at one place: the scene radius is taken as 1".into());
     }
-    Ok(Scene { train, test, reference, points: model.points, radius: radius.unwrap_or(1.0), unit: 1.0, notes })
+    Ok(Scene { train, test, references, points: model.points, radius: radius.unwrap_or(1.0), unit: 1.0, notes })
 }
 
 impl Scene {
+    /// The inpainted picture of this train view, if it has one.
+    pub fn reference_of(&self, view: usize) -> Option<&Reference> {
+        self.references.iter().find(|r| r.view == view)
+    }
+
     /// Counts all lengths in the model's units again, those of the files, and returns how many of them one was.
     pub fn restore_unit(&mut self) -> f64 {
         let unit = self.unit;
@@ -601,7 +606,7 @@ fn take_priors(dir: &Path, config: &Config, layout: &mut layout::Layout, notes: 
     }
     layout.kind = Some(kind);
     notes.push(format!("{taken} priors are those of {}, read as {}", folder.display(), kind.folder()));
-    if let Some(reference) = &mut layout.reference {
+    for reference in &mut layout.references {
         let own = files.get(&format!("reference/{}", reference.name)).cloned();
         match (own, &reference.prior) {
             (Some(path), _) => reference.prior = Some(layout::ReferencePrior { path, kind: Some(kind) }),
@@ -620,23 +625,24 @@ fn take_reference(
     notes: &mut Vec<String>,
 ) -> Result<(), Error> {
     if !config.truth_reference.is_empty() {
-        let what = "scene.reference_file and scene.truth_reference are both set; a scene has one reference";
+        let what = "scene.reference_file and scene.truth_reference are both set; name one of the two";
         return Err(Error::Setting(what.into()));
     }
     let image = dir.join(&config.reference_file);
     let file = image.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let stem = layout::stem(&file);
-    let delivered = layout.reference.take();
+    let mut delivered = std::mem::take(&mut layout.references);
     let named = layout.train.iter().find(|e| file_part(&e.name) == stem).map(|e| e.name.clone());
-    let Some(name) = named.or_else(|| delivered.as_ref().map(|d| d.name.clone())) else {
+    let Some(name) = named.or_else(|| delivered.first().map(|d| d.name.clone())) else {
         return Err(Error::ReferenceWithoutView { path: image });
     };
     notes.push(format!("the reference is {}, taken for view {name}", image.display()));
-    let prior = delivered.filter(|d| d.name == name).and_then(|d| d.prior);
+    delivered.retain(|d| d.name == name);
+    let prior = delivered.pop().and_then(|d| d.prior);
     if prior.is_some() {
         notes.push("its prior is the delivered picture's".into());
     }
-    layout.reference = Some(layout::ReferenceFiles { name, image, prior });
+    layout.references = vec![layout::ReferenceFiles { name, image, prior }];
     Ok(())
 }
 
@@ -670,7 +676,7 @@ fn take_truth(
             let exact = entry.depth.clone().map(|path| (path, PriorKind::Depth));
             entry.prior.clone().or(exact).map(|(path, kind)| layout::ReferencePrior { path, kind: Some(kind) })
         }
-        NO_PRIOR => None,
+        NO_PRIOR | STEREO_PRIOR => None,
         file => {
             let path = dir.join(file);
             let kind = layout::said_kind(&path);
@@ -681,9 +687,8 @@ fn take_truth(
     (entry.prior, entry.depth) = (None, None);
     let name = entry.name.clone();
     notes.push(format!("test view {name} is trained on as the reference: its photograph shows the truth"));
-    if let Some(delivered) =
-        layout.reference.replace(layout::ReferenceFiles { name: name.clone(), image: entry.image.clone(), prior })
-    {
+    let truth = layout::ReferenceFiles { name: name.clone(), image: entry.image.clone(), prior };
+    for delivered in std::mem::replace(&mut layout.references, vec![truth]) {
         let file = layout::relative(dir, &delivered.image);
         notes.push(format!("{file} is set aside; its view trains as any other with a mask"));
     }
@@ -705,7 +710,7 @@ fn radius(train: &[View]) -> Option<f32> {
 fn summarise(
     train: &[View],
     test: &[View],
-    reference: Option<&Reference>,
+    references: &[Reference],
     points: usize,
     config: &Config,
     notes: &mut Vec<String>,
@@ -722,10 +727,11 @@ fn summarise(
         (count(PriorKind::Disparity), "disparity priors"),
     ];
     let having: String = having.iter().filter(|(n, _)| *n > 0).map(|(n, what)| format!(", {n} {what}")).collect();
-    let inpainted = reference.map_or_else(String::new, |r| {
+    let inpainted = |r: &Reference| {
         let prior = r.prior.as_ref().map_or("no", |p| p.kind.folder());
         format!("reference view {} with {prior} prior; ", train[r.view].name)
-    });
+    };
+    let inpainted: String = references.iter().map(inpainted).collect();
     notes.push(format!(
         "{} train views at {size}{having}; {inpainted}{} test views; {points} points",
         train.len(),
@@ -750,17 +756,17 @@ fn summarise(
                 "the masks cover {percent} % of the pictures; if they are 0 on the object, set invert_masks"
             ));
         }
-        if reference.is_none() {
+        if references.is_empty() {
             notes.push("masks but no reference view: the hole is left unsupervised".into());
         }
     }
     let priors = train.iter().filter(|v| v.prior.is_some()).count();
-    let reference_prior = reference.is_some_and(|r| r.prior.is_some());
+    let reference_prior = references.iter().any(|r| r.prior.is_some());
     if config.priors && priors == 0 && !reference_prior {
         notes.push("no depth priors: the depth losses are off".into());
-    } else if config.priors && (priors < train.len() || reference.is_some() && !reference_prior) {
+    } else if config.priors && (priors < train.len() || !references.is_empty() && !reference_prior) {
         let without = train.len() - priors;
-        let hole = if reference.is_some() && !reference_prior { ", nor has the inpainted picture" } else { "" };
+        let hole = if !references.is_empty() && !reference_prior { ", nor has the inpainted picture" } else { "" };
         notes.push(format!("{without} of {} train views have no depth prior{hole}: no depth loss there", train.len()));
     }
     if test.is_empty() {

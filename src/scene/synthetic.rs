@@ -534,7 +534,7 @@ mod tests {
         write(dir.path(), &options()).expect("written");
         let scene = load(dir.path(), &Config::default()).expect("loaded");
         let (room, (train, _)) = (Room::new(7), Shot::all(&options()));
-        let reference = scene.reference.as_ref().expect("there is a reference");
+        let reference = scene.references.first().expect("there is a reference");
         let inpainted = reference.prior.as_ref().expect("it has a prior");
         let own =
             train.iter().zip(&scene.train).map(|(s, v)| (s, v.prior.as_ref().expect("priors were written"), true));

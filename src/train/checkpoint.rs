@@ -361,7 +361,7 @@ impl Fingerprint {
                 parts.push((format!("{set} {}", view.name), hex(hasher)));
             }
         }
-        if let Some(reference) = &scene.reference {
+        for reference in &scene.references {
             let mut hasher = blake3::Hasher::new();
             hasher.update(reference.image.as_raw());
             hash_prior(&mut hasher, reference.prior.as_ref());

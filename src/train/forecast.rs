@@ -191,7 +191,7 @@ impl Forecast {
 fn kinds(scene: &Scene) -> Vec<usize> {
     let mut seen = BTreeSet::new();
     let kind = |i: usize, view: &View| {
-        let reference = scene.reference.as_ref().filter(|r| r.view == i);
+        let reference = scene.reference_of(i);
         let prior = reference.map_or(view.prior.is_some(), |r| r.prior.is_some());
         let masked = view.mask.as_ref().is_some_and(|m| m.as_raw().iter().any(|&v| v != 0));
         (reference.is_some(), masked, prior, view.camera.size)
@@ -376,7 +376,7 @@ fn resized(scene: &Scene, from: u32, to: u32) -> Scene {
             depth: None,
         }
     };
-    let reference = scene.reference.as_ref().map(|r| {
+    let references = scene.references.iter().map(|r| {
         let size @ [w, h] = scaled([r.image.width(), r.image.height()]);
         let prior = r.prior.as_ref().map(|p| blank(p, size));
         Reference { view: r.view, image: RgbImage::new(w, h), prior }
@@ -384,7 +384,7 @@ fn resized(scene: &Scene, from: u32, to: u32) -> Scene {
     Scene {
         train: scene.train.iter().map(view).collect(),
         test: scene.test.iter().map(view).collect(),
-        reference,
+        references: references.collect(),
         points: scene.points.clone(),
         radius: scene.radius,
         unit: scene.unit,

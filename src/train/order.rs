@@ -7,23 +7,24 @@ use rand_pcg::Pcg64;
 use super::config::{Config, ViewOrder};
 use crate::scene::Scene;
 
-/// A view that is visited more often than the others.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Favorite {
-    /// Which.
-    pub view: usize,
-    /// Its share of all steps, from 0 (like the others) to below 1.
+/// Views that are visited more often than the others, in turn.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Favorites {
+    /// Which, ascending.
+    pub views: Vec<usize>,
+    /// Their share of all steps together, from 0 (like the others) to below 1.
     pub share: f64,
 }
 
 /// Views without replacement: every view once per round, in an order of its own. The order of a round depends on the
-/// seed and the round alone, so that any step's view is known without the steps before it. A favourite has steps of its
-/// own, evenly spread; the rounds of the others fill those between.
+/// seed and the round alone, so that any step's view is known without the steps before it. Favourites have steps of
+/// their own, evenly spread; the rounds of the others fill those between.
 #[derive(Clone, Debug)]
 pub struct Order {
-    views: usize,
-    favorite: Option<Favorite>,
-    /// Where between two of its steps the favourite's first one lies.
+    /// Of the rounds: all views that are no favourites.
+    views: Vec<usize>,
+    favorites: Option<Favorites>,
+    /// Where between two of their steps the favourites' first one lies.
     phase: f64,
     seed: u64,
     order: ViewOrder,
@@ -35,43 +36,46 @@ impl Order {
     ///
     /// # Panics
     /// Without a view.
-    pub fn new(views: usize, favorite: Option<Favorite>, seed: u64, order: ViewOrder) -> Self {
+    pub fn new(views: usize, favorites: Option<Favorites>, seed: u64, order: ViewOrder) -> Self {
         assert!(views > 0, "a scene has at least one training view");
-        let favorite = favorite.filter(|f| f.share > 0.0 && views > 1);
+        let favorites = favorites.filter(|f| f.share > 0.0 && !f.views.is_empty() && f.views.len() < views);
         let phase = rand::RngExt::random::<f64>(&mut random(seed, Stream::Favorite, 0));
-        Self { views, favorite, phase, seed, order, round: None }
+        let others = (0..views).filter(|v| favorites.as_ref().is_none_or(|f| !f.views.contains(v))).collect();
+        Self { views: others, favorites, phase, seed, order, round: None }
     }
 
-    /// Of a scene's views, the reference among them.
+    /// Of a scene's views, the references among them. These are visited no less than the others.
     pub fn of(scene: &Scene, config: &Config) -> Self {
-        let favorite = scene.reference.as_ref().map(|r| Favorite { view: r.view, share: config.reference_share });
-        Self::new(scene.train.len(), favorite, config.seed, config.view_order)
+        let views: Vec<usize> = scene.references.iter().map(|r| r.view).collect();
+        let alike = views.len() as f64 / scene.train.len() as f64;
+        let share = if config.reference_share > 0.0 { config.reference_share.max(alike) } else { 0.0 };
+        Self::new(scene.train.len(), Some(Favorites { views, share }), config.seed, config.view_order)
     }
 
     /// The view of `step` (counted from 1).
     pub fn view(&mut self, step: u32) -> usize {
         let index = u64::from(step - 1);
-        let Some(Favorite { view, share }) = self.favorite else { return self.in_round(index, self.views) };
+        let Some(Favorites { views, share }) = &self.favorites else { return self.in_round(index) };
         let visits = |steps: u64| (steps as f64 * share + self.phase).floor() as u64;
         let before = visits(index);
         if visits(index + 1) > before {
-            return view;
+            return views[(before % views.len() as u64) as usize];
         }
-        let other = self.in_round(index - before, self.views - 1);
-        other + usize::from(other >= view)
+        self.in_round(index - before)
     }
 
-    fn in_round(&mut self, index: u64, views: usize) -> usize {
-        let (round, place) = ((index / views as u64) as u32, (index % views as u64) as usize);
+    fn in_round(&mut self, index: u64) -> usize {
+        let views = self.views.len() as u64;
+        let (round, place) = ((index / views) as u32, (index % views) as usize);
         if self.order == ViewOrder::Sequential {
-            return place;
+            return self.views[place];
         }
         if self.round.as_ref().is_none_or(|(r, _)| *r != round) {
-            let mut order: Vec<usize> = (0..views).collect();
+            let mut order: Vec<usize> = (0..self.views.len()).collect();
             order.shuffle(&mut random(self.seed, Stream::Views, round));
             self.round = Some((round, order));
         }
-        self.round.as_ref().map_or(place, |(_, views)| views[place])
+        self.views[self.round.as_ref().map_or(place, |(_, order)| order[place])]
     }
 }
 
@@ -121,8 +125,8 @@ mod tests {
     #[test]
     fn a_favorite_has_its_share_and_the_others_their_rounds() {
         for (views, view, share) in [(2, 0, 0.5), (7, 6, 0.18), (60, 29, 0.18), (60, 0, 0.9), (5, 2, 1e-3)] {
-            let favorite = Some(Favorite { view, share });
-            let mut order = Order::new(views, favorite, 3, ViewOrder::Shuffled);
+            let favorite = Some(Favorites { views: vec![view], share });
+            let mut order = Order::new(views, favorite.clone(), 3, ViewOrder::Shuffled);
             let steps = 40 * views as u32;
             let all: Vec<usize> = (1..=steps).map(|s| order.view(s)).collect();
             let visits: Vec<usize> = (0..all.len()).filter(|i| all[*i] == view).collect();
@@ -139,11 +143,26 @@ mod tests {
             assert_eq!(Order::new(views, favorite, 3, ViewOrder::Shuffled).view(steps), all[all.len() - 1]);
         }
         // Nobody else is there, or it has no share of its own.
-        assert_eq!(Order::new(1, Some(Favorite { view: 0, share: 0.5 }), 0, ViewOrder::Shuffled).view(3), 0);
-        let none = Some(Favorite { view: 1, share: 0.0 });
+        assert_eq!(Order::new(1, Some(Favorites { views: vec![0], share: 0.5 }), 0, ViewOrder::Shuffled).view(3), 0);
+        let none = Some(Favorites { views: vec![1], share: 0.0 });
         let mut plain = Order::new(4, None, 1, ViewOrder::Shuffled);
         let mut same = Order::new(4, none, 1, ViewOrder::Shuffled);
         assert!((1..30).all(|s| plain.view(s) == same.view(s)));
+    }
+
+    #[test]
+    fn several_favorites_take_turns() {
+        let favorites = Favorites { views: vec![1, 4, 5], share: 0.25 };
+        let mut order = Order::new(9, Some(favorites.clone()), 3, ViewOrder::Shuffled);
+        let all: Vec<usize> = (1..=240).map(|s| order.view(s)).collect();
+        let visits: Vec<usize> = all.iter().copied().filter(|v| favorites.views.contains(v)).collect();
+        assert_eq!(visits, [1, 4, 5].repeat(20));
+        let others: Vec<usize> = all.into_iter().filter(|v| !favorites.views.contains(v)).collect();
+        for round in others.chunks_exact(6) {
+            let mut sorted = round.to_vec();
+            sorted.sort_unstable();
+            assert_eq!(sorted, [0, 2, 3, 6, 7, 8]);
+        }
     }
 
     #[test]

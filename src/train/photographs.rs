@@ -21,7 +21,7 @@ pub struct Photograph {
     pub camera: Camera,
     /// How many times smaller the picture is than the training size.
     pub reduction: u32,
-    /// True for the reference view: its picture is the inpainted one.
+    /// True for a reference view: its picture is the inpainted one.
     pub reference: bool,
     /// `[pixel]` red | green << 8 | blue << 16 | mask << 24.
     pub picture: Buffer<u32>,
@@ -67,7 +67,7 @@ pub fn reduced_size(size: [u32; 2], reduction: u32) -> [u32; 2] {
 pub fn upload(gpu: &Gpu, scene: &Scene, plan: &Plan, reduction: u32) -> Result<Vec<Photograph>, Error> {
     let mut all = vec![];
     for (i, view) in scene.train.iter().enumerate() {
-        let reference = scene.reference.as_ref().filter(|r| r.view == i);
+        let reference = scene.reference_of(i);
         let picture = reference.map_or(&view.image, |r| &r.image);
         let prior = match reference {
             Some(r) => r.prior.as_ref(),

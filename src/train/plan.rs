@@ -97,8 +97,8 @@ pub struct Plan {
     pub trained: Trained,
     /// Figures on the test views.
     pub evaluation: bool,
-    /// The reference view, an index into the training views.
-    pub reference: Option<usize>,
+    /// The reference views, indices into the training views.
+    pub references: Vec<usize>,
     /// Distinct sizes of training pictures, at first those of the first step.
     pub sizes: Vec<[u32; 2]>,
     /// Steps.
@@ -136,18 +136,18 @@ impl Plan {
         let mut leave = |what, why: &str| left_out.push(LeftOut { what, why: why.to_owned() });
         let iterations = settings.train.iterations;
         let masks = scene.train.iter().any(|v| v.mask.is_some());
-        let reference_gaps = scene.reference.iter().filter_map(|r| r.prior.as_ref());
+        let reference_gaps = scene.references.iter().filter_map(|r| r.prior.as_ref());
         let gaps = scene.train.iter().filter_map(|v| v.prior.as_ref()).chain(reference_gaps).any(Prior::has_gaps);
         if !masks && !gaps {
             leave("pixel weights", "no view has a mask");
         }
-        if scene.reference.is_none() {
+        if scene.references.is_empty() {
             leave("reference view", "the scene has no inpainted picture");
         }
         let config = &settings.losses.depth;
-        let reference = scene.reference.as_ref().map(|r| r.view);
-        let reference_prior = scene.reference.as_ref().is_some_and(|r| r.prior.is_some());
-        let other_priors = scene.train.iter().enumerate().any(|(i, v)| Some(i) != reference && v.prior.is_some());
+        let references: Vec<usize> = scene.references.iter().map(|r| r.view).collect();
+        let reference_prior = scene.references.iter().any(|r| r.prior.is_some());
+        let other_priors = scene.train.iter().enumerate().any(|(i, v)| !references.contains(&i) && v.prior.is_some());
         let of = |prior, is_reference| {
             if prior { depth_losses(config, is_reference, masks) } else { DepthLosses::default() }
         };
@@ -163,7 +163,7 @@ impl Plan {
         } else if !other_depth.any() && scene.train.len() > 1 {
             let why = if other_priors { "their weights are zero" } else { "they have no prior" };
             leave("depth of views other than the reference", why);
-        } else if !reference_depth.any() && reference.is_some() {
+        } else if !reference_depth.any() && !references.is_empty() {
             let why = if reference_prior { "its weights are zero" } else { "it has no prior" };
             leave("depth of the reference view", why);
         }
@@ -247,7 +247,7 @@ impl Plan {
             sentinel,
             trained,
             evaluation,
-            reference,
+            references,
             sizes,
             iterations,
             left_out,

@@ -52,7 +52,7 @@ fn step() {
             masks: true,
             depth: true,
             depth_gradient: true,
-            reference: Some(0),
+            references: vec![0],
             sizes: vec![cameras[0].size],
             ..Plan::default()
         };

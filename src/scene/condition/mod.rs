@@ -5,7 +5,8 @@
 //! - [`sparse`]: each prior is held against the points of the sparse model. One that does not follow them is not used, and
 //!   disparity becomes depth.
 //! - [`points`]: points on the object are left out, and the hole gets points from the reference view's prior.
-//! - [`reference`](mod@reference): the inpainted picture counts in its hole alone, and less where other views see past the
+//! - [`stereo`]: a reference that shows the truth gets the depth that the test views measure, where that is asked for.
+//! - [`reference`](mod@reference): an inpainted picture counts in its hole alone, and less where other views see past the
 //!   object.
 //!
 //! Each has a setting in [`Config`], and with all of them off the capture stays as it was read.
@@ -13,9 +14,10 @@
 mod points;
 mod reference;
 mod sparse;
+mod stereo;
 mod unit;
 
-use super::{Config, Scene};
+use super::{Config, STEREO_PRIOR, Scene};
 
 pub use unit::footprint;
 
@@ -23,21 +25,24 @@ pub use unit::footprint;
 pub fn condition(scene: &mut Scene, config: &Config) {
     unit::normalize(scene, config.unit);
     points::drop_object(scene, config.object_point_share);
+    if config.truth_prior == STEREO_PRIOR {
+        stereo::measure_prior(scene);
+    }
     if config.check_priors {
         sparse::check_priors(scene);
     }
     if config.guess_reference_prior {
-        reference::guess_prior(scene);
+        reference::guess_priors(scene);
     }
-    let depth = reference::hole_depth(scene);
+    let depths = reference::hole_depths(scene);
     if config.seed_hole {
-        points::seed_hole(scene, depth.as_deref());
+        points::seed_holes(scene, &depths);
     }
     reference::soften_masks(scene, config.rim);
     if !config.whole_reference {
         reference::composite(scene);
     }
     if config.outrank_guess > 0 {
-        reference::outrank(scene, depth.as_deref(), config.outrank_guess);
+        reference::outrank(scene, &depths, config.outrank_guess);
     }
 }

@@ -61,21 +61,29 @@ pub(super) fn drop_object(scene: &mut Scene, share: f64) {
         .push(format!("{count} of {all} points stand on the object and are left out (scene.object_point_share)"));
 }
 
-/// Adds a point for every pixel of the reference view's hole, at `depth` (\[pixel\], NaN outside the hole).
-pub(super) fn seed_hole(scene: &mut Scene, depth: Option<&[f32]>) {
-    let (Some(reference), Some(depth)) = (&scene.reference, depth) else { return };
-    let camera = &scene.train[reference.view].camera;
+/// Adds a point for every pixel of the references' holes, at their depths (\[pixel\], NaN outside the hole). What an earlier
+/// reference has given points to gets none from a later one.
+pub(super) fn seed_holes(scene: &mut Scene, depths: &[Option<Vec<f32>>]) {
     let before = scene.points.len();
-    for (pixel, z) in depth.iter().enumerate().filter(|(_, z)| z.is_finite()) {
-        let Some(position) = lift(camera, pixel, f64::from(*z)) else { continue };
-        let [w, _] = camera.size;
-        let color = reference.image.get_pixel(pixel as u32 % w, pixel as u32 / w).0;
-        scene.points.push(Point { position: position.map(|v| v as f32), color });
+    let mut seeded: Vec<(&Camera, &[f32])> = vec![];
+    for (reference, depth) in scene.references.iter().zip(depths) {
+        let Some(depth) = depth else { continue };
+        let camera = &scene.train[reference.view].camera;
+        for (pixel, z) in depth.iter().enumerate().filter(|(_, z)| z.is_finite()) {
+            let Some(position) = lift(camera, pixel, f64::from(*z)) else { continue };
+            if seeded.iter().any(|(other, depth)| pixel_of(other, position).is_some_and(|p| depth[p].is_finite())) {
+                continue;
+            }
+            let [w, _] = camera.size;
+            let color = reference.image.get_pixel(pixel as u32 % w, pixel as u32 / w).0;
+            scene.points.push(Point { position: position.map(|v| v as f32), color });
+        }
+        seeded.push((camera, depth));
     }
     let added = scene.points.len() - before;
     if added > 0 {
         scene.notes.push(format!(
-            "{added} points are added in the hole, at the depth of the reference view's prior (scene.seed_hole)"
+            "{added} points are added in the hole, at the depth of the reference's prior (scene.seed_hole)"
         ));
     }
 }
@@ -100,11 +108,18 @@ mod tests {
         let dropped = read.points.len() - scene.points.len();
         assert!((100..1000).contains(&dropped), "{dropped}");
         let left = scene.points.len();
-        let depth = reference::hole_depth(&scene).expect("the reference has a prior");
-        seed_hole(&mut scene, Some(&depth));
-        let mask = scene.train[scene.reference.as_ref().expect("one").view].mask.as_ref().expect("one");
+        let depths = reference::hole_depths(&scene);
+        assert!(depths[0].is_some(), "the reference has a prior");
+        seed_holes(&mut scene, &depths);
+        let mask = scene.train[scene.references[0].view].mask.as_ref().expect("one");
         let hole = mask.as_raw().iter().filter(|m| **m != 0).count();
         assert_eq!(scene.points.len() - left, hole);
+        // A second reference of the same hole gives no second points.
+        let mut twice = scene.clone();
+        twice.points.truncate(left);
+        twice.references.push(twice.references[0].clone());
+        seed_holes(&mut twice, &[depths[0].clone(), depths[0].clone()]);
+        assert_eq!(twice.points.len() - left, hole);
         // They lie where the room is: each is near a point that structure from motion would have found there, had the
         // object been away. The room is a box from -2 to 2; nothing floats in front of the bench at y = 0.
         let inside = scene.points[left..].iter().filter(|p| p.position.iter().all(|x| x.abs() < 6.0)).count();

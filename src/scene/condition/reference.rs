@@ -1,16 +1,19 @@
-//! The inpainted picture: how deep its hole is, and how far it is believed.
+//! The inpainted pictures: how deep their holes are, and how far they are believed.
 
 use image::{GrayImage, Luma};
 use rayon::prelude::*;
 
 use super::points::{lift, pixel_of};
-use super::sparse::{Sample, fit, samples};
-use crate::scene::{Prior, PriorKind, Scene, resample};
+use super::sparse::{fit, samples};
+use crate::scene::{Prior, PriorKind, Reference, Scene, resample};
 
-/// Depth z of the hole of the reference view \[pixel\], NaN outside it: its prior brought to the scene's depth by the points
-/// outside the mask. `None` without a reference, a prior, or enough points.
-pub(super) fn hole_depth(scene: &Scene) -> Option<Vec<f32>> {
-    let reference = scene.reference.as_ref()?;
+/// Of each reference, the depth z of its hole \[pixel\], NaN outside it: its prior brought to the scene's depth by the points
+/// outside the mask. `None` without a prior, or without enough points.
+pub(super) fn hole_depths(scene: &Scene) -> Vec<Option<Vec<f32>>> {
+    scene.references.iter().map(|reference| hole_depth(scene, reference)).collect()
+}
+
+fn hole_depth(scene: &Scene, reference: &Reference) -> Option<Vec<f32>> {
     let prior = reference.prior.as_ref()?;
     let view = &scene.train[reference.view];
     let mask = view.mask.as_ref()?;
@@ -27,67 +30,100 @@ pub(super) fn hole_depth(scene: &Scene) -> Option<Vec<f32>> {
 }
 
 /// Nearest samples that a pixel's depth is guessed from.
-const NEIGHBORS: usize = 48;
+const NEIGHBORS: usize = 150;
 /// Colours this far apart (8-bit, root mean square over channels) are taken to be of different surfaces.
-const COLOR: f64 = 24.0;
+const COLOR: f64 = 15.0;
+/// Rounds in which samples far from the plane lose their weight: the nearest may be of another surface.
+const ROUNDS: usize = 3;
 
-/// A prior for a reference picture that has none, from the points: at each pixel a plane of inverse depth through the
-/// nearest points, weighted by their distance and by how alike the colours are. It is smooth where the picture is, and
-/// breaks where colours break, like a surface's border.
-pub(super) fn guess_prior(scene: &mut Scene) {
-    let Some(reference) = &scene.reference else { return };
-    let view = &scene.train[reference.view];
-    if reference.prior.is_some() {
-        return;
+/// Priors for the reference pictures that have none, from the points.
+pub(super) fn guess_priors(scene: &mut Scene) {
+    for at in 0..scene.references.len() {
+        if scene.references[at].prior.is_some() {
+            continue;
+        }
+        let Some(values) = guess(scene, &scene.references[at]) else { continue };
+        let name = &scene.train[scene.references[at].view].name;
+        scene.notes.push(format!("reference {name}: it has no prior; its depth is guessed from the points around it"));
+        scene.references[at].prior = Some(Prior { kind: PriorKind::Depth, values });
     }
+}
+
+/// Depth at each pixel: a plane of inverse depth through the nearest points, weighted by their distance, by how alike the
+/// colours are and by how near the plane they are. It is smooth where the picture is, and breaks where colours break, like
+/// a surface's border. `None` with too few points.
+fn guess(scene: &Scene, reference: &Reference) -> Option<Vec<f32>> {
+    let view = &scene.train[reference.view];
     // Points in the hole as well: those on the object have been left out, the others were seen past it.
     let samples = samples(&view.camera, &scene.points, None);
-    if samples.len() < NEIGHBORS {
-        return;
+    let neighbors = NEIGHBORS.min(samples.len() / 4);
+    if neighbors < FEWEST_NEIGHBORS {
+        return None;
     }
     let [w, h] = view.camera.size.map(|n| n as usize);
-    let picture = reference.image.as_raw();
     // Noise of single pixels tells no surfaces apart.
     let blurred = image::imageops::blur(&reference.image, 1.0 + w as f32 / 250.0);
     let color = |pixel: usize| -> [f64; 3] { std::array::from_fn(|c| f64::from(blurred.as_raw()[3 * pixel + c])) };
-    debug_assert_eq!(picture.len(), 3 * w * h);
     let at = |pixel: usize| [(pixel % w) as f64, (pixel / w) as f64];
+    let colors: Vec<[f64; 3]> = samples.iter().map(|s| color(s.pixel)).collect();
     let guess = |pixel: usize| {
         let (here, tint) = (at(pixel), color(pixel));
-        let mut near: Vec<(f64, &Sample)> = samples
+        let mut near: Vec<(f64, usize)> = samples
             .iter()
-            .map(|s| {
+            .enumerate()
+            .map(|(i, s)| {
                 let there = at(s.pixel);
-                ((there[0] - here[0]).powi(2) + (there[1] - here[1]).powi(2), s)
+                ((there[0] - here[0]).powi(2) + (there[1] - here[1]).powi(2), i)
             })
             .collect();
-        near.select_nth_unstable_by(NEIGHBORS - 1, |a, b| a.0.total_cmp(&b.0));
-        near.truncate(NEIGHBORS);
+        near.select_nth_unstable_by(neighbors - 1, |a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        near.truncate(neighbors);
+        // One order, whatever the selection left: sums round alike everywhere.
+        near.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         let reach = near.iter().fold(1.0_f64, |m, (d, _)| m.max(*d));
-        let weighted: Vec<Weighted> = near
+        let mut weighted: Vec<Weighted> = near
             .iter()
-            .map(|(d, s)| {
-                let other = color(s.pixel);
-                let apart: f64 = (0..3).map(|c| (tint[c] - other[c]).powi(2)).sum::<f64>() / 3.0;
+            .map(|(d, i)| {
+                let apart: f64 = (0..3).map(|c| (tint[c] - colors[*i][c]).powi(2)).sum::<f64>() / 3.0;
                 let weight = (-0.5 * apart / COLOR.powi(2)).exp().max(1e-4) / (d + 0.05 * reach);
-                let there = at(s.pixel);
-                (weight, [there[0] - here[0], there[1] - here[1]], 1.0 / s.depth)
+                let there = at(samples[*i].pixel);
+                (weight, [there[0] - here[0], there[1] - here[1]], 1.0 / samples[*i].depth)
             })
             .collect();
-        (1.0 / plane(&weighted, reach)) as f32
+        (1.0 / robust_plane(&mut weighted, reach)) as f32
     };
-    let values: Vec<f32> = (0..w * h).into_par_iter().map(guess).collect();
-    let name = view.name.clone();
-    scene.reference.as_mut().expect("it was there").prior = Some(Prior { kind: PriorKind::Depth, values });
-    scene.notes.push(format!("reference {name}: it has no prior; its depth is guessed from the points around it"));
+    Some((0..w * h).into_par_iter().map(guess).collect())
 }
+
+/// Fewest samples that a plane is laid through.
+const FEWEST_NEIGHBORS: usize = 12;
 
 /// A weight, a place, and the value there.
 type Weighted = (f64, [f64; 2], f64);
 
-/// The value at the origin of a plane through weighted values, its slope held small by a ridge of a tenth of the spread's
-/// weight, within the values' range.
-fn plane(weighted: &[Weighted], reach: f64) -> f64 {
+/// The value at the origin of a plane through weighted values, within their range. Values far from the plane lose weight
+/// (Cauchy's function at two standard deviations, as the median of the residuals tells them).
+fn robust_plane(weighted: &mut [Weighted], reach: f64) -> f64 {
+    let (low, high) = weighted.iter().fold((f64::INFINITY, 0.0_f64), |(a, b), s| (a.min(s.2), b.max(s.2)));
+    for _ in 0..ROUNDS {
+        let [value, x, y] = plane(weighted, reach);
+        let residual = |s: &Weighted| (s.2 - value - x * s.1[0] - y * s.1[1]).abs();
+        let mut sorted: Vec<f64> = weighted.iter().map(residual).collect();
+        let middle = sorted.len() / 2;
+        let deviation = 1.4826 * *sorted.select_nth_unstable_by(middle, f64::total_cmp).1;
+        if deviation == 0.0 {
+            break;
+        }
+        for s in weighted.iter_mut() {
+            s.0 /= 1.0 + (residual(s) / (2.0 * deviation)).powi(2);
+        }
+    }
+    plane(weighted, reach)[0].clamp(low, high)
+}
+
+/// Value at the origin and slopes of a plane through weighted values; the slopes are held small by a ridge of a tenth of
+/// the spread's weight.
+fn plane(weighted: &[Weighted], reach: f64) -> [f64; 3] {
     let total: f64 = weighted.iter().map(|(w, ..)| w).sum();
     let mean = |value: &dyn Fn(&Weighted) -> f64| weighted.iter().map(|s| s.0 * value(s)).sum::<f64>() / total;
     let (mx, my, mv) = (mean(&|s| s.1[0]), mean(&|s| s.1[1]), mean(&|s| s.2));
@@ -99,8 +135,7 @@ fn plane(weighted: &[Weighted], reach: f64) -> f64 {
     let yv = mean(&|s| (s.1[1] - my) * (s.2 - mv));
     let determinant = xx * yy - xy * xy;
     let slope = [(xv * yy - yv * xy) / determinant, (yv * xx - xv * xy) / determinant];
-    let (low, high) = weighted.iter().fold((f64::INFINITY, 0.0_f64), |(a, b), s| (a.min(s.2), b.max(s.2)));
-    (mv - slope[0] * mx - slope[1] * my).clamp(low, high)
+    [mv - slope[0] * mx - slope[1] * my, slope[0], slope[1]]
 }
 
 /// Lets the train masks fall off to 0 over so many pixels around the object, whose antialiased edge, shadow and glow reach
@@ -118,37 +153,59 @@ pub(super) fn soften_masks(scene: &mut Scene, rim: u32) {
     }
 }
 
-/// Takes the inpainted picture in its hole and the photograph outside, mixed as the mask falls off: networks that inpaint
-/// repaint the surroundings as well, and those were photographed.
+/// Takes the inpainted pictures in their holes and the photographs outside, mixed as the mask falls off: networks that
+/// inpaint repaint the surroundings as well, and those were photographed.
 pub(super) fn composite(scene: &mut Scene) {
-    let Some(reference) = &mut scene.reference else { return };
-    let view = &scene.train[reference.view];
-    let Some(mask) = &view.mask else { return };
-    let pixels = reference.image.pixels_mut().zip(view.image.pixels()).zip(mask.as_raw());
-    for ((painted, photographed), m) in pixels {
-        let share = f64::from(*m) / 255.0;
-        for (p, q) in painted.0.iter_mut().zip(photographed.0) {
-            *p = (share * f64::from(*p) + (1.0 - share) * f64::from(q)).round() as u8;
+    for reference in &mut scene.references {
+        let view = &scene.train[reference.view];
+        let Some(mask) = &view.mask else { continue };
+        let pixels = reference.image.pixels_mut().zip(view.image.pixels()).zip(mask.as_raw());
+        for ((painted, photographed), m) in pixels {
+            let share = f64::from(*m) / 255.0;
+            for (p, q) in painted.0.iter_mut().zip(photographed.0) {
+                *p = (share * f64::from(*p) + (1.0 - share) * f64::from(q)).round() as u8;
+            }
         }
     }
 }
 
-/// Lowers the reference's weight where other views see past the object: with n of `enough` views by n / `enough`, so that
+/// Lowers a reference's weight where other views see past the object: with n of `enough` views by n / `enough`, so that
 /// what was photographed outranks what was painted. Its mask says how much the picture counts; inside it stays above 0.
-pub(super) fn outrank(scene: &mut Scene, depth: Option<&[f32]>, enough: u32) {
-    let (Some(reference), Some(depth)) = (&scene.reference, depth) else { return };
-    let at = reference.view;
-    let camera = &scene.train[at].camera;
-    let others: Vec<_> = scene.train.iter().enumerate().filter(|(i, _)| *i != at).map(|(_, v)| v).collect();
+pub(super) fn outrank(scene: &mut Scene, depths: &[Option<Vec<f32>>], enough: u32) {
+    let lowered: Vec<_> = scene
+        .references
+        .iter()
+        .zip(depths)
+        .filter_map(|(reference, depth)| Some((reference.view, outranked(scene, reference, depth.as_ref()?, enough)?)))
+        .collect();
+    for (view, (mask, share)) in lowered {
+        scene.train[view].mask = Some(mask);
+        if share > 0.0 {
+            scene.notes.push(format!(
+                "{:.0} % of the hole of reference {} is seen past the object by {enough} views or more, which outrank the \
+                 painted picture there (scene.outrank_guess)",
+                100.0 * share,
+                scene.train[view].name
+            ));
+        }
+    }
+}
+
+/// The lowered mask, and the share of the hole that enough views see.
+fn outranked(scene: &Scene, reference: &Reference, depth: &[f32], enough: u32) -> Option<(GrayImage, f64)> {
+    let view = &scene.train[reference.view];
+    let mask = view.mask.as_ref()?;
+    // What another reference shows of the hole was painted too.
+    let others: Vec<_> =
+        scene.train.iter().enumerate().filter(|(i, _)| *i != reference.view).map(|(_, view)| view).collect();
     let views = |pixel: usize| -> usize {
         let z = depth[pixel];
-        let Some(position) = z.is_finite().then(|| lift(camera, pixel, f64::from(z))).flatten() else { return 0 };
-        let sees = |view: &&&crate::scene::View| {
-            pixel_of(&view.camera, position).is_some_and(|p| view.mask.as_ref().is_none_or(|m| m.as_raw()[p] == 0))
+        let Some(position) = z.is_finite().then(|| lift(&view.camera, pixel, f64::from(z))).flatten() else { return 0 };
+        let sees = |other: &&&crate::scene::View| {
+            pixel_of(&other.camera, position).is_some_and(|p| other.mask.as_ref().is_none_or(|m| m.as_raw()[p] == 0))
         };
         others.iter().filter(sees).count()
     };
-    let Some(mask) = scene.train[at].mask.as_ref() else { return };
     let counted: Vec<usize> = (0..depth.len()).into_par_iter().map(views).collect();
     let lowered = |m: u8, n: usize| {
         let left = 1.0 - (n as f64 / f64::from(enough)).min(1.0);
@@ -160,12 +217,5 @@ pub(super) fn outrank(scene: &mut Scene, depth: Option<&[f32]>, enough: u32) {
     for ((to, m), n) in new.pixels_mut().zip(mask.as_raw()).zip(&counted) {
         *to = Luma([lowered(*m, *n)]);
     }
-    scene.train[at].mask = Some(new);
-    if seen > 0 {
-        let percent = 100.0 * seen as f64 / hole as f64;
-        scene.notes.push(format!(
-            "{percent:.0} % of the reference's hole is seen past the object by {enough} views or more, which outrank the \
-             painted picture there (scene.outrank_guess)"
-        ));
-    }
+    Some((new, seen as f64 / hole.max(1) as f64))
 }

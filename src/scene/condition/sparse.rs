@@ -6,7 +6,7 @@
 use rayon::prelude::*;
 
 use crate::scene::priors::rank_correlation;
-use crate::scene::{Camera, Point, Prior, PriorKind, RELATED, Scene, View};
+use crate::scene::{Camera, Point, Prior, PriorKind, RELATED, Reference, Scene, View};
 
 /// Fewest points that tell whether a prior fits.
 const FEWEST: usize = 24;
@@ -152,8 +152,8 @@ pub(super) fn check_priors(scene: &mut Scene) {
         prior.map(|prior| judge(prior, &samples(&view.camera, &points, view.mask.as_ref())))
     };
     let verdicts: Vec<Option<Verdict>> = scene.train.par_iter().map(|view| judged(view, view.prior.as_ref())).collect();
-    let reference =
-        scene.reference.as_ref().and_then(|r| judged(&scene.train[r.view], r.prior.as_ref()).map(|v| (r.view, v)));
+    let of_reference = |r: &Reference| judged(&scene.train[r.view], r.prior.as_ref());
+    let of_references: Vec<Option<Verdict>> = scene.references.iter().map(of_reference).collect();
     scene.points = points;
     let mut converted = 0;
     let mut apply = |name: &str, what: &str, verdict: Verdict, prior: &mut Option<Prior>, notes: &mut Vec<String>| {
@@ -178,8 +178,11 @@ pub(super) fn check_priors(scene: &mut Scene) {
             apply(&view.name, "", verdict, &mut view.prior, &mut scene.notes);
         }
     }
-    if let (Some(reference), Some((view, verdict))) = (&mut scene.reference, reference) {
-        apply(&scene.train[view].name, "reference ", verdict, &mut reference.prior, &mut scene.notes);
+    for (reference, verdict) in scene.references.iter_mut().zip(of_references) {
+        if let Some(verdict) = verdict {
+            let name = &scene.train[reference.view].name;
+            apply(name, "reference ", verdict, &mut reference.prior, &mut scene.notes);
+        }
     }
     if converted > 0 {
         scene.notes.push(format!("{converted} disparity priors are turned into depth by the points of the model"));
