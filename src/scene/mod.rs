@@ -253,6 +253,8 @@ pub struct Reference {
     pub image: RgbImage,
     /// Prior of the inpainted picture. Its kind may differ from that of the views' priors.
     pub prior: Option<Prior>,
+    /// Whether nothing was inpainted: the photograph shows the place without the object ([`Config::truth_reference`]).
+    pub truth: bool,
 }
 
 /// A point of the sparse model.
@@ -548,7 +550,8 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
         let (loaded, note) =
             read_reference(dir, &files, &train[at], &train_files[at], at, picture_sizes[at], layout.kind)?;
         notes.extend(note);
-        read_references.push(loaded);
+        let truth = truth.as_ref() == Some(&files.name);
+        read_references.push(Reference { truth, ..loaded });
     }
     let mut references = read_references;
     references.sort_by_key(|r| r.view);
@@ -1033,5 +1036,5 @@ fn read_reference(
             Some(prior)
         }
     };
-    Ok((Reference { view: at, image, prior }, note))
+    Ok((Reference { view: at, image, prior, truth: false }, note))
 }

@@ -379,7 +379,7 @@ fn resized(scene: &Scene, from: u32, to: u32) -> Scene {
     let references = scene.references.iter().map(|r| {
         let size @ [w, h] = scaled([r.image.width(), r.image.height()]);
         let prior = r.prior.as_ref().map(|p| blank(p, size));
-        Reference { view: r.view, image: RgbImage::new(w, h), prior }
+        Reference { view: r.view, image: RgbImage::new(w, h), prior, truth: r.truth }
     });
     Scene {
         train: scene.train.iter().map(view).collect(),

@@ -3,7 +3,8 @@
 //! A test view that is trained on as the reference ([`Config::truth_reference`](crate::scene::Config::truth_reference)) has
 //! no monocular prior, as a reference of the user's has. The other test views show the same place, so that depth can be
 //! measured: fronto-parallel planes of evenly spaced inverse depth, and for each pixel the one at which the pictures agree
-//! (Collins 1996). Nothing else of the test views reaches training.
+//! (Collins 1996), over a window in which pixels of other colours count less, so that depth breaks where surfaces do (Yoon
+//! and Kweon 2006). Nothing else of the test views reaches training.
 
 use image::RgbImage;
 use rayon::prelude::*;
@@ -16,8 +17,14 @@ use crate::scene::{Camera, Prior, PriorKind, Scene};
 const PLANES: usize = 128;
 /// Colours further apart than this (8-bit, mean over channels) count as this far: something else is in the way.
 const FARTHEST_COLOR: f32 = 64.0;
-/// Half the side of the window over which differences are averaged, pixels.
-const HALF_WINDOW: usize = 2;
+/// Half the side of the window over which the differences to one view are averaged, pixels.
+const HALF_WINDOW: usize = 1;
+/// Half the side of the window over which a plane's costs are averaged, pixels.
+const SUPPORT: usize = 5;
+/// A pixel of that window weighs 1/e at this colour difference (8-bit, mean over channels) ...
+const SUPPORT_COLOR: f32 = 10.0;
+/// ... and at this distance, pixels.
+const SUPPORT_DISTANCE: f32 = 5.0;
 /// Fewest other views that a plane must be seen by.
 const FEWEST_VIEWS: usize = 3;
 
@@ -84,7 +91,8 @@ fn sweep(camera: &Camera, picture: &RgbImage, others: &[(&Camera, &RgbImage)], [
     };
     let volume: Vec<Vec<f32>> = (0..PLANES).into_par_iter().map(cost).collect();
     let depth = |pixel: usize| {
-        let at = |plane: usize| f64::from(volume[plane][pixel]);
+        let costs = supported(&volume, picture, pixel);
+        let at = |plane: usize| f64::from(costs[plane]);
         let best = (0..PLANES).filter(|p| at(*p).is_finite()).min_by(|a, b| at(*a).total_cmp(&at(*b)));
         let Some(best) = best else { return f32::NAN };
         // The vertex of the parabola through the best plane and its neighbours.
@@ -99,6 +107,30 @@ fn sweep(camera: &Camera, picture: &RgbImage, others: &[(&Camera, &RgbImage)], [
         (1.0 / (inverse(best) + between * step)) as f32
     };
     (0..w * h).into_par_iter().map(depth).collect()
+}
+
+/// The costs of all planes at a pixel, averaged over what is near it and of its colour; NaN where its own is.
+fn supported(volume: &[Vec<f32>], picture: &RgbImage, pixel: usize) -> Vec<f32> {
+    let [w, h] = [picture.width() as usize, picture.height() as usize];
+    let (x, y) = (pixel % w, pixel / w);
+    let color = |pixel: usize| &picture.as_raw()[3 * pixel..3 * pixel + 3];
+    let mut support = vec![];
+    for v in y.saturating_sub(SUPPORT)..(y + SUPPORT + 1).min(h) {
+        for u in x.saturating_sub(SUPPORT)..(x + SUPPORT + 1).min(w) {
+            let apart = color(pixel).iter().zip(color(v * w + u)).map(|(a, b)| f32::from(a.abs_diff(*b))).sum::<f32>();
+            let distance = (x.abs_diff(u) as f32).hypot(y.abs_diff(v) as f32);
+            support.push((v * w + u, (-apart / 3.0 / SUPPORT_COLOR - distance / SUPPORT_DISTANCE).exp()));
+        }
+    }
+    let mean = |costs: &Vec<f32>| {
+        if costs[pixel].is_nan() {
+            return f32::NAN;
+        }
+        let finite = support.iter().filter(|(at, _)| costs[*at].is_finite());
+        let [sum, weight] = finite.fold([0.0; 2], |[s, n], (at, w)| [s + w * costs[*at], n + w]);
+        sum / weight
+    };
+    volume.iter().map(mean).collect()
 }
 
 /// The picture at a place in pixels, between the four pixels around it; `None` outside their centres.
@@ -176,8 +208,9 @@ mod tests {
         values[8] = 4.0;
         let mean = window_mean(&values, 6, 5);
         assert!(mean[7].is_nan());
-        // Columns 0 to 2, rows 0 to 2: nine values, of which one is none and one is 4.
-        assert_eq!(mean[0], (7.0 + 4.0) / 8.0);
+        // Columns and rows 0 and 1: four values, of which one is none.
+        assert_eq!(mean[0], 1.0);
+        assert_eq!(mean[2], (4.0 + 4.0) / 5.0);
         assert_eq!(mean[29], 1.0);
     }
 }
