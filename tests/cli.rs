@@ -295,7 +295,7 @@ fn files_below(folder: &Path) -> Vec<String> {
     names
 }
 
-const FEW_STEPS: &str = "--iterations 4 --set model.voxel=0 --set model.attention.start=2 --set model.attention.patch=16 \
+const FEW_STEPS: &str = "--preset gscream --iterations 4 --set model.voxel=0 --set model.attention.start=2 --set model.attention.patch=16 \
                          --set model.attention.tokens=32 --set model.attention.min_tokens=1 --set train.log_interval=2";
 
 #[test]
@@ -305,6 +305,15 @@ fn train_writes_a_run_and_never_over_another() {
     let arguments = format!("train scene --out run --validate {FEW_STEPS}");
     let outcome = succeeds(folder, &arguments);
     let expected = [
+        "index.html",
+        "index/drawn/train_000.jpg",
+        "index/drawn/train_001.jpg",
+        "index/drawn/train_002.jpg",
+        "index/photograph/train_000.jpg",
+        "index/photograph/train_001.jpg",
+        "index/photograph/train_002.jpg",
+        "index/test/test_000.jpg",
+        "index/test/test_001.jpg",
         "log.jsonl",
         "metrics.json",
         "model/point_cloud.ply",
@@ -318,11 +327,22 @@ fn train_writes_a_run_and_never_over_another() {
     ];
     assert_eq!(files_below(&folder.join("run")), expected);
     let last = outcome.stdout.lines().last().expect("lines");
-    assert_eq!(last, "wrote model, log.jsonl, settings.toml, run.json, test, metrics.json, seen in run");
+    assert_eq!(last, "wrote model, log.jsonl, settings.toml, run.json, test, metrics.json, seen, index.html in run");
     assert_eq!(fs::read_to_string(folder.join("run/log.jsonl")).expect("a log").lines().count(), 2);
+    let page = fs::read_to_string(folder.join("run/index.html")).expect("a page");
+    let sources: Vec<&str> = page.split("src=\"").skip(1).filter_map(|rest| rest.split('"').next()).collect();
+    assert_eq!(sources.len(), 10, "two test views and three train views, drawn and photographed");
+    for source in sources {
+        image::open(folder.join("run").join(source)).unwrap_or_else(|error| panic!("{source}: {error}"));
+    }
+    assert!(page.contains("Complete: 4 steps") && !page.contains("http"), "{page}");
+    for command in ["gscream-vk export run", "gscream-vk view run", "gscream-vk render --views spiral run"] {
+        assert!(outcome.stderr.contains(command), "no {command} in {}", outcome.stderr);
+    }
+    assert!(outcome.stderr.contains("warning: the object is in "), "what is wrong is said again: {}", outcome.stderr);
     let model = |run: &str| fs::read(folder.join(run).join("model/point_cloud.ply")).expect("a model");
     let before = model("run");
-    transcript.fails(folder, 1, "train scene --out run --iterations 1");
+    transcript.fails(folder, 1, "train scene --out run --preset gscream --iterations 1");
     assert!(model("run") == before, "the refused run left the first alone");
 
     succeeds(folder, "render run --out drawn");
@@ -339,6 +359,165 @@ fn train_writes_a_run_and_never_over_another() {
     succeeds(folder, "train scene --out run --overwrite --iterations 1 --set model.voxel=0");
     assert!(model("run") != before, "--overwrite replaces it");
     insta::assert_snapshot!("train_again", transcript.0);
+}
+
+/// On a CPU the defaults would take a day: the preset follows the device and the pictures' size, and what is set wins.
+#[test]
+fn train_without_a_preset_says_which_it_takes() {
+    let folder = with_scene();
+    let folder = folder.path();
+    let json = succeeds(folder, "devices --json").stdout;
+    let devices: serde_json::Value = serde_json::from_str(&json).expect("JSON");
+    let usable = devices.as_array().expect("a list").iter().find(|d| d["lacks"].as_array().is_some_and(Vec::is_empty));
+    let cpu = usable.expect("a usable device")["kind"] == "cpu";
+    let (preset, voxel_pixels) = if cpu { ("lavapipe", 5.0) } else { ("gscream", 0.0) };
+    let outcome = succeeds(folder, "train scene --out run --iterations 2");
+    assert!(outcome.stderr.contains(&format!("preset: {preset}, for ")), "{}", outcome.stderr);
+    let settings = fs::read_to_string(folder.join("run/settings.toml")).expect("settings");
+    let settings: Settings = toml::from_str(&settings).expect("settings");
+    assert_eq!((settings.train.iterations, settings.scene.downscale), (2, 1), "pictures of 32 x 24 stay as they are");
+    assert_eq!(settings.model.voxel_pixels, voxel_pixels);
+    // A named preset or a file is all there is.
+    for given in ["--preset gscream", "--config run/settings.toml"] {
+        let outcome = succeeds(folder, &format!("train scene --out run --overwrite --iterations 1 {given}"));
+        assert!(!outcome.stderr.contains("preset:"), "{}", outcome.stderr);
+    }
+}
+
+/// What a shell and `man` need is made from the same definitions as the help.
+#[test]
+fn completions_and_manual_pages_know_every_command() {
+    let folder = folder();
+    let commands: Vec<String> = Arguments::command().get_subcommands().map(|c| c.get_name().to_owned()).collect();
+    for shell in ["bash", "zsh", "fish", "powershell", "elvish"] {
+        let script = succeeds(folder.path(), &format!("completions {shell}")).stdout;
+        for command in &commands {
+            assert!(script.contains(command.as_str()), "no {command} for {shell}");
+        }
+        assert!(script.contains("checkpoint") || script.contains("resume"), "no flags for {shell}");
+    }
+    assert_eq!(run(folder.path(), "completions ksh").code, 2);
+    succeeds(folder.path(), "man pages/man1");
+    let pages = files_below(&folder.path().join("pages/man1"));
+    assert_eq!(pages.len(), commands.len() + 1, "{pages:?}");
+    for command in &commands {
+        let page = folder.path().join(format!("pages/man1/gscream-vk-{command}.1"));
+        assert!(fs::read_to_string(page).expect("a page").contains(".SH SYNOPSIS"));
+    }
+    fs::write(folder.path().join("file"), "").expect("writable");
+    assert_eq!(run(folder.path(), "man file").code, 1);
+}
+
+/// The ten most likely mistakes: each is one sentence that names the file, what is wrong and what to do.
+#[test]
+fn the_ten_most_likely_mistakes() {
+    let mut transcript = Transcript::default();
+    let fresh = with_scene;
+    let at = |folder: &TempDir, name: &str| folder.path().join(name);
+
+    transcript.0 += "# the wrong folder\n";
+    let folder = fresh();
+    transcript.fails(folder.path(), 1, "train scene/images");
+    transcript.fails(folder.path(), 1, "train scen");
+    transcript.fails(folder.path(), 1, "export scene");
+
+    transcript.0 += "# photographs without COLMAP\n";
+    let folder = fresh();
+    fs::remove_dir_all(at(&folder, "scene/sparse")).expect("writable");
+    transcript.fails(folder.path(), 1, "train scene");
+
+    transcript.0 += "# masks inverted\n";
+    let folder = fresh();
+    for mask in fs::read_dir(at(&folder, "scene/masks")).expect("a folder") {
+        let path = mask.expect("readable").path();
+        let mut mask = image::open(&path).expect("a mask").to_luma8();
+        mask.pixels_mut().for_each(|p| p.0[0] = 255 - p.0[0]);
+        mask.save(&path).expect("writable");
+    }
+    let outcome = run(folder.path(), "doctor scene");
+    assert_eq!(outcome.code, 1);
+    let problem = outcome.stdout.lines().find(|line| line.starts_with("problem  masks")).expect("a problem of masks");
+    transcript.0 += &format!("$ gscream-vk doctor scene\n{problem}\n{}\n\n", outcome.stderr.trim_end());
+
+    transcript.0 += "# no driver\n";
+    let folder = fresh();
+    let output = program(folder.path())
+        .env("VK_DRIVER_FILES", "/nonexistent")
+        .env("VK_ICD_FILENAMES", "/nonexistent")
+        .args(["train", "scene"])
+        .output()
+        .expect("the program starts");
+    assert_eq!(output.status.code(), Some(1));
+    transcript.0 += &format!("$ gscream-vk train scene\n{}\n", String::from_utf8_lossy(&output.stderr));
+
+    transcript.0 += "# an old driver\n";
+    let old = gscream_vk::gpu::Error::Missing { device: "Old Card".into(), feature: "Vulkan 1.3".into() };
+    transcript.0 += &format!("error: {old}\n\n");
+
+    transcript.0 += "# another run in the folder\n";
+    let folder = fresh();
+    fs::create_dir(at(&folder, "run")).expect("writable");
+    Record::new("none", "scene").write(&at(&folder, "run")).expect("writable");
+    let outcome = run(folder.path(), "train scene --preset demo --out run");
+    assert_eq!(outcome.code, 1);
+    let last = outcome.stderr.lines().last().expect("a line");
+    transcript.0 += &format!("$ gscream-vk train scene --preset demo --out run\n! {last}\nexit code 1\n\n");
+
+    transcript.0 += "# a preset misspelt\n";
+    transcript.fails(folder.path(), 2, "train scene --preset lavapip");
+
+    transcript.0 += "# disparity in the folder of depth\n";
+    let folder = fresh();
+    for map in fs::read_dir(at(&folder, "scene/depth")).expect("a folder") {
+        let path = map.expect("readable").path();
+        let depth: ndarray::Array2<f32> = ndarray_npy::read_npy(&path).expect("a prior");
+        ndarray_npy::write_npy(&path, &depth.mapv(|z| 1.0 / z)).expect("writable");
+    }
+    let outcome = run(folder.path(), "doctor scene");
+    let depth: Vec<&str> = outcome.stdout.lines().filter(|line| line.contains(" depth ")).collect();
+    transcript.0 += &format!("$ gscream-vk doctor scene\n{}\n\n", depth.join("\n"));
+    transcript.0 += "# depth in two folders\n";
+    fs::create_dir(at(&folder, "scene/disparity")).expect("writable");
+    transcript.fails(folder.path(), 1, "train scene");
+
+    transcript.0 += "# photographs renamed\n";
+    let folder = fresh();
+    for (i, name) in files_below(&at(&folder, "scene/images")).into_iter().enumerate() {
+        let images = at(&folder, "scene/images");
+        fs::rename(images.join(name), images.join(format!("DSC_{i:04}.png"))).expect("writable");
+    }
+    fs::remove_dir_all(at(&folder, "scene/test_images")).expect("writable");
+    fs::remove_dir_all(at(&folder, "scene/reference")).expect("writable");
+    transcript.fails(folder.path(), 1, "train scene");
+
+    insta::assert_snapshot!("mistakes", transcript.0);
+}
+
+/// The tenth mistake, which not every driver survives: files of at most 64 blocks, so that the system refuses a write as a
+/// full disk does.
+#[cfg(unix)]
+#[test]
+fn without_room_on_the_disk_it_is_said_which_file_and_how_to_go_on() {
+    use std::os::unix::process::ExitStatusExt as _;
+    let folder = with_scene();
+    let mut limited = std::process::Command::new("sh");
+    limited.args(["-c", "trap '' XFSZ; ulimit -f 64; exec \"$0\" $1"]).arg(env!("CARGO_BIN_EXE_gscream-vk"));
+    limited.arg(format!("train scene --out run --set train.checkpoint_interval=2 {FEW_STEPS}"));
+    limited.current_dir(folder.path()).env("XDG_CACHE_HOME", folder.path().join("cache"));
+    let output = limited.output().expect("a shell");
+    if output.status.signal() == Some(signal_hook::consts::SIGBUS) {
+        println!("skipped: to this driver a limit of files is one of device memory, and ends the program");
+        return;
+    }
+    assert_eq!(output.status.code(), Some(1));
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    let last = stderr.lines().last().expect("a line");
+    for part in [
+        "error: run/checkpoints/step-00000002.safetensors: the checkpoint cannot be written: File too large",
+        "make room",
+    ] {
+        assert!(last.contains(part), "no {part:?} in {stderr}");
+    }
 }
 
 #[test]
@@ -463,7 +642,7 @@ fn ablate_compares_over_seeds_and_scenes() {
     let folder = folder.path();
     let options = synthetic::Options { seed: 4, width: 32, height: 24, train_views: 3, test_views: 1, points: 50 };
     synthetic::write(&folder.join("other"), &options).expect("a writable folder");
-    let few = format!("--iterations 2 {}", FEW_STEPS.trim_start_matches("--iterations 4 "));
+    let few = FEW_STEPS.replace("--iterations 4", "--iterations 2");
     let command = "ablate scene other --out runs --seeds 2 --only neither,priors-same --priors same=depth --validate";
     let outcome = succeeds(folder, &format!("{command} {few}"));
     for run in ["scene/neither/seed-0", "scene/priors-same/seed-1", "other/neither/seed-1"] {

@@ -80,7 +80,7 @@ impl Place {
                 }
                 let mut bytes = fs::read(&path).expect("readable");
                 let name = path.strip_prefix(&run).expect("below it").to_string_lossy().into_owned();
-                if name == "run.json" {
+                if name == "run.json" || name == "index.html" {
                     continue;
                 }
                 if name == "log.jsonl" {
@@ -208,17 +208,27 @@ fn half(place: &Place, run: &str) {
 }
 
 #[test]
+fn killed_at_a_few_moments_it_comes_to_the_same_end() {
+    kill_at(4);
+}
+
+#[test]
+#[ignore = "long; .ci/run has it"]
 fn killed_at_any_moment_it_comes_to_the_same_end() {
-    const MOMENTS: u32 = 20;
+    kill_at(20);
+}
+
+/// Kills runs once in each of so many equal parts of a whole one, and goes on with them.
+fn kill_at(moments: u32) {
     let whole = WHOLE.1;
     let place = Place::new(&settings());
     let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(20);
     let (mut runs, mut resumed) = (0, 0);
     let mut run = String::new();
-    for moment in 0..MOMENTS {
-        // One in each twentieth of a whole run, from its first instant to its last; where the program was quicker than
+    for moment in 0..moments {
+        // One in each part of a whole run, from its first instant to its last; where the program was quicker than
         // that, a little earlier in a new run.
-        let mut delay = whole.mul_f64((f64::from(moment) + rng.random::<f64>()) / f64::from(MOMENTS));
+        let mut delay = whole.mul_f64((f64::from(moment) + rng.random::<f64>()) / f64::from(moments));
         for attempt in 0.. {
             assert!(attempt < 20, "no run lasts {delay:?}");
             let mut child = if run.is_empty() {
@@ -257,7 +267,7 @@ fn killed_at_any_moment_it_comes_to_the_same_end() {
         succeeds(place.resume(&run));
         assert_whole(&place, &run, "at last");
     }
-    println!("{MOMENTS} kills of {runs} runs, {resumed} of them resumed before");
+    println!("{moments} kills of {runs} runs, {resumed} of them resumed before");
 }
 
 /// Killed between the record that says so and the removal of its checkpoints, a run is complete.

@@ -127,8 +127,7 @@ pub fn examine(folder: &Path, truth: Option<&Path>) -> Result<(Report, Option<Sc
         }
     };
     for note in &scene.notes {
-        // The loader says in its notes what it had to leave out.
-        let lost = note.contains("left out") || note.contains("belong to no picture");
+        let lost = lost(note);
         let kind = if lost { Severity::Problem } else { Severity::Note };
         report.add(kind, if lost { "names" } else { "scene" }, None, note.clone());
     }
@@ -141,12 +140,20 @@ pub fn examine(folder: &Path, truth: Option<&Path>) -> Result<(Report, Option<Sc
     Ok((report, Some(scene)))
 }
 
-/// The checks that need no more than a scene that was loaded: for the line that training prints.
-pub fn verdict(scene: &Scene) -> String {
+/// The checks that need no more than a scene that was loaded: for the lines that training prints.
+pub fn look(scene: &Scene) -> Report {
     let mut report = Report::default();
+    for note in scene.notes.iter().filter(|note| lost(note)) {
+        report.add(Severity::Problem, "names", None, note.clone());
+    }
     examine_scene(scene, &mut report);
     report.sort();
-    report.verdict()
+    report
+}
+
+/// Whether a note of the loader says that it had to leave something out.
+fn lost(note: &str) -> bool {
+    note.contains("belong to no picture") || note.contains("are not in the model")
 }
 
 fn examine_scene(scene: &Scene, report: &mut Report) {

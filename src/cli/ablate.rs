@@ -13,9 +13,11 @@ use super::eval::JudgeArgs;
 use super::report::last_part;
 use super::shared::{DeviceArgs, SYNTHETIC, SceneArgs, load_scene, with_gpu};
 use super::train::{Trained, default_folder, train};
+use super::{index, next};
 use crate::config::{Settings, SettingsArgs};
 use crate::evaluate::{Judge, Mean, Metrics, PUBLISHED_ROWS, Published, Region};
 use crate::gpu::Gpu;
+use crate::report::pace::Pace;
 use crate::report::statistics::{Moments, Paired};
 use crate::scene::Scene;
 
@@ -285,15 +287,18 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         folder.into()
     });
     let seeds: Vec<u64> = (base.train.seed..).take(args.seeds as usize).collect();
+    let pace = Pace::new(scenes.len() * seeds.len() * variants.len());
     let rows = with_gpu(&args.device.options(), |gpu| {
         let mut rows = vec![];
         for ((scene, name), label) in scenes.iter().zip(&names).zip(&labels) {
             for seed in &seeds {
-                rows.extend(of_scene(gpu, args, &variants, &base, &judge, (&scene.scene, name, label), (*seed, &out))?);
+                let place = (&*scene.scene, name.as_str(), label.as_str());
+                rows.extend(of_scene(gpu, args, &variants, &base, &judge, place, (*seed, &out, &pace, rows.len()))?);
             }
         }
         Ok(rows)
     })?;
+    let last = rows.last().map(|row| folder(args, &out, &row.scene, &row.variant, row.seed));
     let comparison = compare(&variants, &rows, labels, seeds, &judge);
     write(&out.join("ablation.json"), &rows)?;
     write(&out.join("comparison.json"), &comparison)?;
@@ -304,6 +309,12 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     }
     let files = "ablation.json and comparison.json";
     println!("wrote {} runs, {files} in {}", rows.len(), out.display());
+    if let Some(last) = last {
+        next::say(&[
+            (next::typed(&last.join(index::INDEX).to_string_lossy()), "is one run as a page; every run has its own"),
+            (next::command(&["export"], &last), "writes that run's scene for viewers"),
+        ]);
+    }
     Ok(())
 }
 
@@ -317,6 +328,19 @@ fn labels(names: &[String]) -> Vec<String> {
     (0..names.len()).map(of).collect()
 }
 
+/// The folder of a run.
+fn folder(args: &Args, out: &Path, label: &str, variant: &str, seed: u64) -> PathBuf {
+    let mut folder = out.to_owned();
+    if args.scenes.len() > 1 {
+        folder.push(label);
+    }
+    folder.push(variant);
+    if args.seeds > 1 {
+        folder.push(format!("seed-{seed}"));
+    }
+    folder
+}
+
 /// All variants of one scene under one seed.
 fn of_scene(
     gpu: &Gpu,
@@ -325,7 +349,7 @@ fn of_scene(
     base: &Settings,
     judge: &Judge,
     (path, name, label): (&Path, &str, &str),
-    (seed, out): (u64, &Path),
+    (seed, out, pace, done): (u64, &Path, &Pace, usize),
 ) -> anyhow::Result<Vec<Row>> {
     let mut rows = vec![];
     // Read once for all variants that read it alike.
@@ -344,18 +368,15 @@ fn of_scene(
                 path.display()
             );
         }
-        let mut folder = out.to_owned();
+        let folder = folder(args, out, label, &variant.name, seed);
         let mut which = variant.name.clone();
         if args.scenes.len() > 1 {
-            folder.push(label);
             which = format!("{label}, {which}");
         }
-        folder.push(&variant.name);
         if args.seeds > 1 {
-            folder.push(format!("seed-{seed}"));
             which = format!("{which}, seed {seed}");
         }
-        eprintln!("== {which}");
+        eprintln!("{}", format!("== {which} {}", pace.next(done + rows.len())).trim_end());
         let trained = train(gpu, scene, &settings, name, &folder, None, judge)?;
         rows.push(Row::new(variant, label, seed, &trained)?);
     }

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail};
 
+use super::next;
 use super::report::{command_line, last_part};
 use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, load_scene, with_gpu};
 use crate::bench::ceilings::Prober;
@@ -148,6 +149,10 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     if let Some(out) = &args.out {
         let written = write_files(&record, out)?;
         println!("\nwrote {} in {}", written.join(", "), out.display());
+        let record = next::typed(&out.join(JSON).to_string_lossy());
+        next::say(&[(format!("--against {record}"), "compares a later bench of the same scene with this one")]);
+    } else {
+        next::say(&[("--out DIR".to_owned(), "keeps the record, and --against compares a later one with it")]);
     }
     Ok(())
 }

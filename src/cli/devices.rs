@@ -1,3 +1,4 @@
+use super::next;
 use crate::gpu;
 use crate::gpu::DeviceInfo;
 
@@ -25,6 +26,11 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         return Err(gpu::Error::NoDevice.into());
     }
     print!("{}", list(&devices));
+    next::say(&[if devices.iter().any(|device| device.lacks.is_empty()) {
+        ("gscream-vk train synthetic".to_owned(), "trains the built-in scene; --device picks one of these")
+    } else {
+        ("a newer driver".to_owned(), "is needed, or Mesa's lavapipe, which needs no GPU (Debian: mesa-vulkan-drivers)")
+    }]);
     Ok(())
 }
 

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, bail};
 use atomic_write_file::AtomicWriteFile;
 
-use super::pictures;
+use super::{next, pictures};
 use crate::capture::doctor::{self, Report, Severity};
 use crate::capture::sheet;
 
@@ -52,7 +52,10 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         eprintln!("wrote {} and {} in {}", sheet::PICTURE, sheet::PAGE, folder.display());
     }
     match report.problems() {
-        0 => Ok(()),
+        0 => {
+            next::say(&[(next::command(&["train"], &args.scene), "trains it")]);
+            Ok(())
+        }
         1 => bail!("{}: 1 problem", args.scene.display()),
         count => bail!("{}: {count} problems", args.scene.display()),
     }

@@ -5,8 +5,8 @@ use anyhow::{Context as _, anyhow, bail};
 use image::{GrayImage, RgbImage};
 
 use super::folders::{self, Origin};
-use super::instruments;
 use super::shared::{self, DeviceArgs};
+use super::{instruments, next};
 use crate::evaluate::fid::Inception;
 use crate::evaluate::lpips::Lpips;
 use crate::evaluate::{Judge, Judging, Protocol, Report};
@@ -110,6 +110,11 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         println!("protocol {protocol}");
     }
     eprintln!("wrote {}", json.display());
+    next::say(&[match &args.truth {
+        None => (next::command(&["export"], &args.renders), "writes the scene for viewers"),
+        Some(_) if args.masks.is_none() => ("--masks DIR".to_owned(), "adds the figures inside the masks"),
+        Some(_) => ("--lpips-weights FILE".to_owned(), "adds LPIPS; gscream-vk eval --help has all figures"),
+    }]);
     Ok(())
 }
 

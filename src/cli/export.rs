@@ -8,6 +8,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde::{Deserialize, Serialize};
 
 use super::folders::Origin;
+use super::next;
 use super::shared::{self, DeviceArgs};
 use crate::config::{Settings, Source};
 use crate::export::{self, Cloud, Export, Observer, Options, gltf, measure, ply, spz, up};
@@ -268,6 +269,19 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         report(&made, &figures, &args.formats);
         let names: Vec<&str> = figures.files.iter().map(|file| file.name.as_str()).collect();
         println!("wrote {}, {FIGURES} in {}", names.join(", "), folder.display());
+        // `view` reads the PLY.
+        if args.formats.contains(&Format::Ply) {
+            let shown = if args.out.is_some() { &folder } else { &args.model };
+            next::say(&[(
+                next::command(&["view"], shown),
+                "shows it in the browser; --html FILE makes a page to send",
+            )]);
+        } else {
+            next::say(&[(
+                next::typed(&folder.to_string_lossy()),
+                "has the files; any viewer of their formats opens them",
+            )]);
+        }
         Ok(())
     })
 }

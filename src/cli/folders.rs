@@ -8,6 +8,7 @@
 //! RUN/test/NAME.png   the test views as rendered at the end
 //! RUN/seen/NAME.png   white where some train view photographed what they show
 //! RUN/metrics.json    their figures
+//! RUN/index.html      a page of all this; its pictures are in index/
 //! RUN/checkpoints/    until the run is complete: what it goes on from
 //! ```
 

@@ -3,8 +3,9 @@
 use std::path::Path;
 
 use image::{GrayImage, RgbImage};
+use indicatif::{ProgressBar, ProgressStyle};
 
-use super::pictures;
+use super::{index, pictures};
 use crate::config::Settings;
 use crate::evaluate::{Judge, Report, Residue, Shown, Surface, hole, seen_map};
 use crate::gpu::Gpu;
@@ -21,6 +22,8 @@ pub(super) struct Measured {
     pub report: Report,
     /// By test view: which pixels some train view photographed.
     pub seen: Vec<GrayImage>,
+    /// Train views as drawn, with their indices: those that [`index::chosen`] names.
+    pub shown: Vec<(usize, RgbImage)>,
 }
 
 impl Measured {
@@ -69,10 +72,14 @@ pub(super) fn measure(
     model::files::rescale(&mut anchors, &mut weights, 1.0 / scene.unit);
     let background = settings.train.background.map(|channel| channel as f32);
     let mut renderer = Renderer::new(gpu, &anchors, &weights, &settings.render, background)?;
+    let style = ProgressStyle::with_template("judging {wide_bar} {pos}/{len} views, {eta} left")?;
+    let bar = ProgressBar::new((scene.train.len() + scene.test.len()) as u64).with_style(style);
     let mut draw = |views: &[View]| -> anyhow::Result<Vec<Drawn>> {
-        views.iter().map(|view| Ok(Drawn::new(&renderer.render(&view.camera)?))).collect()
+        let mut one = |view: &View| Ok(Drawn::new(&renderer.render(&view.camera)?));
+        views.iter().map(|view| one(view).inspect(|_| bar.inc(1))).collect()
     };
     let (train, test) = (draw(&scene.train)?, draw(&scene.test)?);
+    bar.finish_and_clear();
     let shown: Vec<Shown<'_>> = train.iter().zip(&scene.train).map(|(drawn, view)| drawn.shown(view)).collect();
     let pairs = || test.iter().zip(&scene.test);
 
@@ -90,7 +97,8 @@ pub(super) fn measure(
     }
     let mut report = judging.report().with_residues(residues(scene, &train, &shown));
     report.depth_factor = factor;
-    Ok(Measured { report, seen })
+    let shown = index::chosen(scene).into_iter().map(|at| (at, train[at].picture.clone())).collect();
+    Ok(Measured { report, seen, shown })
 }
 
 /// Of every train view that shows the object, against the first reference's picture as the view would show it.

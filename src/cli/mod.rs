@@ -1,21 +1,26 @@
 //! The commands, one file each, and what they share.
 //!
 //! To add a command: a file with `Args` (clap) and `run(Args) -> anyhow::Result<()>`, a line in `Command` and one in
-//! [`run`]. Results go to stdout, progress and notes to stderr. The exit code is 0 when all went well, 2 when the
+//! [`run`]. Results go to stdout, progress, notes and what to do next to stderr. The exit code is 0 when all went well, 2 when the
 //! arguments or settings make no sense, 128 and the signal's number when a signal ended a run, 1 when anything else went
 //! wrong.
 
 mod ablate;
 mod bench;
+mod completions;
 mod devices;
 mod doctor;
 mod eval;
 mod export;
 pub mod folders;
+mod index;
 mod instruments;
+mod man;
+mod next;
 pub mod pictures;
 mod plan;
 mod prepare;
+mod preset;
 mod render;
 mod report;
 pub mod shared;
@@ -68,6 +73,8 @@ enum Command {
     Ablate(ablate::Args),
     Report(report::Args),
     Bench(bench::Args),
+    Completions(completions::Args),
+    Man(man::Args),
 }
 
 /// Runs the command.
@@ -90,6 +97,8 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
         Command::Ablate(args) => ablate::run(&args),
         Command::Report(args) => report::run(&args),
         Command::Bench(args) => bench::run(&args),
+        Command::Completions(args) => completions::run(&args),
+        Command::Man(args) => man::run(&args),
     }
 }
 
@@ -102,7 +111,16 @@ pub fn message(error: &anyhow::Error) -> String {
             write!(text, "\n  caused by: {cause}").expect("a string takes everything");
         }
     }
+    if error.chain().any(is_of_full_disk) {
+        text.push_str("; make room on that disk first");
+    }
     text
+}
+
+fn is_of_full_disk(cause: &(dyn std::error::Error + 'static)) -> bool {
+    use std::io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
+    let kind = cause.downcast_ref::<std::io::Error>().map(std::io::Error::kind);
+    kind.is_some_and(|kind| matches!(kind, StorageFull | QuotaExceeded | FileTooLarge))
 }
 
 /// 2 for settings that make no sense, as for arguments that do not parse; 130 and 143 for SIGINT and SIGTERM; 1
@@ -127,5 +145,8 @@ mod tests {
         assert_eq!(message(&saying), "error: a.png: the picture cannot be written: disk full");
         let adding = Err::<(), _>(io()).context("a.json: cannot be written").expect_err("an error");
         assert_eq!(message(&adding), "error: a.json: cannot be written\n  caused by: disk full");
+        let full = std::io::Error::from(std::io::ErrorKind::StorageFull);
+        let full = anyhow::Error::from(pictures::Error { path: "a.png".into(), source: full });
+        assert!(message(&full).ends_with("; make room on that disk first"), "{}", message(&full));
     }
 }

@@ -8,6 +8,7 @@ use exr::prelude::{
     AnyChannel, AnyChannels, Encoding, FlatSamples, Layer, LayerAttributes, SmallVec, WritableImage as _,
 };
 use image::ImageFormat;
+use image::codecs::jpeg::JpegEncoder;
 
 pub use crate::render::view::to_rgb8;
 
@@ -37,6 +38,16 @@ pub fn write_png(path: &Path, size: [u32; 2], rgb: &[[f32; 3]]) -> Result<(), Er
     let mut bytes = Cursor::new(Vec::new());
     let encoded = to_rgb8(size, rgb).write_to(&mut bytes, ImageFormat::Png).map_err(io::Error::other);
     encoded.and_then(|()| write(path, bytes.get_ref())).map_err(|source| Error { path: path.to_owned(), source })
+}
+
+/// Writes a picture as JPEG, for pages, making the folder if it is missing. The file appears complete or not at all.
+///
+/// # Errors
+/// A path that cannot be written.
+pub fn write_jpeg(path: &Path, picture: &image::RgbImage) -> Result<(), Error> {
+    let mut bytes = vec![];
+    let encoded = picture.write_with_encoder(JpegEncoder::new_with_quality(&mut bytes, 92)).map_err(io::Error::other);
+    encoded.and_then(|()| write(path, &bytes)).map_err(|source| Error { path: path.to_owned(), source })
 }
 
 /// Writes a grey picture as PNG, making the folder if it is missing. The file appears complete or not at all.

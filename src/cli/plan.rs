@@ -6,6 +6,8 @@ use anyhow::Context as _;
 use serde::Serialize;
 use serde_json::{Value, json};
 
+use super::next;
+use super::preset;
 use super::shared::{DeviceArgs, SceneArgs, with_gpu};
 use crate::config::Settings;
 use crate::gpu::{self, Entry, Gpu, Options, Schedule, Timings};
@@ -22,6 +24,8 @@ use crate::train::run::Run;
 /// stage is listed with its steps, passes and bytes, or with the reason why it is left out. Of one step every pass follows:
 /// a line `name  <read  >written  <>both` is a pass with its bindings; an indented line is a barrier and the hazards that
 /// demand it.
+///
+/// Without --preset and --config the preset is chosen as `train` chooses it.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   gscream-vk plan synthetic --preset demo
@@ -52,7 +56,7 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
-    let (scene, settings) = args.scene.load()?;
+    let (scene, settings) = preset::load(&args.scene, &args.device)?;
     let options = Options { timestamps: args.measure.is_some(), ..args.device.options() };
     with_gpu(&options, |gpu| {
         let question =
@@ -76,6 +80,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         } else {
             print!("{}", shown.text());
         }
+        next::say(&[(next::command(&["train"], &args.scene.scene), "trains it; give it the same settings")]);
         Ok(())
     })
 }

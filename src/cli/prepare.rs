@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use anyhow::Context as _;
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::next;
 use super::shared::DeviceArgs;
 use crate::capture::{self, Evidence, Request, Step, Watch};
 use crate::train::run::Signal;
@@ -121,11 +122,11 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         }
         Ok(result?)
     })?;
-    println!(
-        "{}: ready after {:.0} s; gscream-vk doctor looks at it, train trains it",
-        args.out.display(),
-        began.elapsed().as_secs_f64()
-    );
+    println!("{}: ready after {:.0} s", args.out.display(), began.elapsed().as_secs_f64());
+    next::say(&[
+        (next::command(&["doctor"], &args.out), "looks it over; --sheet DIR draws all masks"),
+        (next::command(&["train"], &args.out), "trains it without its object"),
+    ]);
     Ok(())
 }
 

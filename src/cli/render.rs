@@ -4,8 +4,8 @@ use anyhow::{Context as _, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::folders::Origin;
-use super::pictures;
 use super::shared::{self, DeviceArgs};
+use super::{next, pictures};
 use crate::config::Source;
 use crate::model;
 use crate::render::view::Renderer;
@@ -126,5 +126,16 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         Ok(())
     })?;
     println!("{}: {} {} views as .png and .exr", out.display(), cameras.len(), args.views.name());
+    let run = matches!(origin, Origin::Run { .. });
+    next::say(&match args.views {
+        Views::Test if run => [(next::command(&["eval"], &args.model), "measures the model on the test views")],
+        Views::Spiral => {
+            let digits = cameras.len().saturating_sub(1).to_string().len();
+            let frames = out.join(format!("frame_%0{digits}d.png"));
+            let frames = next::typed(&frames.to_string_lossy());
+            [(format!("ffmpeg -i {frames} -pix_fmt yuv420p film.mp4"), "makes a film of the pictures")]
+        }
+        _ => [(next::command(&["export"], &args.model), "writes the scene for viewers")],
+    });
     Ok(())
 }

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::{Context as _, bail};
 
+use super::next;
 use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, load_scene, with_gpu};
 use super::train::default_folder;
 use crate::config::Settings;
@@ -138,6 +139,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let written = write(&report, &out)?;
     print!("{}", summary(&report));
     println!("wrote {} in {}", written.join(", "), out.display());
+    next::say(&[(next::typed(&out.join(PAGE).to_string_lossy()), "open it in a browser")]);
     Ok(())
 }
 
@@ -166,11 +168,7 @@ pub(super) fn last_part(name: &str) -> &str {
 
 /// The command line without the place of the program.
 pub(super) fn command_line() -> String {
-    let quoted = |word: std::borrow::Cow<'_, str>| {
-        let plain = |c: char| c.is_alphanumeric() || "-_=.,/:+".contains(c);
-        if word.chars().all(plain) { word.into_owned() } else { format!("'{}'", word.replace('\'', "'\\''")) }
-    };
-    let arguments = std::env::args_os().skip(1).map(|word| quoted(word.to_string_lossy()));
+    let arguments = std::env::args_os().skip(1).map(|word| next::typed(&word.to_string_lossy()));
     std::iter::once("gscream-vk".to_owned()).chain(arguments).collect::<Vec<_>>().join(" ")
 }
 

@@ -1,5 +1,6 @@
 use std::path::PathBuf;
 
+use super::next;
 use crate::scene::synthetic;
 
 /// Write a synthetic scene: a textured room, an object to remove, and everything known about it
@@ -44,5 +45,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         "{}: {train_views} train views with the object and {test_views} test views without it, {width}x{height}; {points} points",
         dir.display()
     );
+    next::say(&[
+        (next::command(&["doctor"], dir), "looks it over"),
+        (next::command(&["train"], dir), "trains it without its object"),
+    ]);
     Ok(())
 }

@@ -11,7 +11,8 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::folders::{MODEL, RECORD, Record, SEEN, SETTINGS, TEST};
 use super::shared::{DeviceArgs, SceneArgs, load_scene, with_gpu};
-use super::{instruments, pictures};
+use super::{index, instruments, next, pictures, preset};
+use crate::capture::doctor::{self, Severity};
 use crate::config::{Settings, SettingsArgs, Source};
 use crate::evaluate::{Judge, Report};
 use crate::gpu::{Gpu, Options, Timing};
@@ -25,15 +26,19 @@ use crate::train::run::{LOG, Observer, Progress, Run, Signal, Summary};
 /// Train a scene without its object
 ///
 /// Writes a run folder: the model (point_cloud.ply, weights.safetensors), log.jsonl, settings.toml, run.json, the test
-/// views as rendered at the end and their figures (metrics.json). `synthetic` is the built-in scene.
+/// views as rendered at the end, their figures (metrics.json), and a page of it all (index.html). `synthetic` is the
+/// built-in scene.
+///
+/// Without --preset and --config a preset is chosen for the device and the size of the pictures: demo or lavapipe on a CPU,
+/// the defaults (gscream) on a GPU.
 ///
 /// A run that ended early (Ctrl-C, SIGTERM, an error, a power failure) is gone on with by `--resume RUN`, to the same
 /// bytes as if nothing had happened. Until a run is complete its folder holds checkpoints: two at most, one every
 /// train.checkpoint_interval steps.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
-  gscream-vk train synthetic --preset demo
-  gscream-vk train garden --preset lavapipe --out runs/garden
+  gscream-vk train synthetic
+  gscream-vk train garden --out runs/garden
   gscream-vk train garden --preset paper --set losses.depth.enabled=false --iterations 7000
   gscream-vk train --resume runs/garden")]
 pub(super) struct Args {
@@ -81,15 +86,19 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         (load_scene(&path, &settings)?, settings, name, folder.clone())
     } else {
         let given = given.expect("clap asks for a scene where there is nothing to resume");
-        let (scene, settings) = given.load()?;
+        let (scene, settings) = preset::load(&given, &args.device)?;
         let name = given.name();
         let folder = args.out.clone().unwrap_or_else(|| default_folder(&name));
         if folder.join(RECORD).exists() && !args.overwrite {
-            bail!("{}: holds a run already: choose another --out, or --overwrite", folder.display());
+            bail!(
+                "{}: holds a run already: choose another --out, go on with it by --resume, or replace it by --overwrite",
+                folder.display()
+            );
         }
         (scene, settings, name, folder)
     };
-    eprintln!("doctor: {}", crate::capture::doctor::verdict(&scene));
+    let looked = doctor::look(&scene);
+    eprintln!("doctor: {}", looked.verdict());
     let options = Options { timestamps: args.profile, ..args.device.options() };
     with_gpu(&options, |gpu| {
         eprintln!("device: {} ({})", gpu.info().name, gpu.info().driver);
@@ -108,8 +117,20 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         }
         println!("{}", describe(&summary));
         println!("wrote {} in {}", written.join(", "), folder.display());
+        warn(&looked);
+        let page = (next::typed(&folder.join(index::INDEX).to_string_lossy()), "is the run as a page, for a browser");
+        let steps: Vec<_> = index::steps(&folder).into_iter().chain([page]).collect();
+        next::say(&steps);
         Ok(())
     })
+}
+
+/// Says again what is wrong with the scene, now that the lines of the start have scrolled away.
+fn warn(looked: &doctor::Report) {
+    for finding in looked.findings.iter().filter(|finding| finding.severity == Severity::Problem) {
+        let view = finding.view.as_ref().map_or_else(String::new, |view| format!("{view}: "));
+        eprintln!("warning: {view}{}", finding.message);
+    }
 }
 
 /// `runs/` and the last part of the scene's name.
@@ -149,8 +170,8 @@ pub(super) fn train(
     for left in &run.step().plan.left_out {
         eprintln!("left out: {} ({})", left.what, left.why);
     }
-    let trained = finish(run, settings, record, folder, began)?;
-    judged(gpu, scene, settings, folder, judge, trained)
+    let trained = finish(run, settings, folder, began)?;
+    judged(gpu, scene, settings, (folder, record), judge, trained)
 }
 
 /// A run from its first step, with room for what it is expected to take; refused where the device has not that much.
@@ -206,25 +227,21 @@ fn resume(
         name.clone_into(&mut record.scene);
         record.write(folder)?;
     }
-    let trained = finish(run, settings, record, folder, began)?;
-    judged(gpu, scene, settings, folder, &Judge::default(), trained)
+    let trained = finish(run, settings, folder, began)?;
+    judged(gpu, scene, settings, (folder, record), &Judge::default(), trained)
 }
 
-/// Trains to the end, evaluates, and marks the run as complete.
-fn finish(
-    mut run: Run<'_>,
-    settings: &Settings,
-    record: Record,
-    folder: &Path,
-    began: Option<Instant>,
-) -> anyhow::Result<Trained> {
+/// Trains to the end and evaluates.
+fn finish(mut run: Run<'_>, settings: &Settings, folder: &Path, began: Option<Instant>) -> anyhow::Result<Trained> {
     eprintln!("anchors: {}", run.step().anchors.count);
     let signals = Signals::listen()?;
     let bar = bar(settings.train.iterations, run.done());
     let mut watch = Watch { bar, pictures: folder.join(TEST), failed: None, signals, began };
-    let mut summary = run.train(folder, &mut watch)?;
+    let result = run.train(folder, &mut watch);
     watch.bar.finish_and_clear();
+    let mut summary = result.inspect_err(|_| index::of_stopped(folder))?;
     if let Some(error) = watch.failed {
+        index::of_stopped(folder);
         return Err(error.into());
     }
     let mut written = vec![MODEL, LOG, SETTINGS, RECORD];
@@ -233,27 +250,33 @@ fn finish(
         report.write_json(&folder.join(METRICS))?;
         written.extend([TEST, METRICS]);
     }
-    Record { complete: Some(summary.steps), ..record }.write(folder)?;
-    checkpoint::clear(folder)?;
     Ok(Trained { summary, report, written })
 }
 
-/// Judges the model of a run that has ended by all that there is to judge it by, in place of the run's own figures.
+/// Judges the model of a run that has ended by all that there is to judge it by, in place of the run's own figures, makes
+/// its page, and marks the run as complete.
 fn judged(
     gpu: &Gpu,
     scene: &Scene,
     settings: &Settings,
-    folder: &Path,
+    (folder, record): (&Path, Record),
     judge: &Judge,
     mut trained: Trained,
 ) -> anyhow::Result<Trained> {
+    let mut shown = vec![];
     if trained.report.is_some() {
         let measured = instruments::measure(gpu, &folder.join(MODEL), scene, settings, judge)?;
         measured.write_seen(scene, &folder.join(SEEN))?;
         measured.report.write_json(&folder.join(METRICS))?;
         trained.report = Some(measured.report);
         trained.written.push(SEEN);
+        shown = measured.shown;
     }
+    let record = Record { complete: Some(trained.summary.steps), ..record };
+    index::write(folder, &record, scene, &shown)?;
+    trained.written.push(index::INDEX);
+    record.write(folder)?;
+    checkpoint::clear(folder)?;
     Ok(trained)
 }
 
@@ -270,12 +293,13 @@ fn clear(folder: &Path) -> anyhow::Result<()> {
         }
         _ => Ok(()),
     };
-    for pictures in [TEST, SEEN].map(|name| folder.join(name)) {
+    for pictures in [TEST, SEEN, index::PICTURES].map(|name| folder.join(name)) {
         gone(pictures.clone(), std::fs::remove_dir_all(&pictures))?;
     }
     let model = folder.join(MODEL);
     let files = [model.join(POINT_CLOUD), model.join(WEIGHTS)];
-    for path in files.into_iter().chain([LOG, METRICS, TRACE, SETTINGS, RECORD].map(|name| folder.join(name))) {
+    let of_run = [LOG, METRICS, TRACE, index::INDEX, SETTINGS, RECORD];
+    for path in files.into_iter().chain(of_run.map(|name| folder.join(name))) {
         gone(path.clone(), std::fs::remove_file(&path))?;
     }
     Ok(())
@@ -283,11 +307,14 @@ fn clear(folder: &Path) -> anyhow::Result<()> {
 
 /// Removes what a killed run had not written to the end.
 fn sweep(folder: &Path) {
-    checkpoint::sweep(folder, |name| [LOG, METRICS, SETTINGS, RECORD].contains(&name));
+    checkpoint::sweep(folder, |name| [LOG, METRICS, index::INDEX, SETTINGS, RECORD].contains(&name));
     checkpoint::sweep(&folder.join(checkpoint::FOLDER), |name| name.starts_with("step-"));
     checkpoint::sweep(&folder.join(MODEL), |name| [POINT_CLOUD, WEIGHTS].contains(&name));
     checkpoint::sweep(&folder.join(TEST), |name| name.ends_with(".png"));
     checkpoint::sweep(&folder.join(SEEN), |name| name.ends_with(".png"));
+    for pictures in index::FOLDERS {
+        checkpoint::sweep(&folder.join(index::PICTURES).join(pictures), |name| name.ends_with(".jpg"));
+    }
 }
 
 /// Writes a file that appears complete or not at all.

@@ -1,7 +1,9 @@
 //! `gscream-vk verify`.
 
 use anyhow::bail;
+use indicatif::{ProgressBar, ProgressStyle};
 
+use super::next;
 use super::shared::{DeviceArgs, SceneArgs, with_gpu};
 use crate::train::run::Run;
 
@@ -31,9 +33,13 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let (scene, settings) = args.scene.load()?;
     with_gpu(&args.device.options(), |gpu| {
         let mut run = Run::new(gpu, &scene, &settings)?;
+        let style = ProgressStyle::with_template("warm-up {wide_bar} {pos}/{len} steps, {eta} left")?;
+        let bar = ProgressBar::new(args.warm_up.into()).with_style(style);
         for step in 1..=args.warm_up {
             run.run_one(step)?;
+            bar.inc(1);
         }
+        bar.finish_and_clear();
         let step = args.step.unwrap_or(args.warm_up + 1).max(1);
         let mut rec = gpu.checked()?;
         let view = run.record(&mut rec, step)?;
@@ -49,6 +55,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         if beyond > 0 {
             bail!("{beyond} tensors differ from the reference path by more than their bound");
         }
+        next::say(&[(next::command(&["train"], &args.scene.scene), "trains the scene")]);
         Ok(())
     })
 }

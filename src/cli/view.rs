@@ -8,6 +8,7 @@ use image::codecs::jpeg::JpegEncoder;
 
 use super::export::{Cameras, EXPORT, FIGURES, Pose, STEM};
 use super::folders::Origin;
+use super::next;
 use super::shared;
 use crate::export;
 use crate::scene::Camera;
@@ -49,6 +50,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         let html = page.single().with_context(|| format!("{}: cannot be made", file.display()))?;
         export::write(&[(file.clone(), html.as_bytes())])?;
         println!("{}: {:.1} MB, needs nothing else", file.display(), html.len() as f64 / 1e6);
+        next::say(&[(next::typed(&file.to_string_lossy()), "open it in a browser, or send it")]);
         return Ok(());
     }
     let address = SocketAddr::new(args.host, args.port);

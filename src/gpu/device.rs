@@ -168,7 +168,12 @@ fn open_instance(validate: bool) -> Result<Instance, Error> {
         info = info.push_next(&mut features);
     }
     // SAFETY: every name passed was listed by the loader or is checked by it.
-    let raw = unsafe { entry.create_instance(&info, None) }.named("creating a Vulkan instance")?;
+    let raw = unsafe { entry.create_instance(&info, None) };
+    // The loader's answer where no driver is installed, or none that can be loaded.
+    if raw.as_ref().err() == Some(&vk::Result::ERROR_INCOMPATIBLE_DRIVER) {
+        return Err(Error::NoDevice);
+    }
+    let raw = raw.named("creating a Vulkan instance")?;
     Ok(Instance { entry, raw, messages: Arc::default(), debug_utils })
 }
 
@@ -307,7 +312,7 @@ fn choose(
         (None, Some(text)) => Err(Error::UnknownDevice { wanted: text.to_owned(), listed }),
         (None, None) => Err(Error::Missing {
             device: format!("each of the {all} devices here ({listed})"),
-            feature: "a needed feature: `gscream-vk devices` names it".into(),
+            feature: "a needed feature (`gscream-vk devices` names it)".into(),
         }),
     }
 }
@@ -322,6 +327,18 @@ pub fn devices() -> Result<Vec<DeviceInfo>, Error> {
     // SAFETY: nothing made from the instance is alive.
     unsafe { instance.raw.destroy_instance(None) };
     Ok(found?.into_iter().map(|(_, info)| info).collect())
+}
+
+/// The device that [`Gpu::open`] opens for this `wanted`, without opening it.
+///
+/// # Errors
+/// As [`Gpu::open`].
+pub fn chosen(wanted: Option<&str>) -> Result<DeviceInfo, Error> {
+    let instance = open_instance(false)?;
+    let found = list(&instance.raw).and_then(|devices| choose(devices, wanted));
+    // SAFETY: nothing made from the instance is alive.
+    unsafe { instance.raw.destroy_instance(None) };
+    Ok(found?.1)
 }
 
 impl Gpu {

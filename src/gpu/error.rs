@@ -12,7 +12,7 @@ pub enum Error {
     NoLoader(String),
     /// The loader lists no device at all.
     #[error(
-        "no Vulkan device was found: install a driver (Debian: mesa-vulkan-drivers has lavapipe, which needs no GPU)"
+        "no Vulkan device was found: install a driver (Debian: mesa-vulkan-drivers has lavapipe, which needs no GPU), and look whether VK_DRIVER_FILES or VK_ICD_FILENAMES names one that is not there"
     )]
     NoDevice,
     /// `--device` names none of the devices.
@@ -24,7 +24,9 @@ pub enum Error {
         listed: String,
     },
     /// The device lacks a feature that every kernel needs.
-    #[error("{device} cannot be used: it lacks {feature}")]
+    #[error(
+        "{device} cannot be used: it lacks {feature}; update its driver, or take another device with --device (`gscream-vk devices` lists them)"
+    )]
     Missing {
         /// Device name.
         device: String,

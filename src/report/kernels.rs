@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
+use super::pace::Pace;
 use super::pareto::{self, Choice};
 use super::stages::{self, GRADIENTS, OUTPUTS, Rows, Stage, WANTED};
 use super::statistics::Spread;
@@ -192,10 +193,10 @@ pub fn measure(
     }
 
     let mut times: Vec<Times> = vec![Times::default(); variants.len()];
+    // The first round warms up.
+    let pace = Pace::new(1 + options.repetitions);
     for round in 0..=options.repetitions {
-        let what =
-            if round == 0 { "warming up".to_owned() } else { format!("round {round} of {}", options.repetitions) };
-        say(&format!("kernels: {what}"));
+        say(&format!("kernels: round {}", pace.next(round)));
         for turn in 0..variants.len() {
             let which = (turn + round) % variants.len();
             let passes: Vec<Vec<Timing>> =

@@ -10,6 +10,7 @@
 
 pub mod figures;
 pub mod kernels;
+pub mod pace;
 pub mod page;
 pub mod pareto;
 pub mod plots;

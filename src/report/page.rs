@@ -19,7 +19,8 @@ pub struct Drawings {
     pub training: String,
 }
 
-const STYLE: &str = "
+/// How pages of this program look.
+pub(crate) const STYLE: &str = "
 :root { color-scheme: light; }
 * { box-sizing: border-box; }
 body { margin: 0 auto; padding: 2rem 1.5rem 4rem; max-width: 76rem; color: #222; background: #fff;

@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
+use super::pace::Pace;
 use super::pareto;
 use super::statistics::{Moments, Paired};
 use super::variants::Variant;
@@ -221,6 +222,8 @@ pub fn measure<E: From<Error>>(
     let iterations = base.train.iterations;
     let steps = steps(iterations, options);
     let mut measured = vec![];
+    let pace = Pace::new(variants.len() * options.seeds as usize);
+    let mut done = 0;
     for Variant { name, changes, settings } in variants {
         let other = if settings.scene == base.scene { None } else { Some(read(&settings)?) };
         let other = other.map(|other| Scene { test: scene.test.clone(), ..other });
@@ -233,7 +236,9 @@ pub fn measure<E: From<Error>>(
             settings.train.seed = seed;
             let which = if options.seeds > 1 { format!("{name}, seed {seed}") } else { name.clone() };
             let steps = steps.iter().copied().filter(|step| *step <= settings.train.iterations).collect();
-            let samples = train(gpu, scene, &settings, steps, &which, say)?;
+            say(format!("training: \"{which}\", {} steps {}", settings.train.iterations, pace.next(done)).trim_end());
+            let samples = train(gpu, scene, &settings, steps, say)?;
+            done += 1;
             runs.push(SeedRun { seed, samples });
         }
         measured.push(VariantRuns { name, changes, points: points(&runs), runs, dominated_by: None });
@@ -264,10 +269,8 @@ fn train(
     scene: &Scene,
     settings: &Settings,
     steps: Vec<u32>,
-    name: &str,
     say: &mut dyn FnMut(&str),
 ) -> Result<Vec<Sample>, Error> {
-    say(&format!("training: \"{name}\", {} steps", settings.train.iterations));
     let folder = tempfile::tempdir().map_err(Error::Temporary)?;
     let mut watch = Watch {
         views: &scene.test,

@@ -310,7 +310,7 @@ pub enum Error {
     #[error("{}: camera {id} uses {model}; {}", path.display(), colmap::unsupported_hint())]
     CameraModel { path: PathBuf, id: u32, model: String },
     /// No sparse model.
-    #[error("{}: no COLMAP model; sparse/0/ (or sparse/) must hold cameras and images, both .bin or both .txt", scene.display())]
+    #[error("{0}: no COLMAP model; sparse/0/ (or sparse/) must hold cameras and images, both .bin or both .txt; gscream-vk prepare {0}/images --out SCENE makes one, where colmap is installed", scene.display())]
     NoModel { scene: PathBuf },
     /// A model without points.
     #[error(
@@ -319,7 +319,7 @@ pub enum Error {
     )]
     NoPoints { folder: PathBuf },
     /// No photographs.
-    #[error("{}: no pictures; put the photographs (.jpg or .png) into images/", scene.display())]
+    #[error("{0}: no pictures in images/; put the photographs (.jpg or .png) there, or make a scene of them: gscream-vk prepare {0} --out SCENE", scene.display())]
     NoImages { scene: PathBuf },
     /// Pictures and model do not belong together.
     #[error(
@@ -932,6 +932,13 @@ pub(crate) fn pictures(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Error
         return Err(Error::File { path: folder.to_path_buf(), what: "there is no such folder".into() });
     }
     layout::index(folder, &layout::PICTURES)
+}
+
+/// Longer side of the first picture of a scene, pixels; `None` where there is none that can be read.
+pub(crate) fn longest_side(folder: &Path) -> Option<u32> {
+    let layout = layout::find(folder).ok()?;
+    let (width, height) = image::image_dimensions(&layout.train.first()?.image).ok()?;
+    Some(width.max(height))
 }
 
 /// The depth maps in a folder and in the folders below it, by their path below `folder` without extension.

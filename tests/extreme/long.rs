@@ -97,7 +97,7 @@ fn long_run(_: &Gpu) {
     }
     let name = format!("{}: {}", CASES[0].stage, CASES[0].case);
     let output = std::process::Command::new(std::env::current_exe().expect("this program"))
-        .args(["--exact", &name, "--test-threads=1"])
+        .args(["--exact", &name, "--test-threads=1", "--include-ignored"])
         .env(ALONE, "1")
         .output()
         .expect("it starts again");

@@ -68,11 +68,13 @@ fn main() {
     let mut trials: Vec<Trial> = cases
         .into_iter()
         .map(|case| {
-            Trial::test(format!("{}: {}", case.stage, case.case), || {
+            let trial = Trial::test(format!("{}: {}", case.stage, case.case), || {
                 let gpu = testing::gpu();
                 (case.run)(&gpu);
                 Ok(())
-            })
+            });
+            // Minutes: `.ci/run` has it.
+            trial.with_ignored_flag(long::CASES.iter().any(|long| long.case == case.case))
         })
         .collect();
     trials.push(Trial::test("guarantees", move || {
