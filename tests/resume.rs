@@ -260,6 +260,37 @@ fn killed_at_any_moment_it_comes_to_the_same_end() {
     println!("{MOMENTS} kills of {runs} runs, {resumed} of them resumed before");
 }
 
+/// The same command line starts a run, goes on with it, and leaves it alone once it is complete.
+#[test]
+fn resume_or_start_does_what_is_missing() {
+    let place = Place::new(&settings());
+    let again = |more: &[&str]| place.train("run", &[&["--resume-or-start"], more].concat());
+    let mut child = again(&[]).spawn().expect("the program starts");
+    assert!(wait_until(&mut child, || place.checkpoints("run").first().is_some_and(|newest| *newest >= 6)));
+    child.kill().expect("a child");
+    child.wait_with_output().expect("a child");
+    // Other settings, and another scene: nothing is touched.
+    let before = place.checkpoints("run");
+    let stderr = fails(again(&["--seed", "7"]), 1);
+    let says = "error: run: holds a run with other settings, train.seed was 0 and is 7: choose another --out, or --overwrite it";
+    assert!(stderr.contains(says), "{stderr}");
+    copy(&place.path().join("scene"), &place.path().join("other"));
+    let arguments = ["train", "other", "--config", "settings.toml", "--out", "run", "--resume-or-start"];
+    let stderr = fails(place.program(&arguments), 1);
+    assert!(
+        stderr.contains("run: holds a run of another scene, ") && stderr.contains("/other was asked for"),
+        "{stderr}"
+    );
+    assert_eq!(place.checkpoints("run"), before);
+    let output = succeeds(again(&[]));
+    assert!(text(&output.stderr).contains("resuming: behind step"), "{}", text(&output.stderr));
+    assert_whole(&place, "run", "resumed by the same command line");
+    let output = succeeds(again(&[]));
+    assert_eq!(text(&output.stdout), "run: the run is complete (36 steps): nothing to do\n");
+    assert_whole(&place, "run", "left alone");
+    fails(again(&["--overwrite"]), 2);
+}
+
 /// Killed between the record that says so and the removal of its checkpoints, a run is complete.
 #[test]
 fn a_complete_run_is_rid_of_checkpoints_left_behind() {

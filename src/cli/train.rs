@@ -29,13 +29,15 @@ use crate::train::run::{LOG, Observer, Progress, Run, Signal, Summary};
 ///
 /// A run that ended early (Ctrl-C, SIGTERM, an error, a power failure) is gone on with by `--resume RUN`, to the same
 /// bytes as if nothing had happened. Until a run is complete its folder holds checkpoints: two at most, one every
-/// train.checkpoint_interval steps.
+/// train.checkpoint_interval steps. With `--resume-or-start` the same command line starts it, goes on with it and leaves
+/// it alone once it is complete.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   gscream-vk train synthetic --preset demo
   gscream-vk train garden --preset lavapipe --out runs/garden
   gscream-vk train garden --preset paper --set losses.depth.enabled=false --iterations 7000
-  gscream-vk train --resume runs/garden")]
+  gscream-vk train --resume runs/garden
+  gscream-vk train garden --out runs/garden --resume-or-start")]
 pub(super) struct Args {
     /// Folder of the scene, or the word `synthetic` for the built-in one
     #[arg(value_name = "SCENE", required_unless_present = "resume")]
@@ -54,6 +56,12 @@ pub(super) struct Args {
     /// run starts again. A complete run stays as it is.
     #[arg(long, value_name = "RUN", conflicts_with_all = ["SettingsArgs", "out", "overwrite"])]
     resume: Option<PathBuf>,
+    /// Go on with a run that is in the folder, leave a complete one alone, start one where there is none
+    ///
+    /// For scripts and clusters: the same command line again after a failure comes to the same end. The scene and the
+    /// settings must be those that the run began with.
+    #[arg(long, conflicts_with_all = ["resume", "overwrite"])]
+    resume_or_start: bool,
     /// Measure every pass: prints milliseconds per pass and writes trace.json (for chrome://tracing or Perfetto)
     #[arg(long)]
     profile: bool,
@@ -65,35 +73,38 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let began = Some(Instant::now());
     let given = |scene: &PathBuf| SceneArgs { scene: scene.clone(), settings: args.settings.clone() };
     let given = args.scene.as_ref().map(given);
-    let (scene, settings, name, folder) = if let Some(folder) = &args.resume {
+    let (scene, settings, name, folder, begun) = if let Some(folder) = &args.resume {
         let record = Record::read(folder)
             .with_context(|| format!("{}: holds no run to go on with: start one with --out", folder.display()))?;
-        if let Some(steps) = record.complete {
-            // It may have been killed after it was complete and before its last lines.
-            sweep(folder);
-            checkpoint::clear(folder)?;
-            println!("{}: the run is complete ({steps} steps): nothing to do", folder.display());
+        if is_complete(folder, &record)? {
             return Ok(());
         }
         let settings = Settings::resolve(&[Source::File(folder.join(SETTINGS))])?;
         let path = args.scene.clone().unwrap_or_else(|| PathBuf::from(&record.scene));
         let name = given.map_or(record.scene, |given| given.name());
-        (load_scene(&path, &settings)?, settings, name, folder.clone())
+        (load_scene(&path, &settings)?, settings, name, folder.clone(), true)
     } else {
         let given = given.expect("clap asks for a scene where there is nothing to resume");
         let (scene, settings) = given.load()?;
         let name = given.name();
         let folder = args.out.clone().unwrap_or_else(|| default_folder(&name));
-        if folder.join(RECORD).exists() && !args.overwrite {
+        let begun = args.resume_or_start && folder.join(RECORD).exists();
+        if begun {
+            let record = Record::read(&folder)?;
+            same_run(&folder, &record, &name, &settings)?;
+            if is_complete(&folder, &record)? {
+                return Ok(());
+            }
+        } else if folder.join(RECORD).exists() && !args.overwrite {
             bail!("{}: holds a run already: choose another --out, or --overwrite", folder.display());
         }
-        (scene, settings, name, folder)
+        (scene, settings, name, folder, begun)
     };
     eprintln!("doctor: {}", crate::capture::doctor::verdict(&scene));
     let options = Options { timestamps: args.profile, ..args.device.options() };
     with_gpu(&options, |gpu| {
         eprintln!("device: {} ({})", gpu.info().name, gpu.info().driver);
-        let Trained { summary, report, mut written } = if args.resume.is_some() {
+        let Trained { summary, report, mut written } = if begun {
             resume(gpu, &scene, &settings, &name, &folder, began)?
         } else {
             train(gpu, &scene, &settings, &name, &folder, began, &Judge::default())?
@@ -110,6 +121,29 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         println!("wrote {} in {}", written.join(", "), folder.display());
         Ok(())
     })
+}
+
+/// Whether the run is complete, which is then said.
+fn is_complete(folder: &Path, record: &Record) -> anyhow::Result<bool> {
+    let Some(steps) = record.complete else { return Ok(false) };
+    // It may have been killed after it was complete and before its last lines.
+    sweep(folder);
+    checkpoint::clear(folder)?;
+    println!("{}: the run is complete ({steps} steps): nothing to do", folder.display());
+    Ok(true)
+}
+
+/// Refuses to go on with a run of another scene or under other settings than those asked for.
+fn same_run(folder: &Path, record: &Record, name: &str, settings: &Settings) -> anyhow::Result<()> {
+    let or = "choose another --out, or --overwrite it";
+    if record.scene != name {
+        bail!("{}: holds a run of another scene, {}, where {name} was asked for: {or}", folder.display(), record.scene);
+    }
+    let theirs = Settings::resolve(&[Source::File(folder.join(SETTINGS))])?;
+    if let Some(difference) = checkpoint::setting_difference(&theirs.to_toml(), &settings.to_toml()) {
+        bail!("{}: holds a run with other settings, {difference}: {or}", folder.display());
+    }
+    Ok(())
 }
 
 /// `runs/` and the last part of the scene's name.
@@ -149,8 +183,8 @@ pub(super) fn train(
     for left in &run.step().plan.left_out {
         eprintln!("left out: {} ({})", left.what, left.why);
     }
-    let trained = finish(run, settings, record, folder, began)?;
-    judged(gpu, scene, settings, folder, judge, trained)
+    let trained = finish(run, settings, folder, began)?;
+    complete(record, folder, judged(gpu, scene, settings, folder, judge, trained)?)
 }
 
 /// A run from its first step, with room for what it is expected to take; refused where the device has not that much.
@@ -206,18 +240,12 @@ fn resume(
         name.clone_into(&mut record.scene);
         record.write(folder)?;
     }
-    let trained = finish(run, settings, record, folder, began)?;
-    judged(gpu, scene, settings, folder, &Judge::default(), trained)
+    let trained = finish(run, settings, folder, began)?;
+    complete(record, folder, judged(gpu, scene, settings, folder, &Judge::default(), trained)?)
 }
 
-/// Trains to the end, evaluates, and marks the run as complete.
-fn finish(
-    mut run: Run<'_>,
-    settings: &Settings,
-    record: Record,
-    folder: &Path,
-    began: Option<Instant>,
-) -> anyhow::Result<Trained> {
+/// Trains to the end and evaluates.
+fn finish(mut run: Run<'_>, settings: &Settings, folder: &Path, began: Option<Instant>) -> anyhow::Result<Trained> {
     eprintln!("anchors: {}", run.step().anchors.count);
     let signals = Signals::listen()?;
     let bar = bar(settings.train.iterations, run.done());
@@ -233,9 +261,14 @@ fn finish(
         report.write_json(&folder.join(METRICS))?;
         written.extend([TEST, METRICS]);
     }
-    Record { complete: Some(summary.steps), ..record }.write(folder)?;
-    checkpoint::clear(folder)?;
     Ok(Trained { summary, report, written })
+}
+
+/// Marks the run as complete: nothing of it is missing any more.
+fn complete(record: Record, folder: &Path, trained: Trained) -> anyhow::Result<Trained> {
+    Record { complete: Some(trained.summary.steps), ..record }.write(folder)?;
+    checkpoint::clear(folder)?;
+    Ok(trained)
 }
 
 /// Judges the model of a run that has ended by all that there is to judge it by, in place of the run's own figures.
