@@ -1,5 +1,6 @@
 //! `gscream-vk train`.
 
+use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -14,13 +15,15 @@ use super::shared::{DeviceArgs, SceneArgs, load_scene, with_gpu};
 use super::{instruments, pictures};
 use crate::config::{Settings, SettingsArgs, Source};
 use crate::evaluate::{Judge, Report};
-use crate::gpu::{Gpu, Options, Timing};
+use crate::gpu::{self, Gpu, Options, Timing};
 use crate::model::files::{POINT_CLOUD, WEIGHTS};
 use crate::render::view::Rendered;
-use crate::scene::Scene;
+use crate::scene::{Camera, Scene};
 use crate::train::checkpoint::{self, Owner, Search};
 use crate::train::forecast::{self, Question};
 use crate::train::run::{LOG, Observer, Progress, Run, Signal, Summary};
+use crate::view::live::{Board, Host};
+use crate::view::server;
 
 /// Train a scene without its object
 ///
@@ -62,11 +65,44 @@ pub(super) struct Args {
     /// settings must be those that the run began with.
     #[arg(long, conflicts_with_all = ["resume", "overwrite"])]
     resume_or_start: bool,
+    /// Show the training in the browser while it runs, at this address [default: 127.0.0.1:8643]
+    ///
+    /// Pictures are rendered where the page looks, in a few per cent of the time while somebody looks; the trained model
+    /// is the same. From another machine: ssh -L 8643:localhost:8643 HOST. Other addresses than the loopback let other
+    /// machines in; port 0 is any free one.
+    #[arg(long, value_name = "ADDRESS", num_args = 0..=1, require_equals = true, value_parser = address,
+        default_missing_value = "127.0.0.1:8643")]
+    view: Option<SocketAddr>,
     /// Measure every pass: prints milliseconds per pass and writes trace.json (for chrome://tracing or Perfetto)
     #[arg(long)]
     profile: bool,
     #[command(flatten)]
     device: DeviceArgs,
+}
+
+/// An address and a port, or one of them.
+fn address(text: &str) -> Result<SocketAddr, String> {
+    let with_port = || text.parse().ok();
+    let alone = || Some(SocketAddr::new(text.parse().ok()?, PORT));
+    let port = || Some(SocketAddr::new(Ipv4Addr::LOCALHOST.into(), text.parse().ok()?));
+    with_port()
+        .or_else(alone)
+        .or_else(port)
+        .ok_or_else(|| "give ADDRESS:PORT, such as 127.0.0.1:8643, or a port".into())
+}
+
+/// Where a training is shown unless told otherwise.
+const PORT: u16 = 8643;
+
+/// Serves a page about the training; the trainer's side of it is made of what is returned.
+fn show(address: SocketAddr, name: &str, scene: &Scene, settings: &Settings) -> anyhow::Result<Arc<Board>> {
+    let listener = super::view::bind(address, "--view=127.0.0.1:0")?;
+    let title = Path::new(name).file_name().map_or_else(|| name.into(), |name| name.to_string_lossy().into_owned());
+    let board = Board::new(title, scene, settings.train.iterations);
+    eprintln!("view: http://{}/", listener.local_addr().unwrap_or(address));
+    let site = board.clone();
+    std::thread::spawn(move || server::serve(&listener, &site));
+    Ok(board)
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
@@ -101,13 +137,15 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         (scene, settings, name, folder, begun)
     };
     eprintln!("doctor: {}", crate::capture::doctor::verdict(&scene));
+    let board = args.view.map(|address| show(address, &name, &scene, &settings)).transpose()?;
+    let manner = Manner { began, board };
     let options = Options { timestamps: args.profile, ..args.device.options() };
     with_gpu(&options, |gpu| {
         eprintln!("device: {} ({})", gpu.info().name, gpu.info().driver);
         let Trained { summary, report, mut written } = if begun {
-            resume(gpu, &scene, &settings, &name, &folder, began)?
+            resume(gpu, &scene, &settings, &name, &folder, &manner)?
         } else {
-            train(gpu, &scene, &settings, &name, &folder, began, &Judge::default())?
+            train(gpu, &scene, &settings, &name, &folder, &manner, &Judge::default())?
         };
         if let Some(report) = report {
             println!("{}", report.table());
@@ -152,6 +190,15 @@ pub(super) fn default_folder(scene: &str) -> PathBuf {
     Path::new("runs").join(stem)
 }
 
+/// How a run is trained, which changes nothing of what it comes to.
+#[derive(Default)]
+pub(super) struct Manner {
+    /// When all began: how long the first step was in coming is said when it is known.
+    pub began: Option<Instant>,
+    /// Where visitors see it.
+    pub board: Option<Arc<Board>>,
+}
+
 /// What a finished run is.
 pub(super) struct Trained {
     /// Speed and size.
@@ -162,15 +209,14 @@ pub(super) struct Trained {
     pub written: Vec<&'static str>,
 }
 
-/// Trains into `folder`, in place of any run that is there, and evaluates, with a progress bar on stderr. How long the
-/// first step was in coming is said when it is known when all `began`.
+/// Trains into `folder`, in place of any run that is there, and evaluates, with a progress bar on stderr.
 pub(super) fn train(
     gpu: &Gpu,
     scene: &Scene,
     settings: &Settings,
     name: &str,
     folder: &Path,
-    began: Option<Instant>,
+    manner: &Manner,
     judge: &Judge,
 ) -> anyhow::Result<Trained> {
     std::fs::create_dir_all(folder).with_context(|| format!("{}: cannot be made", folder.display()))?;
@@ -183,7 +229,7 @@ pub(super) fn train(
     for left in &run.step().plan.left_out {
         eprintln!("left out: {} ({})", left.what, left.why);
     }
-    let trained = finish(run, settings, folder, began)?;
+    let trained = finish(run, settings, folder, manner)?;
     complete(record, folder, judged(gpu, scene, settings, folder, judge, trained)?)
 }
 
@@ -210,7 +256,7 @@ fn resume(
     settings: &Settings,
     name: &str,
     folder: &Path,
-    began: Option<Instant>,
+    manner: &Manner,
 ) -> anyhow::Result<Trained> {
     sweep(folder);
     let mut record = Record::read(folder)?;
@@ -240,16 +286,17 @@ fn resume(
         name.clone_into(&mut record.scene);
         record.write(folder)?;
     }
-    let trained = finish(run, settings, folder, began)?;
+    let trained = finish(run, settings, folder, manner)?;
     complete(record, folder, judged(gpu, scene, settings, folder, &Judge::default(), trained)?)
 }
 
 /// Trains to the end and evaluates.
-fn finish(mut run: Run<'_>, settings: &Settings, folder: &Path, began: Option<Instant>) -> anyhow::Result<Trained> {
+fn finish(mut run: Run<'_>, settings: &Settings, folder: &Path, manner: &Manner) -> anyhow::Result<Trained> {
     eprintln!("anchors: {}", run.step().anchors.count);
     let signals = Signals::listen()?;
     let bar = bar(settings.train.iterations, run.done());
-    let mut watch = Watch { bar, pictures: folder.join(TEST), failed: None, signals, began };
+    let host = manner.board.as_ref().map(Host::new);
+    let mut watch = Watch { bar, pictures: folder.join(TEST), failed: None, signals, began: manner.began, host };
     let mut summary = run.train(folder, &mut watch)?;
     watch.bar.finish_and_clear();
     if let Some(error) = watch.failed {
@@ -375,6 +422,7 @@ struct Watch {
     signals: Signals,
     /// Until the first step has ended.
     began: Option<Instant>,
+    host: Option<Host>,
 }
 
 /// SIGINT and SIGTERM, remembered; a second one of a kind ends the program at once.
@@ -413,8 +461,27 @@ impl Observer for Watch {
         if let Some(began) = self.began.take() {
             self.say(&format!("first step done {:.2} s after the start", began.elapsed().as_secs_f64()));
         }
+        if let Some(host) = &self.host {
+            host.step(progress);
+        }
         self.bar.set_position(progress.step.into());
         self.bar.set_message(format!("loss {:.4}  {} anchors", progress.loss, progress.anchors));
+    }
+
+    fn visited(&mut self) -> bool {
+        self.host.as_ref().is_some_and(Host::visited)
+    }
+
+    fn look(&mut self, draw: &mut dyn FnMut(&Camera) -> Result<Option<Rendered>, gpu::Error>) {
+        if let Some(host) = &mut self.host {
+            host.look(draw);
+        }
+    }
+
+    fn evaluated(&mut self, progress: &Progress, report: &Report) {
+        if let Some(host) = &self.host {
+            host.evaluated(progress, report);
+        }
     }
 
     fn say(&mut self, line: &str) {
