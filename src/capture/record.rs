@@ -233,7 +233,11 @@ impl Folder {
         for path in old.into_iter().filter(|path| !new.files.contains_key(path)) {
             if self.root.join(&path).exists() && !self.is_users(&path)? {
                 let file = self.root.join(&path);
-                std::fs::remove_file(&file).map_err(|source| Error::Io { path: file, source })?;
+                std::fs::remove_file(&file).map_err(|source| Error::Io { path: file.clone(), source })?;
+                // A folder that is empty now says nothing any more; one that is not stays.
+                if let Some(folder) = file.parent().filter(|folder| *folder != self.root) {
+                    let _ = std::fs::remove_dir(folder);
+                }
             }
         }
         self.record.steps.insert(step.to_owned(), new);
