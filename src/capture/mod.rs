@@ -4,6 +4,7 @@ pub mod depth;
 pub mod doctor;
 pub mod fit;
 pub mod graph_cut;
+pub mod lens;
 pub mod masks;
 pub mod patchmatch;
 pub mod poses;
@@ -281,7 +282,7 @@ fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>
             mask.iter_mut().for_each(|v| *v = 255 - *v);
         }
         // Of those that came with the photographs an empty one is a view without the object.
-        let mask = checked(path, mask, size, true)?;
+        let mask = capture.mask(name, checked(path, mask, size, true)?);
         all.insert(name.clone(), Given { mask, from: format!("{}", path.display()) });
     }
     for (name, evidence) in &request.object {
@@ -327,7 +328,14 @@ fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>
                 }
             }
         };
-        all.insert(stem, given);
+        let mask = capture.mask(&stem, given.mask);
+        if mask.as_raw().iter().all(|v| *v == 0) {
+            return Err(Error::Request(format!(
+                "{option} {name}: the object lies where the photograph's lens sees more than a pinhole does; mask a view that \
+                 has it nearer to the middle"
+            )));
+        }
+        all.insert(stem, Given { mask, ..given });
     }
     Ok(all)
 }
