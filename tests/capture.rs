@@ -88,7 +88,7 @@ fn one_box_becomes_a_scene() {
     let around = bounds(&mask(&truth(&folder, given)), 4);
     let mut request = Request::new(folder.path().join("photos"), &out);
     request.object = vec![(name(given), Evidence::Box(around))];
-    (request.fit_steps, request.fit_side, request.depth) = (250, 112, true);
+    (request.fit_steps, request.fit_side) = (250, 112);
     // The view of which the built-in scene knows what is behind the object.
     request.reference = Some(name(given));
     let mut lines = Lines::default();
@@ -101,13 +101,21 @@ fn one_box_becomes_a_scene() {
     println!("the cut's IoU {own:.3}, carried {mean:.3}: {others:.3?}; {:?}", lines.0);
     assert!(own > 0.85 && mean > 0.8, "the cut's IoU {own:.3}, the others' {mean:.3}: {others:.3?}");
 
-    // The scene is one that training takes, with a reference; without its priors, whose NaN say that nothing is known.
-    let config = scene::Config { priors: false, ..scene::Config::default() };
-    let scene = scene::load(&out, &config).expect("a scene");
+    // The scene is one that training takes, with a reference and priors, whose NaN say that nothing is known.
+    let scene = scene::load(&out, &scene::Config::default()).expect("a scene");
     let reference = scene.references.first().expect("a reference");
     let view = &scene.train[reference.view];
     assert_eq!(scene.train.len(), VIEWS as usize);
     assert!(scene.train.iter().all(|view| view.mask.is_some()));
+    let known = |view: &scene::View| {
+        let prior = view.prior.as_ref().expect("a prior").values.iter().filter(|v| v.is_finite()).count();
+        prior as f64 / f64::from(view.camera.size[0] * view.camera.size[1])
+    };
+    let known: Vec<f64> = scene.train.iter().map(known).collect();
+    println!("depth is known of {known:.2?}");
+    assert!(known.iter().all(|part| (0.2..0.99).contains(part)), "{known:.2?}");
+    // Ours is written beside the reference, whose hole has a depth everywhere.
+    assert!(reference.prior.as_ref().is_some_and(|prior| prior.values.iter().any(|v| v.is_finite())));
 
     // Behind the object: nearer to the truth than the photograph, whose hole shows the object.
     let (found, object) = (&reference.image, &view.image);
@@ -148,6 +156,25 @@ fn one_box_becomes_a_scene() {
     assert!(record.contains("carried from train_000, train_005"), "{record}");
     let again = ious(&folder, &out, &[0, given]);
     assert!(again.iter().sum::<f64>() / again.len() as f64 > mean - 0.02, "{again:.3?}");
+
+    // Priors that the user brings are the only ones; those made before go when none are wanted.
+    request.only.clear();
+    request.depth = false;
+    capture::prepare(&gpu, &request, &mut Lines::default()).expect("a scene without priors");
+    assert!(!out.join("depth").exists());
+    fs::create_dir(out.join("depth")).expect("a writable folder");
+    assert!(!out.join("reference").join(name(given) + "_depth.npy").exists());
+    let own = out.join("depth").join(name(3) + ".npy");
+    fs::copy(folder.path().join("full/depth").join(name(3) + ".npy"), &own).expect("a writable folder");
+    request.depth = true;
+    let mut lines = Lines::default();
+    capture::prepare(&gpu, &request, &mut lines).expect("a scene with one prior");
+    assert!(
+        lines.0.iter().any(|line| line == "depth: the scene has priors of its own, none are made"),
+        "{:?}",
+        lines.0
+    );
+    assert_eq!(fs::read_dir(out.join("depth")).expect("a folder").count(), 1);
 }
 
 // ---------------------------------------------------------------- transforms.json

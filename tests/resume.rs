@@ -4,10 +4,13 @@
 mod common;
 
 use std::fs;
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::net::TcpStream;
 use std::os::unix::process::ExitStatusExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::LazyLock;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use assert_cmd::cargo::cargo_bin;
@@ -268,6 +271,108 @@ fn kill_at(moments: u32) {
         assert_whole(&place, &run, "at last");
     }
     println!("{moments} kills of {runs} runs, {resumed} of them resumed before");
+}
+
+/// The same command line starts a run, goes on with it, and leaves it alone once it is complete.
+#[test]
+fn resume_or_start_does_what_is_missing() {
+    let place = Place::new(&settings());
+    let again = |more: &[&str]| place.train("run", &[&["--resume-or-start"], more].concat());
+    let mut child = again(&[]).spawn().expect("the program starts");
+    assert!(wait_until(&mut child, || place.checkpoints("run").first().is_some_and(|newest| *newest >= 6)));
+    child.kill().expect("a child");
+    child.wait_with_output().expect("a child");
+    // Other settings, and another scene: nothing is touched.
+    let before = place.checkpoints("run");
+    let stderr = fails(again(&["--seed", "7"]), 1);
+    let says = "error: run: holds a run with other settings, train.seed was 0 and is 7: choose another --out, or --overwrite it";
+    assert!(stderr.contains(says), "{stderr}");
+    copy(&place.path().join("scene"), &place.path().join("other"));
+    let arguments = ["train", "other", "--config", "settings.toml", "--out", "run", "--resume-or-start"];
+    let stderr = fails(place.program(&arguments), 1);
+    assert!(
+        stderr.contains("run: holds a run of another scene, ") && stderr.contains("/other was asked for"),
+        "{stderr}"
+    );
+    assert_eq!(place.checkpoints("run"), before);
+    let output = succeeds(again(&[]));
+    assert!(text(&output.stderr).contains("resuming: behind step"), "{}", text(&output.stderr));
+    assert_whole(&place, "run", "resumed by the same command line");
+    let output = succeeds(again(&[]));
+    assert_eq!(text(&output.stdout), "run: the run is complete (36 steps): nothing to do\n");
+    assert_whole(&place, "run", "left alone");
+    fails(again(&["--overwrite"]), 2);
+}
+
+/// GETs a path, or sends whatever bytes; what came back.
+fn ask(address: &str, request: &[u8]) -> Vec<u8> {
+    let mut answer = vec![];
+    let Ok(mut stream) = TcpStream::connect(address) else { return answer };
+    let _ = stream.set_read_timeout(Some(Duration::from_secs(60)));
+    let _ = stream.write_all(request);
+    let _ = stream.read_to_end(&mut answer);
+    answer
+}
+
+/// Visitors see pictures, send nonsense, go away in the middle, and change no byte.
+#[test]
+fn visitors_change_no_byte() {
+    let place = Place::new(&settings());
+    let mut child = place.train("run", &["--view=127.0.0.1:0"]).spawn().expect("the program starts");
+    let mut stderr = BufReader::new(child.stderr.take().expect("it is piped"));
+    let mut said = String::new();
+    let address = loop {
+        let mut line = String::new();
+        assert!(stderr.read_line(&mut line).expect("text") > 0, "{said}");
+        said += &line;
+        if let Some(url) = line.trim_end().strip_prefix("view: http://") {
+            break url.trim_end_matches('/').to_owned();
+        }
+    };
+    // Two programs cannot serve at one place; the second says so and leaves nothing.
+    let other = fails(place.train("other", &[&format!("--view={address}")]), 1);
+    assert!(
+        other.contains(&format!("error: {address}: another program serves there; --view=127.0.0.1:0 takes a free one"))
+    );
+    assert!(!place.path().join("other").exists());
+    let get = |path: &str| format!("GET {path} HTTP/1.1\r\nHost: here\r\n\r\n").into_bytes();
+    let page = text(&ask(&address, &get("/")));
+    assert!(
+        page.starts_with("HTTP/1.1 200") && !page.contains("src=\"http") && !page.contains("href=\"http"),
+        "{page}"
+    );
+    let picture = |x: f64| get(&format!("/picture.jpg?c={x},0,0&r=1,0,0,0,1,0,0,0,1&f=1,1&s=48,36"));
+    let pictures = AtomicUsize::new(0);
+    let over = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        for visitor in 0..4 {
+            let (address, get, picture, pictures, over) = (&address, &get, &picture, &pictures, &over);
+            scope.spawn(move || {
+                while !over.load(Ordering::Relaxed) {
+                    if visitor == 3 {
+                        ask(address, &get("/picture.jpg?c=NaN,0,0&r=1,0,0,0,1,0,0,0,1&f=1,1&s=99999,36"));
+                        ask(address, &get("/state.json"));
+                        ask(address, &[0xff; 3000]);
+                        // Gone before the answer.
+                        if let Ok(mut stream) = TcpStream::connect(address) {
+                            let _ = stream.write_all(&picture(0.1));
+                        }
+                    }
+                    let answer = ask(address, &picture(0.1 * f64::from(visitor)));
+                    if answer.starts_with(b"HTTP/1.1 200") && answer.windows(2).any(|w| w == [0xff, 0xd8]) {
+                        pictures.fetch_add(1, Ordering::Relaxed);
+                    }
+                    std::thread::sleep(Duration::from_millis(5));
+                }
+            });
+        }
+        stderr.read_to_string(&mut said).expect("text");
+        assert!(child.wait().expect("a child").success(), "{said}");
+        over.store(true, Ordering::Relaxed);
+    });
+    println!("{} pictures", pictures.load(Ordering::Relaxed));
+    assert!(pictures.load(Ordering::Relaxed) > 0, "{said}");
+    assert_whole(&place, "run", "visited");
 }
 
 /// Killed between the record that says so and the removal of its checkpoints, a run is complete.

@@ -262,7 +262,7 @@ fn other_camera_models_are_refused_by_name() {
     let mut model = Colmap::new(&["a.jpg", "b.jpg"], SIZE);
     model.cameras[0] = (1, 5, SIZE, vec![60.0; 8]);
     model.binary(&dir.path().join("sparse/0"));
-    insta::assert_snapshot!(refusal(&dir), @"sparse/0/cameras.bin: camera 1 uses OPENCV_FISHEYE; SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL and OPENCV are supported; run `colmap image_undistorter` and use its pictures and its model");
+    insta::assert_snapshot!(refusal(&dir), @"sparse/0/cameras.bin: camera 1 uses OPENCV_FISHEYE; SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL and OPENCV are supported; `gscream-vk prepare` resamples the photographs of other lenses");
     model.cameras[0].1 = 77;
     model.binary(&dir.path().join("sparse/0"));
     assert!(refusal(&dir).contains("camera 1 uses model number 77"));

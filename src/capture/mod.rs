@@ -4,6 +4,7 @@ pub mod depth;
 pub mod doctor;
 pub mod fit;
 pub mod graph_cut;
+pub mod lens;
 pub mod masks;
 pub mod patchmatch;
 pub mod poses;
@@ -139,7 +140,7 @@ pub struct Request {
     pub fit_steps: u32,
     /// The longer side of the pictures that the fit is made with, pixels.
     pub fit_side: u32,
-    /// Whether depth priors are written, NaN where nothing is known.
+    /// Whether depth priors are made of the fit, NaN where nothing is known; a scene that has its own keeps those alone.
     pub depth: bool,
     /// Seed of every random choice.
     pub seed: u64,
@@ -156,7 +157,7 @@ impl Request {
             only: vec![],
             fit_steps: 600,
             fit_side: 256,
-            depth: false,
+            depth: true,
             seed: 0,
         }
     }
@@ -218,10 +219,11 @@ pub fn prepare(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<()
                 .into(),
         ));
     }
-    let mut preparation = Preparation { gpu, request, folder: &mut folder, watch };
+    let mut preparation = Preparation { gpu, request, folder: &mut folder, watch, depth: request.depth };
     if request.wants(Step::Poses) {
         preparation.poses(&capture)?;
     }
+    preparation.depth = request.depth && !preparation.has_priors()?;
     if request.only.iter().all(|step| *step == Step::Poses) && !request.only.is_empty() {
         return Ok(());
     }
@@ -245,6 +247,8 @@ pub fn prepare(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<()
     if request.wants(Step::Depth) {
         let masks = masked(&preparation)?;
         preparation.depth(&scene, &mut splats, &masks)?;
+    } else if request.only.is_empty() && !request.depth {
+        preparation.no_depth()?;
     }
     if request.wants(Step::Reference) {
         let masks = masked(&preparation)?;
@@ -278,7 +282,7 @@ fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>
             mask.iter_mut().for_each(|v| *v = 255 - *v);
         }
         // Of those that came with the photographs an empty one is a view without the object.
-        let mask = checked(path, mask, size, true)?;
+        let mask = capture.mask(name, checked(path, mask, size, true)?);
         all.insert(name.clone(), Given { mask, from: format!("{}", path.display()) });
     }
     for (name, evidence) in &request.object {
@@ -324,7 +328,14 @@ fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>
                 }
             }
         };
-        all.insert(stem, given);
+        let mask = capture.mask(&stem, given.mask);
+        if mask.as_raw().iter().all(|v| *v == 0) {
+            return Err(Error::Request(format!(
+                "{option} {name}: the object lies where the photograph's lens sees more than a pinhole does; mask a view that \
+                 has it nearer to the middle"
+            )));
+        }
+        all.insert(stem, Given { mask, ..given });
     }
     Ok(all)
 }
@@ -378,6 +389,8 @@ struct Preparation<'a> {
     request: &'a Request,
     folder: &'a mut Folder,
     watch: &'a mut dyn Watch,
+    /// Whether the fit's depth is written.
+    depth: bool,
 }
 
 impl Preparation<'_> {
@@ -567,7 +580,42 @@ impl Preparation<'_> {
         masks.iter().fold(Inputs::default().with(self.fit_hash()), |inputs, mask| inputs.with(mask.as_raw()))
     }
 
+    /// Whether the scene has depth priors that are not of the step depth: the user's, or those that came with the cameras.
+    fn has_priors(&self) -> Result<bool, Error> {
+        let root = self.folder.root();
+        let ours = self.folder.record().steps.get(Step::Depth.name()).map(|step| &step.files);
+        for name in PRIORS {
+            let path = root.join(name);
+            let entries = match std::fs::read_dir(&path) {
+                Ok(entries) => entries,
+                Err(error) if error.kind() == std::io::ErrorKind::NotFound => continue,
+                Err(source) => return Err(Error::Io { path, source }),
+            };
+            for entry in entries {
+                let entry = entry.map_err(|source| Error::Io { path: path.clone(), source })?;
+                let file = entry.file_name().to_string_lossy().into_owned();
+                // Names that begin with a dot are of files that were not written to the end.
+                if !file.starts_with('.') && !ours.is_some_and(|ours| ours.contains_key(&format!("{name}/{file}"))) {
+                    return Ok(true);
+                }
+            }
+        }
+        Ok(false)
+    }
+
+    /// Takes away the priors that were made before.
+    fn no_depth(&mut self) -> Result<(), Error> {
+        if self.folder.record().steps.get(Step::Depth.name()).is_some_and(|step| !step.files.is_empty()) {
+            self.write(Step::Depth, String::new(), Batch::default())?;
+        }
+        Ok(())
+    }
+
     fn depth(&mut self, scene: &Scene, splats: &mut Splats, masks: &[GrayImage]) -> Result<(), Error> {
+        if !self.depth {
+            self.watch.say("depth: the scene has priors of its own, none are made");
+            return Ok(());
+        }
         let inputs = self.inputs_behind_masks(masks).finish();
         if self.skips(Step::Depth, &inputs) {
             return Ok(());
@@ -581,7 +629,7 @@ impl Preparation<'_> {
 
     fn reference(&mut self, scene: &Scene, fit: &Fit, splats: &mut Splats, masks: &[GrayImage]) -> Result<(), Error> {
         let named = self.request.reference.clone().unwrap_or_default();
-        let inputs = self.inputs_behind_masks(masks).with(named).with([u8::from(self.request.depth)]).finish();
+        let inputs = self.inputs_behind_masks(masks).with(named).with([u8::from(self.depth)]).finish();
         if self.skips(Step::Reference, &inputs) {
             return Ok(());
         }
@@ -593,7 +641,7 @@ impl Preparation<'_> {
             root: self.folder.root(),
             masks,
             named: self.request.reference.as_deref(),
-            depth: self.request.depth,
+            depth: self.depth,
             seed: self.request.seed,
         };
         let batch = reference::make(&task, fit, splats, self.watch)?;
@@ -607,6 +655,9 @@ impl Preparation<'_> {
 const THIN: f64 = 0.3;
 /// Pieces of a carried mask that are smaller than this share of its largest piece are taken away.
 const SPECK: f64 = 0.02;
+
+/// Folders of depth priors.
+const PRIORS: [&str; 2] = ["depth", "disparity"];
 
 /// What the masks of the user's own are made from.
 const USERS: &str = "the user's own";

@@ -1,4 +1,4 @@
-//! Photographs and their cameras: an existing COLMAP model, nerfstudio's `transforms.json`, or photographs alone through
+//! Photographs and their cameras: an existing COLMAP model (whose fisheyes [`super::lens`] resamples), nerfstudio's `transforms.json`, or photographs alone through
 //! the `colmap` program.
 
 use std::collections::BTreeMap;
@@ -8,13 +8,15 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use glam::{DMat3, DQuat, DVec3, dvec3};
+use image::GrayImage;
 use rand::RngExt;
 use rand_pcg::Pcg64;
 use serde::Deserialize;
 
 use super::Error;
+use super::lens::{self, Pinhole};
 use super::record::{self, Batch, Inputs};
-use crate::scene::{self, undistort};
+use crate::scene::{self, colmap, undistort};
 
 /// Where a scene keeps its photographs and its model.
 pub const IMAGES: &str = "images";
@@ -32,6 +34,8 @@ pub struct Capture {
     /// Masks that came with the photographs, and whether they are 0 on the object.
     pub masks: BTreeMap<String, (PathBuf, bool)>,
     depths: BTreeMap<String, PathBuf>,
+    /// What brings photographs of other lenses into a pinhole's picture of the same size.
+    pinholes: BTreeMap<String, Pinhole>,
 }
 
 #[derive(Debug)]
@@ -118,8 +122,31 @@ pub fn find(folder: &Path) -> Result<Capture, Error> {
     }
     let masks = if images == folder { BTreeMap::new() } else { existing(&folder.join("masks"))? };
     let masks = masks.into_iter().map(|(name, path)| (name, (path, false))).collect();
+    let pinholes = if model.is_some() { pinholes(folder, &photographs)? } else { BTreeMap::new() };
     let source = model.map_or(Source::Photographs(images), Source::Colmap);
-    Ok(Capture { folder: folder.to_owned(), source, photographs, masks, depths: BTreeMap::new() })
+    Ok(Capture { folder: folder.to_owned(), source, photographs, masks, depths: BTreeMap::new(), pinholes })
+}
+
+/// The pinholes of the photographs whose lenses training does not project with.
+fn pinholes(folder: &Path, photographs: &BTreeMap<String, PathBuf>) -> Result<BTreeMap<String, Pinhole>, Error> {
+    let (lenses, images) = colmap::lenses(folder)?;
+    let tests = existing(&folder.join(TEST[0]))?;
+    let mut pinholes = BTreeMap::new();
+    for image in images {
+        let (name, lens) = (scene::stem(&image.name), lenses[&image.camera]);
+        let photograph = photographs.get(name).or_else(|| tests.get(name));
+        let Some(photograph) = photograph.filter(|_| lens.projected().is_none()) else { continue };
+        let size = super::picture_size(photograph)?;
+        let pinhole = Pinhole::of(lens::scaled(&lens, size)).ok_or_else(|| Error::File {
+            path: photograph.clone(),
+            what: format!(
+                "no pinhole shows a part of this photograph alone: camera {} ({}) folds over; look at its parameters",
+                image.camera, lens.model
+            ),
+        })?;
+        pinholes.insert(name.to_owned(), pinhole);
+    }
+    Ok(pinholes)
 }
 
 fn existing(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Error> {
@@ -145,6 +172,11 @@ impl Capture {
             Source::Transforms { file, .. } => format!("{}", file.display()),
             Source::Photographs(_) => "the program colmap, from the photographs alone".into(),
         }
+    }
+
+    /// A photograph's mask as the scene has it: resampled like the photograph, where that is.
+    pub fn mask(&self, name: &str, mask: GrayImage) -> GrayImage {
+        self.pinholes.get(name).map_or_else(|| mask.clone(), |pinhole| pinhole.mask(&mask))
     }
 
     /// Whether the scene is to be made in the capture's own folder.
@@ -187,6 +219,15 @@ impl Capture {
     pub fn collect(&self, out: &Path, say: &mut dyn FnMut(&str)) -> Result<Batch, Error> {
         let mut batch = Batch::default();
         let in_place = self.in_place(out);
+        if !self.pinholes.is_empty() {
+            if in_place {
+                let what = "the photographs are of lenses that are resampled, and the originals stay: make the scene in \
+                            another folder, with --out";
+                return Err(Error::File { path: out.to_owned(), what: what.into() });
+            }
+            self.collect_resampled(&mut batch)?;
+            return Ok(batch);
+        }
         if !in_place || matches!(self.source, Source::Photographs(_) | Source::Transforms { .. }) {
             for (name, path) in &self.photographs {
                 let extension = path.extension().map_or_else(|| "png".into(), |e| e.to_string_lossy().to_lowercase());
@@ -221,6 +262,67 @@ impl Capture {
             Source::Photographs(folder) => self.collect_colmap(folder, &mut batch, say)?,
         }
         Ok(batch)
+    }
+
+    /// The photographs of a COLMAP model with lenses of which some are resampled: all of them, and a camera for each.
+    fn collect_resampled(&self, batch: &mut Batch) -> Result<(), Error> {
+        let (lenses, images) = colmap::lenses(&self.folder)?;
+        let [tests, test_masks] = TEST.map(|name| existing(&self.folder.join(name)));
+        let (tests, test_masks) = (tests?, test_masks?);
+        let mut shots = vec![];
+        let mut models: Vec<&str> = vec![];
+        for image in &images {
+            let (name, lens) = (scene::stem(&image.name), lenses[&image.camera]);
+            let own = self.photographs.get(name).map(|path| (IMAGES, path));
+            let Some((folder, path)) = own.or_else(|| Some((TEST[0], tests.get(name)?))) else { continue };
+            let size = super::picture_size(path)?;
+            let lens = lens::scaled(&lens, size);
+            let axes = DMat3::from_cols_array_2d(&image.rotation).transpose();
+            let mut shot = Shot {
+                name: name.to_owned(),
+                size,
+                parameters: [0.0; 8],
+                rotation: DQuat::from_mat3(&axes).normalize(),
+                translation: DVec3::from_array(image.translation),
+            };
+            let focal = match self.pinholes.get(name) {
+                Some(pinhole) => {
+                    let picture = pinhole.photograph(&scene::photograph(path, 1)?);
+                    let from = format!("{}, resampled from {} to a pinhole", path.display(), lens.model);
+                    batch.rgb_aside(format!("{folder}/{name}.png"), &picture, from)?;
+                    models.push(lens.model);
+                    pinhole.focal
+                }
+                None => {
+                    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+                    batch.copy(format!("{folder}/{name}.{extension}"), path, "the photographs");
+                    shot.parameters[4..].copy_from_slice(&lens.coefficients[..4]);
+                    lens.focal
+                }
+            };
+            shot.parameters[..2].copy_from_slice(&focal);
+            shot.parameters[2..4].copy_from_slice(&lens.principal);
+            shots.push(shot);
+        }
+        let (cameras, images) = model_text(&shots);
+        let origin = format!("{}, its lenses resampled", self.origin());
+        batch.bytes(format!("{MODEL}/cameras.txt"), cameras.into_bytes(), origin.clone());
+        batch.bytes(format!("{MODEL}/images.txt"), images.into_bytes(), origin);
+        if let Source::Colmap(files) = &self.source {
+            for path in files.iter().filter(|path| path.file_stem().is_some_and(|stem| stem == "points3D")) {
+                let name = path.file_name().unwrap_or_default().to_string_lossy();
+                batch.copy(format!("{MODEL}/{name}"), path, self.origin());
+            }
+        }
+        let count = models.len();
+        models.sort_unstable();
+        models.dedup();
+        batch.notes.push(format!("{count} photographs were resampled from {} to pinholes", models.join(", ")));
+        for (name, path) in &test_masks {
+            let mask = self.mask(name, scene::mask(path, 1)?);
+            batch.gray(format!("{}/{name}.png", TEST[1]), &mask, format!("{}", path.display()));
+        }
+        Ok(())
     }
 
     fn collect_transforms(
@@ -366,6 +468,7 @@ fn from_transforms(folder: &Path, file: &Path) -> Result<Capture, Error> {
         photographs: BTreeMap::new(),
         masks: BTreeMap::new(),
         depths: BTreeMap::new(),
+        pinholes: BTreeMap::new(),
     };
     let mut names = vec![];
     let below = |path: &str| {
@@ -440,9 +543,11 @@ fn model_text(shots: &[Shot]) -> (String, String) {
     let (mut cameras, mut images) = (String::new(), String::new());
     for (i, shot) in shots.iter().enumerate() {
         let Shot { name, size: [w, h], parameters, rotation: q, translation: t } = shot;
-        let parameters: Vec<String> = parameters.iter().map(f64::to_string).collect();
+        let straight = parameters[4..].iter().all(|v| *v == 0.0);
+        let (model, used) = if straight { ("PINHOLE", 4) } else { ("OPENCV", 8) };
+        let parameters: Vec<String> = parameters[..used].iter().map(f64::to_string).collect();
         let id = i + 1;
-        writeln!(cameras, "{id} OPENCV {w} {h} {}", parameters.join(" ")).expect("a string takes everything");
+        writeln!(cameras, "{id} {model} {w} {h} {}", parameters.join(" ")).expect("a string takes everything");
         let pose = format!("{} {} {} {} {} {} {}", q.w, q.x, q.y, q.z, t.x, t.y, t.z);
         writeln!(images, "{id} {pose} {id} {name}\n").expect("a string takes everything");
     }

@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 use atomic_write_file::AtomicWriteFile;
 use image::{GrayImage, ImageFormat, RgbImage};
 use serde::{Deserialize, Serialize};
+use tempfile::TempDir;
 
 use super::Error;
 
@@ -90,6 +91,8 @@ pub struct Batch {
     pub notes: Vec<String>,
     /// See [`StepRecord::figures`].
     pub figures: BTreeMap<String, f64>,
+    /// Where large pictures wait.
+    aside: Option<TempDir>,
 }
 
 enum Content {
@@ -113,6 +116,28 @@ impl Batch {
         let mut bytes = Cursor::new(vec![]);
         picture.write_to(&mut bytes, ImageFormat::Png).expect("a picture is encoded into memory");
         self.bytes(path, bytes.into_inner(), from);
+    }
+
+    /// A picture as PNG, one of many large ones: until it is written it waits on disk.
+    ///
+    /// # Errors
+    /// When there is no room for it.
+    pub fn rgb_aside(
+        &mut self,
+        path: impl Into<String>,
+        picture: &RgbImage,
+        from: impl Into<String>,
+    ) -> Result<(), Error> {
+        let failed = |source| Error::Io { path: std::env::temp_dir(), source };
+        if self.aside.is_none() {
+            self.aside = Some(tempfile::tempdir().map_err(failed)?);
+        }
+        let folder = self.aside.as_ref().expect("it was just made").path();
+        let file = folder.join(format!("{}.png", self.files.len()));
+        let written = picture.save(&file);
+        written.map_err(|source| Error::Scene(crate::scene::Error::Picture { path: file.clone(), source }))?;
+        self.copy(path, &file, from);
+        Ok(())
     }
 
     /// A mask as PNG.
@@ -194,7 +219,7 @@ impl Folder {
     /// # Errors
     /// A file that cannot be read or written; the files written before stay, and are written over the next time.
     pub fn write(&mut self, step: &str, inputs: String, batch: Batch) -> Result<Vec<String>, Error> {
-        let Batch { files, notes, figures } = batch;
+        let Batch { files, notes, figures, aside: _aside } = batch;
         let mut kept = vec![];
         let mut new = StepRecord { inputs, files: BTreeMap::new(), notes, figures };
         let mut todo = vec![];
@@ -233,7 +258,11 @@ impl Folder {
         for path in old.into_iter().filter(|path| !new.files.contains_key(path)) {
             if self.root.join(&path).exists() && !self.is_users(&path)? {
                 let file = self.root.join(&path);
-                std::fs::remove_file(&file).map_err(|source| Error::Io { path: file, source })?;
+                std::fs::remove_file(&file).map_err(|source| Error::Io { path: file.clone(), source })?;
+                // A folder that is empty now says nothing any more; one that is not stays.
+                if let Some(folder) = file.parent().filter(|folder| *folder != self.root) {
+                    let _ = std::fs::remove_dir(folder);
+                }
             }
         }
         self.record.steps.insert(step.to_owned(), new);

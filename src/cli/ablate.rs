@@ -12,7 +12,7 @@ use serde::Serialize;
 use super::eval::JudgeArgs;
 use super::report::last_part;
 use super::shared::{DeviceArgs, SYNTHETIC, SceneArgs, load_scene, with_gpu};
-use super::train::{Trained, default_folder, train};
+use super::train::{Manner, Trained, default_folder, train};
 use super::{index, next};
 use crate::config::{Settings, SettingsArgs};
 use crate::evaluate::{Judge, Mean, Metrics, PUBLISHED_ROWS, Published, Region};
@@ -377,7 +377,7 @@ fn of_scene(
             which = format!("{which}, seed {seed}");
         }
         eprintln!("{}", format!("== {which} {}", pace.next(done + rows.len())).trim_end());
-        let trained = train(gpu, scene, &settings, name, &folder, None, judge)?;
+        let trained = train(gpu, scene, &settings, name, &folder, &Manner::default(), judge)?;
         rows.push(Row::new(variant, label, seed, &trained)?);
     }
     Ok(rows)

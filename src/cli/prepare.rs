@@ -11,7 +11,7 @@ use super::shared::DeviceArgs;
 use crate::capture::{self, Evidence, Request, Step, Watch};
 use crate::train::run::Signal;
 
-/// Make a scene of photographs and one mask: cameras, masks for all views, a reference view without the object
+/// Make a scene of photographs and one mask: cameras, masks for all views, depth, a reference view without the object
 ///
 /// PHOTOS is a folder of photographs, alone or with what is known of their cameras: a COLMAP model in sparse/ (photographs
 /// in images/), or nerfstudio's transforms.json. For photographs alone the program colmap is asked, where it is installed.
@@ -48,9 +48,11 @@ pub(super) struct Args {
     /// Run this step alone, with what those before it left; may be given many times
     #[arg(long, value_name = "STEP", value_parser = step)]
     only: Vec<Step>,
-    /// Also write the fit's own depth as priors, nothing (NaN) where views disagree
+    /// Make no depth priors; otherwise they are the fit's own depth, nothing (NaN) where views disagree
+    ///
+    /// A scene that has priors of its own in depth/ or disparity/ keeps those alone.
     #[arg(long)]
-    depth: bool,
+    no_depth: bool,
     /// Steps of the fit
     #[arg(long, value_name = "N", default_value_t = 600, value_parser = clap::value_parser!(u32).range(1..))]
     fit_steps: u32,
@@ -102,7 +104,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         object,
         reference: args.reference.clone(),
         only: args.only.clone(),
-        depth: args.depth,
+        depth: !args.no_depth,
         fit_steps: args.fit_steps,
         fit_side: args.fit_side,
         seed: args.seed.into(),

@@ -1,5 +1,6 @@
 //! `gscream-vk train`.
 
+use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -15,13 +16,15 @@ use super::{index, instruments, next, pictures, preset};
 use crate::capture::doctor::{self, Severity};
 use crate::config::{Settings, SettingsArgs, Source};
 use crate::evaluate::{Judge, Report};
-use crate::gpu::{Gpu, Options, Timing};
+use crate::gpu::{self, Gpu, Options, Timing};
 use crate::model::files::{POINT_CLOUD, WEIGHTS};
 use crate::render::view::Rendered;
-use crate::scene::Scene;
+use crate::scene::{Camera, Scene};
 use crate::train::checkpoint::{self, Owner, Search};
 use crate::train::forecast::{self, Question};
 use crate::train::run::{LOG, Observer, Progress, Run, Signal, Summary};
+use crate::view::live::{Board, Host};
+use crate::view::server;
 
 /// Train a scene without its object
 ///
@@ -34,13 +37,15 @@ use crate::train::run::{LOG, Observer, Progress, Run, Signal, Summary};
 ///
 /// A run that ended early (Ctrl-C, SIGTERM, an error, a power failure) is gone on with by `--resume RUN`, to the same
 /// bytes as if nothing had happened. Until a run is complete its folder holds checkpoints: two at most, one every
-/// train.checkpoint_interval steps.
+/// train.checkpoint_interval steps. With `--resume-or-start` the same command line starts it, goes on with it and leaves
+/// it alone once it is complete.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   gscream-vk train synthetic
   gscream-vk train garden --out runs/garden
   gscream-vk train garden --preset paper --set losses.depth.enabled=false --iterations 7000
-  gscream-vk train --resume runs/garden")]
+  gscream-vk train --resume runs/garden
+  gscream-vk train garden --out runs/garden --resume-or-start")]
 pub(super) struct Args {
     /// Folder of the scene, or the word `synthetic` for the built-in one
     #[arg(value_name = "SCENE", required_unless_present = "resume")]
@@ -59,6 +64,20 @@ pub(super) struct Args {
     /// run starts again. A complete run stays as it is.
     #[arg(long, value_name = "RUN", conflicts_with_all = ["SettingsArgs", "out", "overwrite"])]
     resume: Option<PathBuf>,
+    /// Go on with a run that is in the folder, leave a complete one alone, start one where there is none
+    ///
+    /// For scripts and clusters: the same command line again after a failure comes to the same end. The scene and the
+    /// settings must be those that the run began with.
+    #[arg(long, conflicts_with_all = ["resume", "overwrite"])]
+    resume_or_start: bool,
+    /// Show the training in the browser while it runs, at this address [default: 127.0.0.1:8643]
+    ///
+    /// Pictures are rendered where the page looks, in a few per cent of the time while somebody looks; the trained model
+    /// is the same. From another machine: ssh -L 8643:localhost:8643 HOST. Other addresses than the loopback let other
+    /// machines in; port 0 is any free one.
+    #[arg(long, value_name = "ADDRESS", num_args = 0..=1, require_equals = true, value_parser = address,
+        default_missing_value = "127.0.0.1:8643")]
+    view: Option<SocketAddr>,
     /// Measure every pass: prints milliseconds per pass and writes trace.json (for chrome://tracing or Perfetto)
     #[arg(long)]
     profile: bool,
@@ -66,46 +85,76 @@ pub(super) struct Args {
     device: DeviceArgs,
 }
 
+/// An address and a port, or one of them.
+fn address(text: &str) -> Result<SocketAddr, String> {
+    let with_port = || text.parse().ok();
+    let alone = || Some(SocketAddr::new(text.parse().ok()?, PORT));
+    let port = || Some(SocketAddr::new(Ipv4Addr::LOCALHOST.into(), text.parse().ok()?));
+    with_port()
+        .or_else(alone)
+        .or_else(port)
+        .ok_or_else(|| "give ADDRESS:PORT, such as 127.0.0.1:8643, or a port".into())
+}
+
+/// Where a training is shown unless told otherwise.
+const PORT: u16 = 8643;
+
+/// Serves a page about the training; the trainer's side of it is made of what is returned.
+fn show(address: SocketAddr, name: &str, scene: &Scene, settings: &Settings) -> anyhow::Result<Arc<Board>> {
+    let listener = super::view::bind(address, "--view=127.0.0.1:0")?;
+    let title = Path::new(name).file_name().map_or_else(|| name.into(), |name| name.to_string_lossy().into_owned());
+    let board = Board::new(title, scene, settings.train.iterations);
+    eprintln!("view: http://{}/", listener.local_addr().unwrap_or(address));
+    let site = board.clone();
+    std::thread::spawn(move || server::serve(&listener, &site));
+    Ok(board)
+}
+
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let began = Some(Instant::now());
     let given = |scene: &PathBuf| SceneArgs { scene: scene.clone(), settings: args.settings.clone() };
     let given = args.scene.as_ref().map(given);
-    let (scene, settings, name, folder) = if let Some(folder) = &args.resume {
+    let (scene, settings, name, folder, begun) = if let Some(folder) = &args.resume {
         let record = Record::read(folder)
             .with_context(|| format!("{}: holds no run to go on with: start one with --out", folder.display()))?;
-        if let Some(steps) = record.complete {
-            // It may have been killed after it was complete and before its last lines.
-            sweep(folder);
-            checkpoint::clear(folder)?;
-            println!("{}: the run is complete ({steps} steps): nothing to do", folder.display());
+        if is_complete(folder, &record)? {
             return Ok(());
         }
         let settings = Settings::resolve(&[Source::File(folder.join(SETTINGS))])?;
         let path = args.scene.clone().unwrap_or_else(|| PathBuf::from(&record.scene));
         let name = given.map_or(record.scene, |given| given.name());
-        (load_scene(&path, &settings)?, settings, name, folder.clone())
+        (load_scene(&path, &settings)?, settings, name, folder.clone(), true)
     } else {
         let given = given.expect("clap asks for a scene where there is nothing to resume");
         let (scene, settings) = preset::load(&given, &args.device)?;
         let name = given.name();
         let folder = args.out.clone().unwrap_or_else(|| default_folder(&name));
-        if folder.join(RECORD).exists() && !args.overwrite {
+        let begun = args.resume_or_start && folder.join(RECORD).exists();
+        if begun {
+            let record = Record::read(&folder)?;
+            same_run(&folder, &record, &name, &settings)?;
+            if is_complete(&folder, &record)? {
+                return Ok(());
+            }
+        } else if folder.join(RECORD).exists() && !args.overwrite {
             bail!(
                 "{}: holds a run already: choose another --out, go on with it by --resume, or replace it by --overwrite",
                 folder.display()
             );
         }
-        (scene, settings, name, folder)
+        (scene, settings, name, folder, begun)
     };
     let looked = doctor::look(&scene);
     eprintln!("doctor: {}", looked.verdict());
+    let board = args.view.map(|address| show(address, &name, &scene, &settings)).transpose()?;
+    let manner = Manner { began, board };
     let options = Options { timestamps: args.profile, ..args.device.options() };
     with_gpu(&options, |gpu| {
         eprintln!("device: {} ({})", gpu.info().name, gpu.info().driver);
-        let Trained { summary, report, mut written } = if args.resume.is_some() {
-            resume(gpu, &scene, &settings, &name, &folder, began)?
+        let Trained { summary, report, mut written } = if begun {
+            resume(gpu, &scene, &settings, &name, &folder, &manner)?
         } else {
-            train(gpu, &scene, &settings, &name, &folder, began, &Judge::default())?
+            train(gpu, &scene, &settings, &name, &folder, &manner, &Judge::default())?
         };
         if let Some(report) = report {
             println!("{}", report.table());
@@ -133,10 +182,42 @@ fn warn(looked: &doctor::Report) {
     }
 }
 
+/// Whether the run is complete, which is then said.
+fn is_complete(folder: &Path, record: &Record) -> anyhow::Result<bool> {
+    let Some(steps) = record.complete else { return Ok(false) };
+    // It may have been killed after it was complete and before its last lines.
+    sweep(folder);
+    checkpoint::clear(folder)?;
+    println!("{}: the run is complete ({steps} steps): nothing to do", folder.display());
+    Ok(true)
+}
+
+/// Refuses to go on with a run of another scene or under other settings than those asked for.
+fn same_run(folder: &Path, record: &Record, name: &str, settings: &Settings) -> anyhow::Result<()> {
+    let or = "choose another --out, or --overwrite it";
+    if record.scene != name {
+        bail!("{}: holds a run of another scene, {}, where {name} was asked for: {or}", folder.display(), record.scene);
+    }
+    let theirs = Settings::resolve(&[Source::File(folder.join(SETTINGS))])?;
+    if let Some(difference) = checkpoint::setting_difference(&theirs.to_toml(), &settings.to_toml()) {
+        bail!("{}: holds a run with other settings, {difference}: {or}", folder.display());
+    }
+    Ok(())
+}
+
 /// `runs/` and the last part of the scene's name.
 pub(super) fn default_folder(scene: &str) -> PathBuf {
     let stem = Path::new(scene).file_name().unwrap_or(std::ffi::OsStr::new(scene));
     Path::new("runs").join(stem)
+}
+
+/// How a run is trained, which changes nothing of what it comes to.
+#[derive(Default)]
+pub(super) struct Manner {
+    /// When all began: how long the first step was in coming is said when it is known.
+    pub began: Option<Instant>,
+    /// Where visitors see it.
+    pub board: Option<Arc<Board>>,
 }
 
 /// What a finished run is.
@@ -149,15 +230,14 @@ pub(super) struct Trained {
     pub written: Vec<&'static str>,
 }
 
-/// Trains into `folder`, in place of any run that is there, and evaluates, with a progress bar on stderr. How long the
-/// first step was in coming is said when it is known when all `began`.
+/// Trains into `folder`, in place of any run that is there, and evaluates, with a progress bar on stderr.
 pub(super) fn train(
     gpu: &Gpu,
     scene: &Scene,
     settings: &Settings,
     name: &str,
     folder: &Path,
-    began: Option<Instant>,
+    manner: &Manner,
     judge: &Judge,
 ) -> anyhow::Result<Trained> {
     std::fs::create_dir_all(folder).with_context(|| format!("{}: cannot be made", folder.display()))?;
@@ -170,7 +250,7 @@ pub(super) fn train(
     for left in &run.step().plan.left_out {
         eprintln!("left out: {} ({})", left.what, left.why);
     }
-    let trained = finish(run, settings, folder, began)?;
+    let trained = finish(run, settings, folder, manner)?;
     judged(gpu, scene, settings, (folder, record), judge, trained)
 }
 
@@ -197,7 +277,7 @@ fn resume(
     settings: &Settings,
     name: &str,
     folder: &Path,
-    began: Option<Instant>,
+    manner: &Manner,
 ) -> anyhow::Result<Trained> {
     sweep(folder);
     let mut record = Record::read(folder)?;
@@ -227,16 +307,17 @@ fn resume(
         name.clone_into(&mut record.scene);
         record.write(folder)?;
     }
-    let trained = finish(run, settings, folder, began)?;
+    let trained = finish(run, settings, folder, manner)?;
     judged(gpu, scene, settings, (folder, record), &Judge::default(), trained)
 }
 
 /// Trains to the end and evaluates.
-fn finish(mut run: Run<'_>, settings: &Settings, folder: &Path, began: Option<Instant>) -> anyhow::Result<Trained> {
+fn finish(mut run: Run<'_>, settings: &Settings, folder: &Path, manner: &Manner) -> anyhow::Result<Trained> {
     eprintln!("anchors: {}", run.step().anchors.count);
     let signals = Signals::listen()?;
     let bar = bar(settings.train.iterations, run.done());
-    let mut watch = Watch { bar, pictures: folder.join(TEST), failed: None, signals, began };
+    let host = manner.board.as_ref().map(Host::new);
+    let mut watch = Watch { bar, pictures: folder.join(TEST), failed: None, signals, began: manner.began, host };
     let result = run.train(folder, &mut watch);
     watch.bar.finish_and_clear();
     let mut summary = result.inspect_err(|_| index::of_stopped(folder))?;
@@ -369,6 +450,7 @@ struct Watch {
     signals: Signals,
     /// Until the first step has ended.
     began: Option<Instant>,
+    host: Option<Host>,
 }
 
 /// SIGINT and SIGTERM, remembered; a second one of a kind ends the program at once.
@@ -407,8 +489,27 @@ impl Observer for Watch {
         if let Some(began) = self.began.take() {
             self.say(&format!("first step done {:.2} s after the start", began.elapsed().as_secs_f64()));
         }
+        if let Some(host) = &self.host {
+            host.step(progress);
+        }
         self.bar.set_position(progress.step.into());
         self.bar.set_message(format!("loss {:.4}  {} anchors", progress.loss, progress.anchors));
+    }
+
+    fn visited(&mut self) -> bool {
+        self.host.as_ref().is_some_and(Host::visited)
+    }
+
+    fn look(&mut self, draw: &mut dyn FnMut(&Camera) -> Result<Option<Rendered>, gpu::Error>) {
+        if let Some(host) = &mut self.host {
+            host.look(draw);
+        }
+    }
+
+    fn evaluated(&mut self, progress: &Progress, report: &Report) {
+        if let Some(host) = &self.host {
+            host.evaluated(progress, report);
+        }
     }
 
     fn say(&mut self, line: &str) {

@@ -1,7 +1,8 @@
 //! `gscream-vk view`.
 
-use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::{Context as _, anyhow, bail};
 use image::codecs::jpeg::JpegEncoder;
@@ -54,12 +55,17 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         return Ok(());
     }
     let address = SocketAddr::new(args.host, args.port);
-    let listener = server::bind(address).map_err(|error| match error.kind() {
-        std::io::ErrorKind::AddrInUse => anyhow!("{address}: another program serves there; --port 0 takes a free one"),
-        _ => anyhow!("{address}: cannot be served on: {error}"),
-    })?;
+    let listener = bind(address, "--port 0")?;
     println!("http://{}/ (Ctrl-C ends it)", listener.local_addr().unwrap_or(address));
-    server::serve(&listener, page.resources()).with_context(|| format!("{address}: cannot be served on"))
+    server::serve(&listener, &Arc::new(page.resources())).with_context(|| format!("{address}: cannot be served on"))
+}
+
+/// Binds the address; `other` is what asks for a free port.
+pub(super) fn bind(address: SocketAddr, other: &str) -> anyhow::Result<TcpListener> {
+    server::bind(address).map_err(|error| match error.kind() {
+        std::io::ErrorKind::AddrInUse => anyhow!("{address}: another program serves there; {other} takes a free one"),
+        _ => anyhow!("{address}: cannot be served on: {error}"),
+    })
 }
 
 fn page(args: &Args) -> anyhow::Result<Page> {

@@ -204,6 +204,17 @@ impl Painter {
     /// # Panics
     /// For more anchors than the capacity's.
     pub fn render(&mut self, model: Model<'_>, camera: &Camera) -> Result<Rendered, Error> {
+        Ok(self.render_within(model, camera, u32::MAX)?.expect("no view has more pairs than can be counted"))
+    }
+
+    /// Renders one view unless it takes more than `most` (Gaussian, tile) pairs.
+    ///
+    /// # Errors
+    /// As [`Painter::render`].
+    ///
+    /// # Panics
+    /// As [`Painter::render`].
+    pub fn render_within(&mut self, model: Model<'_>, camera: &Camera, most: u32) -> Result<Option<Rendered>, Error> {
         loop {
             let (forward, picture) = match self.stages.take() {
                 Some((forward, picture)) if picture.size == camera.size => (forward, picture),
@@ -234,9 +245,12 @@ impl Painter {
                     transmittance: self.gpu.read(transmittance)?,
                 };
                 self.stages = Some((forward, picture));
-                return Ok(rendered);
+                return Ok(Some(rendered));
             }
             let counters = self.gpu.read(self.limits.counters())?;
+            if counters[Counter::Pairs as usize] > most {
+                return Ok(None);
+            }
             self.capacity = self.capacity.fit(std::array::from_fn(|i| counters[i]));
             let mut rec = self.gpu.recorder()?;
             self.limits.lower(&mut rec);

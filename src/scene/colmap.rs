@@ -5,7 +5,7 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, BufReader, Read};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::{Error, Point};
 
@@ -18,6 +18,21 @@ pub struct Intrinsics {
     pub principal: [f64; 2],
     /// k1, k2, p1, p2.
     pub distortion: [f64; 4],
+    /// Width, height in pixels.
+    pub size: [u32; 2],
+}
+
+/// A camera of any model of COLMAP's, as written.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Lens {
+    /// The model's name.
+    pub model: &'static str,
+    /// fx, fy in pixels.
+    pub focal: [f64; 2],
+    /// cx, cy in pixels; the centre of the first pixel is at 0.5.
+    pub principal: [f64; 2],
+    /// What else the model has, in COLMAP's order, and zeros.
+    pub coefficients: [f64; 12],
     /// Width, height in pixels.
     pub size: [u32; 2],
 }
@@ -72,21 +87,24 @@ fn is_finite(v: f64) -> bool {
     (v as f32).is_finite()
 }
 
-impl Intrinsics {
-    /// From the parameters of one of the first [`PROJECTED`] models.
-    fn new(model: usize, p: &[f64], size: [u32; 2]) -> Intrinsics {
+/// How many of [`MODELS`] [`Lens`] has room for.
+const READ: usize = 11;
+
+impl Lens {
+    /// From the parameters of one of the first [`READ`] models.
+    fn new(model: usize, p: &[f64], size: [u32; 2]) -> Self {
         let (focal, rest) = match model {
-            0 | 2 | 3 => ([p[0], p[0]], &p[1..]),
+            0 | 2 | 3 | 8 | 9 => ([p[0], p[0]], &p[1..]),
             _ => ([p[0], p[1]], &p[2..]),
         };
-        let mut distortion = [0.0; 4];
-        distortion[..rest.len() - 2].copy_from_slice(&rest[2..]);
-        Intrinsics { focal, principal: [rest[0], rest[1]], distortion, size }
+        let mut coefficients = [0.0; 12];
+        coefficients[..rest.len() - 2].copy_from_slice(&rest[2..]);
+        Self { model: MODELS[model].0, focal, principal: [rest[0], rest[1]], coefficients, size }
     }
 
     /// One clause on what makes the camera unusable, if anything does.
     fn fault(&self) -> Option<String> {
-        let finite = self.focal.iter().chain(&self.principal).chain(&self.distortion).all(|v| is_finite(*v));
+        let finite = self.focal.iter().chain(&self.principal).chain(&self.coefficients).all(|v| is_finite(*v));
         if !finite {
             Some("a parameter is not a finite number".into())
         } else if self.focal.iter().any(|f| *f <= 0.0) {
@@ -96,6 +114,14 @@ impl Intrinsics {
         } else {
             None
         }
+    }
+
+    /// The camera, if it is of a model that this crate projects with.
+    pub fn projected(&self) -> Option<Intrinsics> {
+        let Self { focal, principal, size, .. } = *self;
+        let [k1, k2, p1, p2, ..] = self.coefficients;
+        let known = MODELS[..PROJECTED].iter().any(|model| model.0 == self.model);
+        known.then_some(Intrinsics { focal, principal, distortion: [k1, k2, p1, p2], size })
     }
 }
 
@@ -119,27 +145,9 @@ fn rotation(q: [f64; 4]) -> Option<[[f64; 3]; 3]> {
 /// # Errors
 /// No model, an unreadable or truncated file, an unsupported camera model, unusable numbers, no points.
 pub fn read(scene: &Path) -> Result<Model, Error> {
-    let folders = [scene.join("sparse/0"), scene.join("sparse")];
-    let has = |folder: &Path, extension: &str| {
-        ["cameras", "images"].iter().all(|stem| folder.join(stem).with_extension(extension).is_file())
-    };
-    let (folder, extension) = folders
-        .iter()
-        .find_map(|folder| ["bin", "txt"].into_iter().find(|e| has(folder, e)).map(|e| (folder, e)))
-        .ok_or_else(|| Error::NoModel { scene: scene.to_path_buf() })?;
-    let (cameras, images) =
-        (folder.join("cameras").with_extension(extension), folder.join("images").with_extension(extension));
-    let mut model = if extension == "bin" {
-        Model { cameras: binary_cameras(&cameras)?, images: binary_images(&images)?, ..Model::default() }
-    } else {
-        Model { cameras: text_cameras(&cameras)?, images: text_images(&images)?, ..Model::default() }
-    };
-    for image in &model.images {
-        if !model.cameras.contains_key(&image.camera) {
-            let what = format!("image {} uses camera {}, which {} lacks", image.name, image.camera, cameras.display());
-            return Err(Error::File { path: images, what });
-        }
-    }
+    let (folder, cameras, images) = cameras_and_images(scene, PROJECTED)?;
+    let cameras = cameras.into_iter().filter_map(|(id, lens)| Some((id, lens.projected()?))).collect();
+    let mut model = Model { cameras, images, points: vec![] };
     for (name, read) in [
         ("points3D.bin", binary_points as fn(&Path) -> Result<Vec<Point>, Error>),
         ("points3D.txt", text_points),
@@ -153,7 +161,41 @@ pub fn read(scene: &Path) -> Result<Model, Error> {
             }
         }
     }
-    Err(Error::NoPoints { folder: folder.clone() })
+    Err(Error::NoPoints { folder })
+}
+
+/// The cameras and photographs of the model under `scene`, whatever lenses it has.
+///
+/// # Errors
+/// As [`read`], points apart; a camera model that not even its name is known of.
+pub fn lenses(scene: &Path) -> Result<(BTreeMap<u32, Lens>, Vec<Image>), Error> {
+    cameras_and_images(scene, READ).map(|(_, cameras, images)| (cameras, images))
+}
+
+/// The model's folder, its cameras, which must be of the first `models`, and its photographs.
+fn cameras_and_images(scene: &Path, models: usize) -> Result<(PathBuf, BTreeMap<u32, Lens>, Vec<Image>), Error> {
+    let folders = [scene.join("sparse/0"), scene.join("sparse")];
+    let has = |folder: &Path, extension: &str| {
+        ["cameras", "images"].iter().all(|stem| folder.join(stem).with_extension(extension).is_file())
+    };
+    let (folder, extension) = folders
+        .iter()
+        .find_map(|folder| ["bin", "txt"].into_iter().find(|e| has(folder, e)).map(|e| (folder, e)))
+        .ok_or_else(|| Error::NoModel { scene: scene.to_path_buf() })?;
+    let (cameras, images) =
+        (folder.join("cameras").with_extension(extension), folder.join("images").with_extension(extension));
+    let (lenses, photographs) = if extension == "bin" {
+        (binary_cameras(&cameras, models)?, binary_images(&images)?)
+    } else {
+        (text_cameras(&cameras, models)?, text_images(&images)?)
+    };
+    for image in &photographs {
+        if !lenses.contains_key(&image.camera) {
+            let what = format!("image {} uses camera {}, which {} lacks", image.name, image.camera, cameras.display());
+            return Err(Error::File { path: images, what });
+        }
+    }
+    Ok((folder.clone(), lenses, photographs))
 }
 
 // ---------------------------------------------------------------- binary
@@ -237,7 +279,7 @@ fn checked_size(width: u64, height: u64) -> Option<[u32; 2]> {
     Some([u32::try_from(width).ok()?, u32::try_from(height).ok()?])
 }
 
-fn binary_cameras(path: &Path) -> Result<BTreeMap<u32, Intrinsics>, Error> {
+fn binary_cameras(path: &Path, models: usize) -> Result<BTreeMap<u32, Lens>, Error> {
     let mut file = Binary::open(path)?;
     let count = file.u64(&|| "the number of cameras".into())?;
     let mut cameras = BTreeMap::new();
@@ -246,18 +288,18 @@ fn binary_cameras(path: &Path) -> Result<BTreeMap<u32, Intrinsics>, Error> {
         let id = file.u32(&record)?;
         let model = file.u32(&record)?;
         let (width, height) = (file.u64(&record)?, file.u64(&record)?);
-        if model as usize >= PROJECTED {
+        if model as usize >= models {
             let name = MODELS.get(model as usize).map_or_else(|| format!("model number {model}"), |m| m.0.to_string());
             return Err(Error::CameraModel { path: path.to_path_buf(), id, model: name });
         }
-        let mut parameters = [0.0; 8];
+        let mut parameters = [0.0; 12];
         let used = MODELS[model as usize].1;
         for p in &mut parameters[..used] {
             [*p] = file.f64s(&record)?;
         }
         let size = checked_size(width, height)
             .ok_or_else(|| file.invalid(format!("camera {id} is {width} x {height} pixels large")))?;
-        let camera = Intrinsics::new(model as usize, &parameters[..used], size);
+        let camera = Lens::new(model as usize, &parameters[..used], size);
         if let Some(fault) = camera.fault() {
             return Err(file.invalid(format!("camera {id}: {fault}")));
         }
@@ -373,7 +415,7 @@ impl<'a> Fields<'a> {
     }
 }
 
-fn text_cameras(path: &Path) -> Result<BTreeMap<u32, Intrinsics>, Error> {
+fn text_cameras(path: &Path, models: usize) -> Result<BTreeMap<u32, Lens>, Error> {
     let text = read_text(path)?;
     let mut cameras = BTreeMap::new();
     for (line, rest) in lines(&text, false) {
@@ -381,10 +423,10 @@ fn text_cameras(path: &Path) -> Result<BTreeMap<u32, Intrinsics>, Error> {
         let id: u32 = fields.next("the camera id")?;
         let name: String = fields.next("the camera model")?;
         let size = [fields.next("the width")?, fields.next("the height")?];
-        let Some(model) = MODELS[..PROJECTED].iter().position(|m| m.0 == name) else {
+        let Some(model) = MODELS[..models].iter().position(|m| m.0 == name) else {
             return Err(Error::CameraModel { path: path.to_path_buf(), id, model: name });
         };
-        let mut parameters = [0.0; 8];
+        let mut parameters = [0.0; 12];
         let used = MODELS[model].1;
         for (i, p) in parameters[..used].iter_mut().enumerate() {
             *p = fields.next(&format!("parameter {} of {used}", i + 1))?;
@@ -392,7 +434,7 @@ fn text_cameras(path: &Path) -> Result<BTreeMap<u32, Intrinsics>, Error> {
         if !fields.rest.is_empty() {
             return Err(fields.invalid(format!("{name} has {used} parameters, '{}' is left over", fields.rest)));
         }
-        let camera = Intrinsics::new(model, &parameters[..used], size);
+        let camera = Lens::new(model, &parameters[..used], size);
         if let Some(fault) = camera.fault() {
             return Err(fields.invalid(format!("camera {id}: {fault}")));
         }
@@ -520,5 +562,5 @@ fn ply_points(path: &Path) -> Result<Vec<Point>, Error> {
 
 /// What to do about a camera model that is not projected with.
 pub(super) fn unsupported_hint() -> String {
-    format!("{SUPPORTED} are supported; run `colmap image_undistorter` and use its pictures and its model")
+    format!("{SUPPORTED} are supported; `gscream-vk prepare` resamples the photographs of other lenses")
 }

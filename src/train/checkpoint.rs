@@ -424,7 +424,7 @@ impl Owner {
 }
 
 /// The first setting in which two TOML texts differ, dotted, with both values.
-fn setting_difference(theirs: &str, ours: &str) -> String {
+pub(crate) fn setting_difference(theirs: &str, ours: &str) -> Option<String> {
     fn leaves(table: &toml::Table, prefix: &str, all: &mut BTreeMap<String, String>) {
         for (key, value) in table {
             match value {
@@ -439,12 +439,9 @@ fn setting_difference(theirs: &str, ours: &str) -> String {
         all
     };
     let (theirs, ours) = (parse(theirs), parse(ours));
-    let differs = theirs.keys().chain(ours.keys()).find(|key| theirs.get(*key) != ours.get(*key));
+    let key = theirs.keys().chain(ours.keys()).find(|key| theirs.get(*key) != ours.get(*key))?;
     let value = |of: &BTreeMap<String, String>, key| of.get(key).cloned().unwrap_or_else(|| "not set".to_owned());
-    differs.map_or_else(
-        || "their text differs".to_owned(),
-        |key| format!("{key} was {} and is {}", value(&theirs, key), value(&ours, key)),
-    )
+    Some(format!("{key} was {} and is {}", value(&theirs, key), value(&ours, key)))
 }
 
 // ---------------------------------------------------------------- on disk
@@ -592,6 +589,7 @@ pub fn read(path: &Path, owner: &Owner) -> Result<State, Refusal> {
     }
     if entry("settings") != owner.settings {
         let difference = setting_difference(entry("settings"), &owner.settings);
+        let difference = difference.unwrap_or_else(|| "their text differs".to_owned());
         return Err(refuse(format!("is of a run with other settings: {difference}")));
     }
     if entry("version") != env!("CARGO_PKG_VERSION") {

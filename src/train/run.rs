@@ -23,7 +23,7 @@ use crate::model::{files, init};
 use crate::primitives::finite::NOT_FINITE;
 use crate::primitives::limit::{COUNTERS, Counter};
 use crate::render::view::{Capacity, Rendered};
-use crate::scene::Scene;
+use crate::scene::{Camera, Scene};
 
 /// Why a run ended early.
 #[derive(Debug, thiserror::Error)]
@@ -230,6 +230,13 @@ pub trait Observer {
     fn interrupted(&mut self) -> Option<Signal> {
         None
     }
+    /// Whether somebody wants to see the model now; asked before every step.
+    fn visited(&mut self) -> bool {
+        false
+    }
+    /// Lets somebody look, where [`Observer::visited`] said so, once nothing is in flight: `draw` renders the model as it is
+    /// now ([`Step::glance`]). The clock stands still, and training goes on as if nobody had looked.
+    fn look(&mut self, _draw: &mut dyn FnMut(&Camera) -> Result<Option<Rendered>, gpu::Error>) {}
     /// Steps to evaluate at besides those of the settings.
     fn samples(&self) -> Vec<u32> {
         vec![]
@@ -603,9 +610,16 @@ impl<'a> Run<'a> {
             if halt.is_none() {
                 halt = watch.interrupted().map(|signal| Error::Interrupted { signal });
             }
+            let visited = halt.is_none() && !session.careful && watch.visited();
+            if visited && in_flight.is_empty() {
+                let pause = Instant::now();
+                watch.look(&mut |camera| self.step.glance(camera));
+                session.paused += pause.elapsed().as_secs_f64();
+                continue;
+            }
             // What follows a change of the anchors or of the pictures' size, an evaluation, a save or a checkpoint waits until it is made.
             let behind = next > history.last.step + 1;
-            let blocked = halt.is_some() || behind && (session.careful || self.pauses_behind(next - 1));
+            let blocked = halt.is_some() || visited || behind && (session.careful || self.pauses_behind(next - 1));
             if next <= iterations && in_flight.len() < DEPTH && !blocked {
                 match self.submit(next, next as usize % DEPTH) {
                     Ok(submitted) => in_flight.push_back(submitted),

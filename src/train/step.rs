@@ -286,6 +286,21 @@ impl Step {
         Ok(self.furnish()?)
     }
 
+    /// One picture of the model as it is now, in memory of its own that is freed behind it: the step stays as it is, whether
+    /// that is to be had or not. None for a camera that sees several times as much as those of training. Nothing of the step
+    /// may be in flight.
+    ///
+    /// # Errors
+    /// When the device has no room, or is lost.
+    pub fn glance(&self, camera: &Camera) -> Result<Option<Rendered>, Error> {
+        self.gpu.stage(stage::EVALUATION, || {
+            let capacity = Capacity { anchors: self.anchors.capacity, ..self.capacity };
+            let mut painter = Painter::new(&self.gpu, &self.config.render, self.background, capacity)?;
+            let model = Model { anchors: &self.anchors, weights: &self.weights.value };
+            painter.render_within(model, camera, capacity.pairs.max(1 << 20).saturating_mul(4))
+        })
+    }
+
     /// Goes on with training pictures of other sizes. Nothing of the step may be in flight.
     ///
     /// # Errors

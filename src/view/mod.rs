@@ -1,9 +1,11 @@
-//! An exported scene in the browser: a page around SuperSplat's viewer, served or as one file.
+//! An exported scene in the browser: a page around SuperSplat's viewer, served or as one file. A training that is under
+//! way is shown by [`live`].
 //!
 //! The viewer (`supersplat/`, MIT) is part of the program, so that nothing is fetched from anywhere. The page starts at a
 //! training camera, in a frame of the photograph's proportions; a slider draws the photograph over it, before and after.
 //! SuperSplat turns a PLY half round the z axis: up is -y in the file and +y in the page.
 
+pub mod live;
 pub mod server;
 
 use std::io::Write as _;

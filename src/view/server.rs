@@ -1,7 +1,9 @@
-//! A web server for a handful of files in memory: GET and HEAD, one answer per connection.
+//! A web server for a handful of files in memory, or what a [`Site`] makes of a request: GET and HEAD, one answer per
+//! connection.
 //!
 //! Whatever a client sends or does not send costs a thread for ten seconds at most and nothing else.
 
+use std::borrow::Cow;
 use std::io::{self, BufRead as _, BufReader, Read as _, Write as _};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::sync::Arc;
@@ -19,6 +21,58 @@ pub struct Resource {
     pub gzip: bool,
     /// Its bytes.
     pub bytes: Vec<u8>,
+}
+
+/// What is answered with.
+#[derive(Debug)]
+pub struct Answer<'a> {
+    /// Its media type.
+    pub kind: &'static str,
+    /// Whether the bytes are compressed, to be unpacked by the client.
+    pub gzip: bool,
+    /// Its bytes.
+    pub bytes: Cow<'a, [u8]>,
+}
+
+/// Why there is no answer, as HTTP has it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Refusal {
+    /// The request makes no sense.
+    BadRequest,
+    /// There is nothing of this name.
+    NotFound,
+    /// There will be nothing more of this name.
+    Gone,
+    /// Not now.
+    Busy,
+}
+
+impl Refusal {
+    fn status(self) -> &'static str {
+        match self {
+            Self::BadRequest => "400 Bad Request",
+            Self::NotFound => "404 Not Found",
+            Self::Gone => "410 Gone",
+            Self::Busy => "503 Service Unavailable",
+        }
+    }
+}
+
+/// What a server shows.
+pub trait Site: Send + Sync + 'static {
+    /// What is at a path, `/` first, with a query (what follows a `?`). It may take its time: every client has a thread.
+    ///
+    /// # Errors
+    /// What is said to the client instead.
+    fn get(&self, path: &str, query: &str) -> Result<Answer<'_>, Refusal>;
+}
+
+impl Site for Vec<Resource> {
+    fn get(&self, path: &str, _query: &str) -> Result<Answer<'_>, Refusal> {
+        let resource = self.iter().find(|resource| resource.path == path).ok_or(Refusal::NotFound)?;
+        let Resource { kind, gzip, ref bytes, .. } = *resource;
+        Ok(Answer { kind, gzip, bytes: Cow::Borrowed(bytes) })
+    }
 }
 
 /// Longest request head that is read.
@@ -40,8 +94,7 @@ pub fn bind(address: SocketAddr) -> io::Result<TcpListener> {
 ///
 /// # Errors
 /// Never while the listener is whole.
-pub fn serve(listener: &TcpListener, resources: Vec<Resource>) -> io::Result<()> {
-    let resources = Arc::new(resources);
+pub fn serve(listener: &TcpListener, site: &Arc<impl Site>) -> io::Result<()> {
     let clients = Arc::new(AtomicUsize::new(0));
     loop {
         // A client that is gone again, or a moment without file handles, is none of the others' business.
@@ -50,21 +103,37 @@ pub fn serve(listener: &TcpListener, resources: Vec<Resource>) -> io::Result<()>
             continue;
         };
         let before = clients.fetch_add(1, Ordering::Relaxed);
-        let (resources, clients) = (resources.clone(), clients.clone());
-        std::thread::spawn(move || {
-            // Errors are the client's: it went away.
-            let _ = answer(&stream, &resources, before >= MOST_CLIENTS);
-            clients.fetch_sub(1, Ordering::Relaxed);
-        });
+        let client = Client { site: site.clone(), clients: clients.clone() };
+        let busy = before >= MOST_CLIENTS;
+        // Errors are the client's: it went away. Without a thread for it, it is as good as gone.
+        let _ = std::thread::Builder::new().spawn(move || client.answer(&stream, busy));
     }
 }
 
-fn answer(mut stream: &TcpStream, resources: &[Resource], busy: bool) -> io::Result<()> {
-    stream.set_read_timeout(Some(PATIENCE))?;
-    stream.set_write_timeout(Some(PATIENCE))?;
-    if busy {
-        return refuse(stream, "503 Service Unavailable");
+/// One connection; it is counted until this is gone.
+struct Client<S> {
+    site: Arc<S>,
+    clients: Arc<AtomicUsize>,
+}
+
+impl<S> Drop for Client<S> {
+    fn drop(&mut self) {
+        self.clients.fetch_sub(1, Ordering::Relaxed);
     }
+}
+
+impl<S: Site> Client<S> {
+    fn answer(&self, stream: &TcpStream, busy: bool) -> io::Result<()> {
+        stream.set_read_timeout(Some(PATIENCE))?;
+        stream.set_write_timeout(Some(PATIENCE))?;
+        if busy {
+            return refuse(stream, Refusal::Busy.status());
+        }
+        answer(stream, &*self.site)
+    }
+}
+
+fn answer(mut stream: &TcpStream, site: &impl Site) -> io::Result<()> {
     let mut head = BufReader::new(stream.take(MOST_BYTES));
     let mut request = String::new();
     head.read_line(&mut request)?;
@@ -81,19 +150,21 @@ fn answer(mut stream: &TcpStream, resources: &[Resource], busy: bool) -> io::Res
     if !matches!(method, "GET" | "HEAD") {
         return refuse(stream, "405 Method Not Allowed");
     }
-    let path = target.split(['?', '#']).next().unwrap_or_default();
-    let Some(resource) = resources.iter().find(|resource| resource.path == path) else {
-        return refuse(stream, "404 Not Found");
+    let target = target.split('#').next().unwrap_or_default();
+    let (path, query) = target.split_once('?').unwrap_or((target, ""));
+    let answer = match site.get(path, query) {
+        Ok(answer) => answer,
+        Err(refusal) => return refuse(stream, refusal.status()),
     };
-    let encoding = if resource.gzip { "Content-Encoding: gzip\r\n" } else { "" };
+    let encoding = if answer.gzip { "Content-Encoding: gzip\r\n" } else { "" };
     write!(
         stream,
         "HTTP/1.1 200 OK\r\nContent-Type: {}\r\nContent-Length: {}\r\n{encoding}Cache-Control: no-store\r\nConnection: close\r\n\r\n",
-        resource.kind,
-        resource.bytes.len()
+        answer.kind,
+        answer.bytes.len()
     )?;
     if method == "GET" {
-        stream.write_all(&resource.bytes)?;
+        stream.write_all(&answer.bytes)?;
     }
     stream.flush()
 }
@@ -115,7 +186,7 @@ mod tests {
         let address = listener.local_addr().expect("it is bound");
         let file = |path, gzip, bytes: &[u8]| Resource { path, kind: "text/plain", gzip, bytes: bytes.to_vec() };
         let resources = vec![file("/", false, b"page"), file("/big", true, &vec![b'Q'; 3_000_000])];
-        std::thread::spawn(move || serve(&listener, resources));
+        std::thread::spawn(move || serve(&listener, &Arc::new(resources)));
         address
     }
 
