@@ -249,3 +249,27 @@ fn values_that_make_no_sense_are_refused_with_the_layer_that_set_them() {
     assert!(resolve(&["--set", "model.voxel=-1"]).is_ok());
     assert!(resolve(&["--set", "densify.max_log_scaling=inf"]).is_ok());
 }
+
+#[test]
+fn a_shorter_run_keeps_the_places_of_its_schedule() {
+    for preset in ["gscream", "paper", "lavapipe", "demo"] {
+        let settings = Settings::resolve(&[Source::Preset(preset.into())]).unwrap();
+        for iterations in [30, 600, 3_000, 100_000] {
+            let new = settings.rescheduled(iterations);
+            new.validate().unwrap_or_else(|e| panic!("{preset}, {iterations} steps: {e:?}"));
+            let (old, densify) = (&settings.densify, &new.densify);
+            let place = |step: u32, of: u32| f64::from(step) / f64::from(of);
+            let close = |new: u32, was: u32| {
+                (place(new, iterations) - place(was, settings.train.iterations)).abs() <= 0.5 / f64::from(iterations)
+            };
+            assert!(close(densify.from, old.from) && close(densify.until, old.until), "{preset}, {iterations}");
+            assert!(close(new.model.attention.start, settings.model.attention.start), "{preset}, {iterations}");
+            assert!((25..=old.every.max(25)).contains(&densify.every) || densify.every == old.every, "{preset}");
+            assert_eq!((new.train.eval_interval, new.train.save_interval), (0, 0));
+        }
+    }
+    let lavapipe = Settings::resolve(&[Source::Preset("lavapipe".into())]).unwrap().rescheduled(600);
+    let densify = &lavapipe.densify;
+    assert_eq!((densify.from, densify.until, densify.every, densify.statistics_from), (30, 300, 25, 10));
+    assert_eq!((densify.min_slot_visits, densify.min_anchor_visits), (10, 20));
+}

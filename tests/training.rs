@@ -240,6 +240,38 @@ fn training_learns_and_what_it_saves_draws_the_same_picture() {
     }
 }
 
+/// Inside the mask the reference counts, by its weight, and no other view does.
+#[test]
+fn what_is_inside_the_mask_counts_on_the_reference_alone() {
+    let gpu = testing::gpu();
+    let scene = scene_without_tests();
+    let [reference] = scene.references.as_slice() else { panic!("one reference") };
+    assert_eq!(reference.view, 3, "it is seen in step 4");
+    let losses = |scene: &Scene, inside: f64| -> Vec<u32> {
+        let mut settings = common::settings(6);
+        settings.losses.reference_inside_weight = inside;
+        train(&gpu, scene, &settings, None).watch.steps.iter().map(|p| p.loss.to_bits()).collect()
+    };
+    let inverted = |picture: &mut image::RgbImage, mask: &image::GrayImage| {
+        let inside = picture.pixels_mut().zip(mask.pixels()).filter(|(_, m)| m.0[0] != 0);
+        inside.for_each(|(p, _)| p.0 = p.0.map(|v| 255 - v));
+    };
+    let mut others = scene.clone();
+    for (i, view) in others.train.iter_mut().enumerate().filter(|(i, _)| *i != 3) {
+        let mask = view.mask.as_ref().unwrap_or_else(|| panic!("view {i} has a mask"));
+        assert!(mask.pixels().any(|m| m.0[0] != 0), "view {i} shows the object");
+        inverted(&mut view.image, mask);
+    }
+    assert_eq!(losses(&others, 20.0), losses(&scene, 20.0), "other views are compared inside their masks");
+    let mut painted = scene.clone();
+    inverted(&mut painted.references[0].image, scene.train[3].mask.as_ref().expect("a mask"));
+    let (weighed, weighed_painted) = (losses(&scene, 20.0), losses(&painted, 20.0));
+    assert_eq!(weighed[..3], weighed_painted[..3]);
+    assert_ne!(weighed[3], weighed_painted[3], "the reference is not compared inside its hole");
+    // SSIM knows no weight between none and one: where colours weigh nothing, it weighs nothing either.
+    assert_eq!(losses(&scene, 0.0)[3], losses(&painted, 0.0)[3], "a weight of 0 counts");
+}
+
 /// PSNR of the test views, whole and masked, of a short run on the tiny scene with its lengths and its priors in other
 /// units.
 fn figures_in_units(

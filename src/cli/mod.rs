@@ -15,7 +15,9 @@ mod export;
 pub mod folders;
 mod index;
 mod instruments;
+mod kernels;
 mod man;
+mod minutes;
 mod next;
 pub mod pictures;
 mod plan;
@@ -67,6 +69,7 @@ enum Command {
     Export(export::Args),
     View(view::Args),
     Devices(devices::Args),
+    Kernels(kernels::Args),
     Synth(synth::Args),
     Plan(plan::Args),
     Verify(verify::Args),
@@ -91,6 +94,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
         Command::Export(args) => export::run(&args),
         Command::View(args) => view::run(&args),
         Command::Devices(args) => devices::run(&args),
+        Command::Kernels(args) => kernels::run(&args),
         Command::Synth(args) => synth::run(&args),
         Command::Plan(args) => plan::run(&args),
         Command::Verify(args) => verify::run(&args),

@@ -12,7 +12,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::folders::{MODEL, RECORD, Record, SEEN, SETTINGS, TEST};
 use super::shared::{DeviceArgs, SceneArgs, load_scene, with_gpu};
-use super::{index, instruments, next, pictures, preset};
+use super::{index, instruments, minutes, next, pictures, preset};
 use crate::capture::doctor::{self, Severity};
 use crate::config::{Settings, SettingsArgs, Source};
 use crate::evaluate::{Judge, Report};
@@ -78,11 +78,22 @@ pub(super) struct Args {
     #[arg(long, value_name = "ADDRESS", num_args = 0..=1, require_equals = true, value_parser = address,
         default_missing_value = "127.0.0.1:8643")]
     view: Option<SocketAddr>,
+    /// Train for about so many minutes: the schedule is fitted to as many steps as this device takes in that time
+    ///
+    /// The steps are counted before training begins, and the settings written down repeat the run to the byte. The first of
+    /// them see smaller pictures, and nothing is evaluated before the end.
+    #[arg(long, value_name = "N", conflicts_with_all = ["iterations", "resume", "resume_or_start"], value_parser = positive)]
+    minutes: Option<f64>,
     /// Measure every pass: prints milliseconds per pass and writes trace.json (for chrome://tracing or Perfetto)
     #[arg(long)]
     profile: bool,
     #[command(flatten)]
     device: DeviceArgs,
+}
+
+/// A positive number of minutes.
+fn positive(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|m| (1e-3..1e6).contains(m)).ok_or_else(|| "give a positive number of minutes".into())
 }
 
 /// An address and a port, or one of them.
@@ -146,9 +157,15 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     };
     let looked = doctor::look(&scene);
     eprintln!("doctor: {}", looked.verdict());
+    let options = Options { timestamps: args.profile, ..args.device.options() };
+    let settings = match args.minutes {
+        Some(time) => {
+            with_gpu(&options, |gpu| minutes::fitted(gpu, &scene, &settings, time, began.unwrap_or_else(Instant::now)))?
+        }
+        None => settings,
+    };
     let board = args.view.map(|address| show(address, &name, &scene, &settings)).transpose()?;
     let manner = Manner { began, board };
-    let options = Options { timestamps: args.profile, ..args.device.options() };
     with_gpu(&options, |gpu| {
         eprintln!("device: {} ({})", gpu.info().name, gpu.info().driver);
         let Trained { summary, report, mut written } = if begun {

@@ -111,11 +111,37 @@ impl Settings {
         fitted
     }
 
+    /// These settings for a run of so many steps: what starts and ends at a step keeps its place in the run. Rounds of
+    /// growing come as often as before or more, but not below [`SHORTEST_ROUND`] steps, so that each has something to go
+    /// by. Nothing is evaluated or saved on the way.
+    pub fn rescheduled(&self, iterations: u32) -> Self {
+        let mut new = self.clone();
+        let share = f64::from(iterations) / f64::from(self.train.iterations);
+        let at = |step: u32| (f64::from(step) * share).round() as u32;
+        new.train.iterations = iterations;
+        new.train.coarse.until = at(self.train.coarse.until);
+        (new.train.eval_interval, new.train.save_interval) = (0, 0);
+        new.optimizer.schedule_length = at(self.optimizer.schedule_length);
+        new.model.attention.start = at(self.model.attention.start);
+        let (old, densify) = (&self.densify, &mut new.densify);
+        densify.every = at(old.every).clamp(SHORTEST_ROUND.min(old.every), old.every.max(SHORTEST_ROUND));
+        let visits = f64::from(densify.every) / f64::from(old.every);
+        densify.min_slot_visits = (f64::from(old.min_slot_visits) * visits) as u32;
+        densify.min_anchor_visits = (f64::from(old.min_anchor_visits) * visits) as u32;
+        densify.from = at(old.from);
+        densify.until = at(old.until).max(densify.from);
+        densify.statistics_from = at(old.statistics_from);
+        new
+    }
+
     /// The settings as TOML, every key written out; [`Settings::resolve`] reads it back to the same value.
     pub fn to_toml(&self) -> String {
         toml::to_string(self).expect("settings are tables of plain values")
     }
 }
+
+/// Fewest steps between two rounds of growing in a run that [`Settings::rescheduled`] has shortened.
+const SHORTEST_ROUND: u32 = 25;
 
 /// `Err` naming `key` and `value` unless the condition holds; `reason` completes "is VALUE, but ...".
 pub fn ensure(

@@ -13,6 +13,7 @@ use super::error::{Error, Named};
 use super::kernel::Kernel;
 use super::ledger::{Ledger, Rehearsal};
 use super::recorder::Context;
+use super::statistics::{self, Compiled, Statistic};
 
 /// Bytes that are taken from the device at once for small buffers; larger buffers get memory of their own.
 const DEVICE_BLOCK: u64 = 32 << 20;
@@ -37,6 +38,10 @@ pub struct Options {
     pub timestamps: bool,
     /// File of the pipeline cache; none is kept without it.
     pub cache: Option<PathBuf>,
+    /// Keep what the driver's compiler says of each kernel ([`Gpu::compiled`]), and make kernels in rehearsals too.
+    pub statistics: bool,
+    /// Threads of a subgroup in place of the driver's own choice, where the device can.
+    pub subgroup_size: Option<u32>,
 }
 
 /// What a device is and can.
@@ -80,6 +85,7 @@ pub(super) struct Pipeline {
     pub raw: vk::Pipeline,
     pub layout: vk::PipelineLayout,
     set: vk::DescriptorSetLayout,
+    compiled: Option<Compiled>,
 }
 
 type PipelineKey = (TypeId, Vec<u8>);
@@ -88,6 +94,7 @@ pub(super) struct Inner {
     pub device: ash::Device,
     pub queue: vk::Queue,
     pub push_descriptor: ash::khr::push_descriptor::Device,
+    executables: Option<ash::khr::pipeline_executable_properties::Device>,
     pub command_pool: vk::CommandPool,
     pub info: DeviceInfo,
     pub options: Options,
@@ -348,7 +355,15 @@ impl Gpu {
     /// One sentence naming what is missing: the loader, a device, a feature, the validation layer.
     pub fn open(options: &Options) -> Result<Self, Error> {
         let Instance { entry, raw: instance, messages, debug_utils } = open_instance(options.validate)?;
-        let (physical, info) = choose(list(&instance)?, options.device.as_deref())?;
+        let (physical, mut info) = choose(list(&instance)?, options.device.as_deref())?;
+        if let Some(size) = options.subgroup_size {
+            let [least, most] = subgroup_sizes(&instance, physical);
+            if !(least..=most).contains(&size) || !size.is_power_of_two() {
+                let feature = format!("subgroups of {size} threads (it has {least} to {most})");
+                return Err(Error::Missing { device: info.name, feature });
+            }
+            info.subgroup_size = size;
+        }
         let messenger = if options.validate {
             let utils = ash::ext::debug_utils::Instance::new(&entry, &instance);
             let severity =
@@ -367,9 +382,9 @@ impl Gpu {
         // SAFETY: a plain query of a live instance.
         let extensions = unsafe { instance.enumerate_device_extension_properties(physical) };
         let extensions = extensions.named("listing device extensions")?;
-        let memory_budget = extensions
-            .iter()
-            .any(|e| e.extension_name_as_c_str().is_ok_and(|name| name == ash::ext::memory_budget::NAME));
+        let has = |name: &CStr| extensions.iter().any(|e| e.extension_name_as_c_str().is_ok_and(|n| n == name));
+        let memory_budget = has(ash::ext::memory_budget::NAME);
+        let executables = options.statistics && has(ash::khr::pipeline_executable_properties::NAME);
         // SAFETY: the instance and physical device are live; names and features were checked by `describe`.
         let (device, queue, command_pool) = unsafe {
             let families = instance.get_physical_device_queue_family_properties(physical);
@@ -380,18 +395,26 @@ impl Gpu {
             let priorities = [1.0];
             let queues =
                 [vk::DeviceQueueCreateInfo::default().queue_family_index(family).queue_priorities(&priorities)];
-            let extensions = [ash::khr::push_descriptor::NAME.as_ptr()];
+            let mut extensions = vec![ash::khr::push_descriptor::NAME.as_ptr()];
+            let mut statistics =
+                vk::PhysicalDevicePipelineExecutablePropertiesFeaturesKHR::default().pipeline_executable_info(true);
             let mut f12 = vk::PhysicalDeviceVulkan12Features::default().scalar_block_layout(true);
             let mut f13 = vk::PhysicalDeviceVulkan13Features::default()
                 .synchronization2(true)
                 .maintenance4(true)
                 .subgroup_size_control(true)
                 .compute_full_subgroups(true);
-            let create = vk::DeviceCreateInfo::default()
+            if executables {
+                extensions.push(ash::khr::pipeline_executable_properties::NAME.as_ptr());
+            }
+            let mut create = vk::DeviceCreateInfo::default()
                 .queue_create_infos(&queues)
                 .enabled_extension_names(&extensions)
                 .push_next(&mut f12)
                 .push_next(&mut f13);
+            if executables {
+                create = create.push_next(&mut statistics);
+            }
             let device = instance.create_device(physical, &create, None).named("opening the device")?;
             let pool = vk::CommandPoolCreateInfo::default()
                 .queue_family_index(family)
@@ -420,6 +443,7 @@ impl Gpu {
         let cache = unsafe { device.create_pipeline_cache(&cache_info, None) }.named("creating a pipeline cache")?;
         let inner = Inner {
             push_descriptor: ash::khr::push_descriptor::Device::new(&instance, &device),
+            executables: executables.then(|| ash::khr::pipeline_executable_properties::Device::new(&instance, &device)),
             debug: debug_utils.then(|| ash::ext::debug_utils::Device::new(&instance, &device)),
             queue,
             command_pool,
@@ -518,7 +542,21 @@ impl Gpu {
     }
 }
 
+/// Fewest and most threads that a subgroup may be asked to have.
+fn subgroup_sizes(instance: &ash::Instance, physical: vk::PhysicalDevice) -> [u32; 2] {
+    let mut v13 = vk::PhysicalDeviceVulkan13Properties::default();
+    let mut properties = vk::PhysicalDeviceProperties2::default().push_next(&mut v13);
+    // SAFETY: a plain query of a live instance.
+    unsafe { instance.get_physical_device_properties2(physical, &mut properties) };
+    [v13.min_subgroup_size, v13.max_subgroup_size]
+}
+
 impl Inner {
+    /// What is known of the pipelines made with statistics, in no order.
+    pub(super) fn compiled(&self) -> Vec<Compiled> {
+        lock(&self.pipelines).values().filter_map(|p| p.compiled.clone()).collect()
+    }
+
     pub(super) fn allocate(
         &self,
         description: &AllocationCreateDesc<'_>,
@@ -627,14 +665,26 @@ impl Inner {
             if K::SUBGROUPS {
                 stage = stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS).push_next(&mut size);
             }
-            let create = [vk::ComputePipelineCreateInfo::default().layout(layout).stage(stage)];
-            let made = self.device.create_compute_pipelines(self.cache, &create, None);
+            let mut create = vk::ComputePipelineCreateInfo::default().layout(layout).stage(stage);
+            if self.executables.is_some() {
+                create = create.flags(vk::PipelineCreateFlags::CAPTURE_STATISTICS_KHR);
+            }
+            let began = std::time::Instant::now();
+            let made = self.device.create_compute_pipelines(self.cache, &[create], None);
+            let milliseconds = 1e3 * began.elapsed().as_secs_f64();
             self.device.destroy_shader_module(module, None);
             let raw = made.map_err(|(_, result)| refused(result))?[0];
             if raw == vk::Pipeline::null() {
                 return Err(refused(vk::Result::ERROR_UNKNOWN));
             }
-            Arc::new(Pipeline { name: K::NAME, raw, layout, set })
+            let mut pipeline = Pipeline { name: K::NAME, raw, layout, set, compiled: None };
+            if self.options.statistics {
+                let said: Vec<Statistic> =
+                    self.executables.as_ref().map_or_else(Vec::new, |e| statistics::of(e, &pipeline));
+                let words = bytemuck::pod_collect_to_vec(bytemuck::bytes_of(constants));
+                pipeline.compiled = Some(Compiled::new(K::NAME, words, milliseconds, said));
+            }
+            Arc::new(pipeline)
         };
         self.name_object(pipeline.raw, K::NAME);
         lock(&self.pipelines).insert(key, pipeline.clone());
@@ -664,7 +714,10 @@ impl Drop for Inner {
     fn drop(&mut self) {
         // SAFETY: the last owner is going; buffers and recorders hold an Arc, so none is left.
         unsafe {
-            let _ = self.device.device_wait_idle();
+            // Mesa's null device has no queue to wait for.
+            if self.info.heap_bytes > 0 {
+                let _ = self.device.device_wait_idle();
+            }
             self.save_cache();
             self.empty_trash();
             for context in lock(&self.contexts).drain(..) {

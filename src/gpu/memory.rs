@@ -258,6 +258,10 @@ impl Gpu {
             let memory = Memory { raw, bytes: padded, name, stage: self.ledger().stage(), backing };
             return Ok(Buffer { memory: Arc::new(memory), bytes, len, element: PhantomData });
         }
+        if self.info().heap_bytes == 0 {
+            let feature = "memory (a driver without hardware compiles kernels and runs none)".to_owned();
+            return Err(Error::Missing { device: self.info().name.clone(), feature });
+        }
         // SAFETY: the device outlives the buffer (the buffer holds an Arc of it), and the memory is bound before use.
         let (raw, requirements) = unsafe {
             let raw = inner.device.create_buffer(&info, None).named("creating a buffer")?;

@@ -12,6 +12,7 @@ pub mod kernel;
 pub mod ledger;
 pub mod memory;
 pub mod recorder;
+pub mod statistics;
 pub mod testing;
 pub mod timings;
 
@@ -23,6 +24,7 @@ pub use kernel::{Access, Binding, Kernel, Reference, Slot};
 pub use ledger::Used;
 pub use memory::Buffer;
 pub use recorder::{Groups, NotFinite, Recorder, Submission, Threads};
+pub use statistics::{Compiled, Statistic};
 pub use timings::{Timing, Timings};
 
 /// The typed interfaces of all kernels, generated from `glsl/` by `build.rs`.

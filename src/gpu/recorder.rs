@@ -438,6 +438,9 @@ impl<'g> Recorder<'g> {
         }
         if let Some(rehearsal) = &self.rehearsal {
             rehearsal.pipeline(K::NAME);
+            if self.gpu.options().statistics {
+                self.gpu.inner().pipeline::<K>(constants)?;
+            }
             self.pass(K::NAME, &accesses, |_| {});
             return Ok(());
         }

@@ -431,7 +431,7 @@ pub fn forecast(gpu: &Gpu, scene: &Scene, settings: &Settings, question: Questio
     Ok(verdict)
 }
 
-/// As [`survey`]; where the device has no room for that either, as if all anchors were in view.
+/// As [`survey`]; where the device has no room for that either, or no memory at all, as if all anchors were in view.
 fn surveyed<'c>(
     gpu: &Gpu,
     initial: &Initial,
@@ -439,7 +439,7 @@ fn surveyed<'c>(
     cameras: impl IntoIterator<Item = &'c Camera>,
 ) -> Result<Survey, Error> {
     match survey(gpu, initial, settings, cameras) {
-        Err(gpu::Error::TooLarge { .. } | gpu::Error::OutOfMemory { .. }) => {
+        Err(gpu::Error::TooLarge { .. } | gpu::Error::OutOfMemory { .. } | gpu::Error::Missing { .. }) => {
             let anchors = initial.anchors.position.len() as u32;
             Ok(Survey { anchors, visible: anchors, pairs: anchors.saturating_mul(settings.model.offsets) })
         }

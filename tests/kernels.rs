@@ -1,0 +1,79 @@
+//! What AMD's compiler makes of the kernels, on Mesa's null device: it needs no GPU and runs nothing.
+
+use std::path::Path;
+
+use assert_cmd::Command;
+
+/// Mesa whose figures the snapshots are.
+const DRIVER: &str = "radv Mesa 22.3.6";
+const ICD: &str = "/usr/share/vulkan/icd.d/radeon_icd.x86_64.json";
+
+fn on_null_device(family: &str, arguments: &[&str]) -> Command {
+    let mut command = Command::cargo_bin("gscream-vk").expect("the program");
+    command.args(arguments).env("RADV_FORCE_FAMILY", family).env("VK_ICD_FILENAMES", ICD).env("VK_DRIVER_FILES", ICD);
+    command
+}
+
+/// True where Mesa's RADV is installed; otherwise says that it is not.
+fn installed() -> bool {
+    let there = Path::new(ICD).is_file();
+    if !there {
+        println!("skipped: no {ICD} (Debian: mesa-vulkan-drivers)");
+    }
+    there
+}
+
+/// Registers, spills and occupancy hold what they held. A change that makes one worse shows here; one that makes it better
+/// is taken over by `INSTA_UPDATE=always`.
+#[test]
+fn registers_and_spills_are_those_of_the_table() {
+    if !installed() {
+        return;
+    }
+    for (family, subgroup) in [("gfx1100", "64"), ("gfx1100", "32"), ("navi21", "64"), ("vega10", "64")] {
+        let arguments = ["kernels", "synthetic", "--preset", "demo", "--subgroup", subgroup, "--json"];
+        let output = on_null_device(family, &arguments).output().expect("it runs");
+        assert!(output.status.success(), "{family}: {}", String::from_utf8_lossy(&output.stderr));
+        let found: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        let kernels = found["kernels"].as_array().expect("kernels");
+        assert!(kernels.len() > 60, "{family}: {} kernels", kernels.len());
+        assert!(kernels.iter().all(|k| k["registers"].as_u64().is_some_and(|n| n > 0)), "{family}");
+        let driver = found["driver"].as_str().expect("a driver");
+        if driver != DRIVER {
+            println!("skipped: the table is of {DRIVER}, and here is {driver}");
+            continue;
+        }
+        let mut table = String::from("kernel [constants]: registers, spilled, shared bytes, occupancy\n");
+        for k in kernels {
+            let constants: Vec<String> =
+                k["constants"].as_array().expect("words").iter().map(ToString::to_string).collect();
+            table += &format!(
+                "{} [{}]: {}, {}, {}, {}\n",
+                k["kernel"].as_str().expect("a name"),
+                constants.join(" "),
+                k["registers"],
+                k["spilled"],
+                k["shared_bytes"],
+                k["occupancy"]
+            );
+        }
+        insta::assert_snapshot!(format!("kernels_{family}_{subgroup}"), table);
+    }
+}
+
+/// A device without memory is refused in a sentence by what would run on it.
+#[test]
+fn nothing_runs_on_a_device_without_memory() {
+    if !installed() {
+        return;
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let out = folder.path().join("run");
+    let out = out.to_str().expect("a plain name");
+    let output =
+        on_null_device("gfx1100", &["train", "synthetic", "--preset", "demo", "--out", out]).output().expect("it runs");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    let last = said.lines().last().expect("an error");
+    assert!(last.contains("needs about") && last.contains("0 MiB are free"), "{last}");
+}
