@@ -151,9 +151,9 @@ pub fn look(scene: &Scene) -> Report {
     report
 }
 
-/// Whether a note of the loader says that it had to leave something out.
+/// Whether a note of the loader says that it left something out.
 fn lost(note: &str) -> bool {
-    note.contains("belong to no picture") || note.contains("are not in the model")
+    ["belong to no picture", "are not in the model", "is not read"].iter().any(|part| note.contains(part))
 }
 
 fn examine_scene(scene: &Scene, report: &mut Report) {

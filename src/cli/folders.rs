@@ -121,7 +121,8 @@ impl Origin {
             return Ok(Self::Model { folder: owned });
         }
         bail!(
-            "{}: neither a run folder (it has no {RECORD}) nor a model folder (it has no {POINT_CLOUD})",
+            "{}: neither a run folder (it has no {RECORD}) nor a model folder (it has no {POINT_CLOUD}); name what \
+             gscream-vk train wrote, runs/SCENE if not told otherwise",
             folder.display()
         )
     }

@@ -14,6 +14,7 @@ use super::folders::{Record, SETTINGS, TEST};
 use super::report::last_part;
 use super::{next, pictures};
 use crate::export;
+use crate::report::pace::duration;
 use crate::report::page::STYLE;
 use crate::report::plots::{self, Axis, Figure, Mark, Panel, Scale, Series};
 use crate::scene::Scene;
@@ -128,7 +129,7 @@ fn page(facts: &Facts<'_>, test: &[Pair], train: &[Pair]) -> anyhow::Result<Stri
                         Some(steps) => { "Complete: " (steps) " steps" },
                         None => { "Ended early, the last line of the log is of step " (last) },
                     }
-                    @if seconds > 0.0 { " in " (format!("{:.1}", seconds / 60.0)) " minutes of training" }
+                    @if seconds > 0.0 { " in " (duration(seconds)) " of training" }
                     " on " (record.device) ", gscream-vk " (record.version) "."
                 }
                 @if record.complete.is_none() { p { code { (go_on) } " goes on." } }
@@ -242,7 +243,7 @@ fn curves(log: &[Value]) -> Figure {
 const REGIONS: [(&str, &str); 5] = [
     ("full", "full image"),
     ("mask", "inside the mask"),
-    ("bounding_box", "the mask's box"),
+    ("box", "the mask's box"),
     ("outside", "outside the mask"),
     ("rim", "the mask's rim"),
 ];

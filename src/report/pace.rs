@@ -34,7 +34,8 @@ fn place(done: usize, all: usize, passed: Duration) -> String {
     format!("{place}, about {} left", duration(left))
 }
 
-fn duration(seconds: f64) -> String {
+/// Seconds, minutes or hours in words, such as `12 min`.
+pub fn duration(seconds: f64) -> String {
     match seconds {
         s if s < 90.0 => format!("{s:.0} s"),
         s if s < 5400.0 => format!("{:.0} min", s / 60.0),

@@ -117,7 +117,7 @@ fn plain(scene: &Path) -> Result<Layout, Error> {
     let mut test = entries(&test_images, |name| test_masks.get(name).cloned(), prior);
     let depths = index(&scene.join("test_depth"), &priors::EXTENSIONS)?;
     test.iter_mut().for_each(|entry| entry.depth = depths.get(&entry.name).cloned());
-    let mut notes = Vec::new();
+    let mut notes = misspelt(scene)?;
     let of_test =
         [("masks", &masks, &images), ("test_masks", &test_masks, &test_images), ("test_depth", &depths, &test_images)];
     for (what, files, pictures) in of_test {
@@ -130,6 +130,23 @@ fn plain(scene: &Path) -> Result<Layout, Error> {
     let references = references(&scene.join("reference"), &train)?;
     let found = format!("plain layout: pictures in {folder}/");
     Ok(Layout { found, train, test, references, kind, notes, tall_test_mask: None })
+}
+
+/// The folders of the plain layout.
+const FOLDERS: [&str; 9] =
+    ["images", "masks", "depth", "disparity", "reference", "test_images", "test_masks", "test_depth", "sparse"];
+
+/// Notes on folders that are called nearly like one that is not there.
+fn misspelt(scene: &Path) -> Result<Vec<String>, Error> {
+    let folders = list(scene)?.into_iter().filter(|(path, _)| path.is_dir()).map(|(_, name)| name);
+    let near = |name: &str| {
+        let missing = FOLDERS.into_iter().filter(|known| !scene.join(known).is_dir());
+        missing.map(|known| (strsim::damerau_levenshtein(name, known), known)).filter(|(d, _)| *d <= 2).min()
+    };
+    let unknown = folders.filter(|name| !FOLDERS.contains(&name.as_str()) && !name.starts_with("images"));
+    Ok(unknown
+        .filter_map(|name| near(&name).map(|(_, known)| format!("{name}/ is not read; should it be called {known}/?")))
+        .collect())
 }
 
 /// A note on files that belong to no picture.
