@@ -186,7 +186,7 @@ mod tests {
             lens("SIMPLE_RADIAL_FISHEYE", &[-0.02]),
             lens("RADIAL_FISHEYE", &[0.02, 0.01]),
             lens("THIN_PRISM_FISHEYE", &[0.02, -0.01, 0.001, -0.002, 0.003, 0.0, 0.002, -0.001]),
-            lens("FULL_OPENCV", &[-0.2, 0.05, 0.001, 0.002, -0.01, 0.02, 0.01, 0.001]),
+            lens("FULL_OPENCV", &[-0.15, 0.04, 0.001, 0.002, 0.01, 0.02, 0.01, 0.001]),
             lens("FULL_OPENCV", &[0.3, 0.1]),
             lens("FOV", &[0.9]),
         ]
