@@ -279,6 +279,11 @@ fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>
         let size = picture_size(photograph)?;
         let mut mask = scene::mask(path, 1)?;
         if *inverted {
+/// Whether a box has an inside and lies within a picture of this size.
+fn is_box([x0, y0, x1, y1]: [u32; 4], size: [u32; 2]) -> bool {
+    x0 < x1 && y0 < y1 && x1 <= size[0] && y1 <= size[1]
+}
+
             mask.iter_mut().for_each(|v| *v = 255 - *v);
         }
         // Of those that came with the photographs an empty one is a view without the object.
@@ -294,6 +299,13 @@ fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>
         };
         let Some(photograph) = capture.photographs.get(&stem) else {
             return Err(no_such_view(name, option, capture.photographs.keys().map(String::as_str)));
+    let on = |stem: &str, kind: &dyn Fn(&Evidence) -> bool| {
+        request
+            .object
+            .iter()
+            .find(|(name, evidence)| scene::stem(name) == stem && kind(evidence))
+            .map(|(_, evidence)| evidence)
+    };
         };
         let size = picture_size(photograph)?;
         let given = match evidence {
@@ -303,7 +315,7 @@ fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>
             }
             Evidence::Box(bounds) => {
                 let [x0, y0, x1, y1] = *bounds;
-                if x0 >= x1 || y0 >= y1 || x1 > size[0] || y1 > size[1] {
+                if !is_box(*bounds, size) {
                     return Err(Error::Request(format!(
                         "--box {name}={x0},{y0},{x1},{y1}: not a box within the photograph, which is {}x{}; give x0,y0,x1,y1 \
                          with x0 < x1 and y0 < y1",
@@ -319,12 +331,26 @@ fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>
                 })?;
                 Given { mask, from: format!("--box {x0},{y0},{x1},{y1} and a graph cut") }
             }
+                if on(&stem, &|other| matches!(other, Evidence::Strokes(_))).is_some() {
+                    // It bounds what the strokes reach.
+                    continue;
+                }
             Evidence::Strokes(path) => {
                 let picture = scene::photograph(photograph, 1)?;
                 let strokes = graph_cut::Strokes::read(path, size)?;
-                Given {
-                    mask: graph_cut::from_strokes(&picture, &strokes),
-                    from: format!("--strokes {}", path.display()),
+                let bounds = on(&stem, &|other| matches!(other, Evidence::Box(_)));
+                let (mask, within) = match bounds {
+                    Some(Evidence::Box(bounds)) if is_box(*bounds, size) => {
+                        let [x0, y0, x1, y1] = bounds;
+                        let mask = graph_cut::from_strokes_in_box(&picture, &strokes, *bounds);
+                        (mask, format!(" within --box {x0},{y0},{x1},{y1}"))
+                    }
+                    _ => (graph_cut::from_strokes(&picture, &strokes), String::new()),
+                };
+                if mask.as_raw().iter().all(|v| *v == 0) {
+                    return Err(Error::Request(format!(
+                        "--strokes {name}: no stroke on the object lies within the box; draw one there"
+                    )));
                 }
             }
         };
@@ -335,6 +361,7 @@ fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>
                  has it nearer to the middle"
             )));
         }
+                Given { mask, from: format!("--strokes {}{within}", path.display()) }
         all.insert(stem, Given { mask, ..given });
     }
     Ok(all)

@@ -39,6 +39,8 @@ pub(super) struct Args {
     #[arg(long = "box", value_name = "NAME=x0,y0,x1,y1", value_parser = bounds)]
     bounds: Vec<(String, Evidence)>,
     /// Picture of strokes on one view: white or green on the object, black or red beside it, else grey or transparent
+    ///
+    /// With a --box of the same view they count within it alone: for one leaf of many.
     #[arg(long, value_name = "NAME=FILE", value_parser = strokes)]
     strokes: Vec<(String, Evidence)>,
     /// View to become the reference [default: the one whose hole is seen best by others]
