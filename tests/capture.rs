@@ -369,3 +369,14 @@ fn the_doctor_tells_right_from_wrong() {
     }
     problems(&["they seem to be 0 on the object"]);
 }
+        (
+            "prepare photos --out scene --box train_001=10,10,90,70 --inpaint-model text.png",
+            1,
+            // With networks built in it is no whole file, without them it is said how to build them in.
+            "text.png: ",
+        ),
+        (
+            "prepare photos --out scene --box train_001=10,10,90,70 --no-depth --depth-model a.onnx",
+            2,
+            "cannot be used with",
+        ),
