@@ -177,7 +177,7 @@ fn window(hole: &[bool], [w, h]: [usize; 2]) -> Option<[usize; 4]> {
     let side = ((larger as f64 * AROUND).ceil() as usize).max(64);
     let part = |i: usize, all: usize| {
         let side = side.min(all);
-        let start = ((low[i] + high[i] + 1) / 2).saturating_sub(side / 2).min(all - side);
+        let start = (low[i] + high[i]).div_ceil(2).saturating_sub(side / 2).min(all - side);
         [start, side]
     };
     let ([x, side_x], [y, side_y]) = (part(0, w), part(1, h));
