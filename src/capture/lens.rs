@@ -97,7 +97,7 @@ pub struct Pinhole {
 }
 
 impl Pinhole {
-    /// The pinhole for a lens; nothing if no focal length up to [`LARGEST`] times the lens's shows a part of the photograph
+    /// The pinhole for a lens; nothing if no focal length up to four times the lens's shows a part of the photograph
     /// alone.
     pub fn of(lens: Lens) -> Option<Self> {
         let [w, h] = lens.size.map(f64::from);
