@@ -226,6 +226,117 @@ fn cameras_of_nerfstudio_are_the_same() {
     }
 }
 
+// ---------------------------------------------------------------- thin evidence, other lenses
+
+/// Masks for all photographs, by the number of the view; a short fit.
+fn prepared_with_masks(of: impl Fn(u32, &GrayImage) -> GrayImage) -> (TempDir, Vec<String>) {
+    let folder = capture();
+    let masks = folder.path().join("photos/masks");
+    fs::create_dir(&masks).expect("a writable folder");
+    for view in 0..VIEWS {
+        of(view, &mask(&truth(&folder, view))).save(masks.join(name(view) + ".png")).expect("a writable folder");
+    }
+    let mut request = Request::new(folder.path().join("photos"), folder.path().join("scene"));
+    (request.fit_steps, request.fit_side, request.depth) = (30, 56, false);
+    let mut lines = Lines::default();
+    capture::prepare(&testing::gpu(), &request, &mut lines).expect("a scene");
+    (folder, lines.0)
+}
+
+#[test]
+fn an_object_in_two_views_only_is_said() {
+    let empty = GrayImage::new(112, 84);
+    let (folder, lines) = prepared_with_masks(|view, truth| if view < 2 { truth.clone() } else { empty.clone() });
+    assert!(lines.iter().any(|line| line.contains("the object is in 2 of 10 views only")), "{lines:?}");
+    assert!(folder.path().join("scene/prepare.json").is_file());
+}
+
+#[test]
+fn a_hole_that_nobody_sees_is_said() {
+    // All but a corner: no photograph shows anything that is not the object.
+    let all = GrayImage::from_fn(112, 84, |x, y| Luma([if x + y > 0 { 255 } else { 0 }]));
+    let (folder, lines) = prepared_with_masks(|_, _| all.clone());
+    let says = "no other photograph looks behind the object: the whole hole is guessed";
+    assert!(lines.iter().any(|line| line.contains(says)), "{lines:?}");
+    // The doctor's sheet shows it: ten views, the reference, and the map.
+    let at = folder.path();
+    let outcome = run(at, "doctor scene --sheet sheet");
+    let page = fs::read_to_string(at.join("sheet/sheet.html")).expect("a page");
+    assert!(page.contains("green: seen by others, red: by none"), "{}{}", outcome.stdout, outcome.stderr);
+    let sheet = image::open(at.join("sheet/sheet.png")).expect("a picture").into_rgb8();
+    let count = |color: [u8; 3]| sheet.pixels().filter(|pixel| pixel.0 == color).count();
+    assert!(count([230, 60, 40]) > 1000 && count([40, 170, 70]) == 0);
+}
+
+/// A capture of two cameras of which one is a fisheye: its photograph is resampled, the others stay as they are.
+#[test]
+fn fisheyes_become_pinholes() {
+    let folder = capture();
+    let photos = folder.path().join("photos");
+    let model = photos.join("sparse/0");
+    let full = scene::load(&folder.path().join("full"), &scene::Config::default()).expect("a scene");
+    let plain = full.train[0].camera;
+    let [fx, fy] = plain.focal;
+    let [cx, cy] = plain.principal;
+    let [k1, k2] = [0.02, -0.004];
+    let cameras =
+        format!("1 PINHOLE 112 84 {fx} {fy} {cx} {cy}\n2 OPENCV_FISHEYE 112 84 {fx} {fy} {cx} {cy} {k1} {k2} 0 0\n");
+    let mut images = String::new();
+    for (i, view) in full.train.iter().enumerate() {
+        let r = glam::DMat3::from_cols_array_2d(&view.camera.rotation.map(|row| row.map(f64::from))).transpose();
+        let q = glam::DQuat::from_mat3(&r).normalize();
+        let [x, y, z] = view.camera.translation;
+        let camera = if i == 3 { 2 } else { 1 };
+        images += &format!("{} {} {} {} {} {x} {y} {z} {camera} {}.png\n\n", i + 1, q.w, q.x, q.y, q.z, view.name);
+    }
+    for stem in ["cameras", "images"] {
+        fs::remove_file(model.join(stem).with_extension("bin")).expect("a model");
+    }
+    fs::write(model.join("cameras.txt"), cameras).expect("a writable folder");
+    fs::write(model.join("images.txt"), images).expect("a writable folder");
+    // Training alone says what to do.
+    let refused = scene::load(&photos, &scene::Config::default()).expect_err("a fisheye").to_string();
+    assert!(
+        refused.contains("camera 2 uses OPENCV_FISHEYE") && refused.contains("`gscream-vk prepare` resamples"),
+        "{refused}"
+    );
+
+    let mut request = Request::new(&photos, folder.path().join("scene"));
+    request.only = vec![Step::Poses];
+    let mut lines = Lines::default();
+    capture::prepare(&testing::gpu(), &request, &mut lines).expect("poses");
+    let said = "poses: 1 photographs were resampled from OPENCV_FISHEYE to pinholes";
+    assert!(lines.0.iter().any(|line| line == said), "{:?}", lines.0);
+    let scene = scene::load(&request.out, &scene::Config { unit: 1.0, ..Default::default() }).expect("a scene");
+    let original =
+        scene::load(&folder.path().join("full"), &scene::Config { unit: 1.0, ..Default::default() }).expect("a scene");
+    assert_eq!(scene.train.len(), VIEWS as usize);
+    let lens = capture::lens::Pinhole::of(scene::colmap::Lens {
+        model: "OPENCV_FISHEYE",
+        focal: [fx, fy].map(f64::from),
+        principal: [cx, cy].map(f64::from),
+        coefficients: std::array::from_fn(|i| if i < 2 { [k1, k2][i] } else { 0.0 }),
+        size: [112, 84],
+    })
+    .expect("a pinhole");
+    for (i, (view, before)) in scene.train.iter().zip(&original.train).enumerate() {
+        assert_eq!(view.camera.distortion, [0.0; 4]);
+        // Through a quaternion and back.
+        let moved = (0..3).map(|k| (view.camera.center()[k] - before.camera.center()[k]).abs()).fold(0.0, f64::max);
+        assert!(moved < 1e-5, "{moved}");
+        if i == 3 {
+            assert!(view.image == lens.photograph(&before.image) && view.image != before.image);
+            assert!((f64::from(view.camera.focal[0]) - lens.focal[0]).abs() < 1e-4);
+        } else {
+            assert!(view.image == before.image && view.camera.focal == before.camera.focal);
+        }
+    }
+    // In its own folder the photographs would be written over.
+    request.out = photos;
+    let refused = capture::prepare(&testing::gpu(), &request, &mut Lines::default()).expect_err("in place").to_string();
+    assert!(refused.contains("make the scene in another folder"), "{refused}");
+}
+
 // ---------------------------------------------------------------- the commands
 
 struct Outcome {
@@ -293,6 +404,17 @@ fn mistakes_are_one_sentence_and_write_nothing() {
             "prepare photos --out scene --box train_001=50,10,40,70",
             1,
             "not a box within the photograph, which is 112x84",
+        ),
+        (
+            "prepare photos --out scene --box train_001=10,10,90,70 --inpaint-model text.png",
+            1,
+            // With networks built in it is no whole file, without them it is said how to build them in.
+            "text.png: ",
+        ),
+        (
+            "prepare photos --out scene --box train_001=10,10,90,70 --no-depth --depth-model a.onnx",
+            2,
+            "cannot be used with",
         ),
         ("prepare photos --out scene --box train_001=5,10,40", 2, "a box is four numbers"),
         ("prepare photos --out scene --mask train_001", 2, "must be NAME=..."),

@@ -1,12 +1,15 @@
 //! Depth priors from the fit itself: kept where views agree on them, nothing elsewhere.
 
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
 use image::GrayImage;
 use rayon::prelude::*;
 
 use super::record::Batch;
 use super::splats::Splats;
-use super::{Error, Watch};
-use crate::scene::{Camera, Scene, resample};
+use super::{Error, Watch, doctor, network};
+use crate::scene::{self, Camera, Prior, PriorKind, Scene, resample};
 
 /// A pixel less covered than this has no depth.
 const COVERED: f32 = 0.9;
@@ -172,6 +175,75 @@ pub fn make(scene: &Scene, splats: &mut Splats, masks: &[GrayImage], watch: &mut
     Ok(batch)
 }
 
+/// A network's output follows the sparse points if the median of its rank correlation with their depth is beyond this.
+const FOLLOWS: f64 = 0.3;
+
+/// Writes every view's map by a network, as depth or as disparity, whichever follows the sparse points.
+///
+/// # Errors
+/// Photographs that cannot be read; a network that cannot be run, or whose maps follow the points in neither sense.
+pub fn by_network(
+    scene: &Scene,
+    network: &network::Depth,
+    files: &BTreeMap<String, PathBuf>,
+    watch: &mut dyn Watch,
+) -> Result<Batch, Error> {
+    let mut maps = vec![];
+    let mut correlations = vec![];
+    for (i, view) in scene.train.iter().enumerate() {
+        let picture = scene::photograph(&files[&view.name], 1)?;
+        let (values, size) = proportioned(network.of(&picture)?, [picture.width(), picture.height()]);
+        let prior = Prior { kind: PriorKind::Depth, values: resample::map(&values, size, view.camera.size) };
+        correlations.extend(doctor::follows_points(scene, view, &prior));
+        maps.push((values, size));
+        watch.at(2 * i as u64 + 2);
+    }
+    correlations.sort_by(f64::total_cmp);
+    let median = correlations.get(correlations.len() / 2).copied();
+    let kind = match median {
+        Some(r) if r.abs() < FOLLOWS => {
+            let what = format!(
+                "its maps follow the sparse points neither as depth nor as disparity (median rank correlation {r:.2}): the \
+                 network must take RGB less (0.485, 0.456, 0.406) over (0.229, 0.224, 0.225)"
+            );
+            return Err(Error::File { path: network.path().to_owned(), what });
+        }
+        Some(r) if r < 0.0 => PriorKind::Disparity,
+        Some(_) => PriorKind::Depth,
+        // Most networks of this kind tell disparity.
+        None => PriorKind::Disparity,
+    };
+    let word = word(kind);
+    let mut batch = Batch::default();
+    for (view, (values, size)) in scene.train.iter().zip(maps) {
+        let from = format!("{}, read as {word}", network.path().display());
+        batch.npy(format!("{word}/{}.npy", view.name), size, values, from);
+    }
+    let told = median.map_or_else(
+        || "no view shows enough sparse points to tell, most networks give it".into(),
+        |r| format!("median rank correlation with the sparse points' depth {r:.2}"),
+    );
+    batch.notes.push(format!("{} gives {word} ({told})", network.path().display()));
+    batch.figures.extend(median.map(|r| ("correlation".into(), r)));
+    Ok(batch)
+}
+
+/// The kind's folder, and the end of a reference prior's name.
+pub fn word(kind: PriorKind) -> &'static str {
+    match kind {
+        PriorKind::Depth => "depth",
+        PriorKind::Disparity => "disparity",
+    }
+}
+
+/// A map in the proportions of its picture, no side of it longer than it was.
+pub fn proportioned((values, size): (Vec<f32>, [u32; 2]), picture: [u32; 2]) -> (Vec<f32>, [u32; 2]) {
+    let longer = f64::from(size[0].max(size[1]));
+    let scale = (longer / f64::from(picture[0].max(picture[1]))).min(1.0);
+    let to = picture.map(|side| ((f64::from(side) * scale).round() as u32).max(1));
+    (resample::map(&values, size, to), to)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -218,6 +290,16 @@ mod tests {
         assert!(agreed(&maps, 3).iter().all(|v| v.is_nan()));
         // At the border only one of the others sees the point.
         assert!(agreed(&maps[..2], 1).iter().all(|v| v.is_nan()));
+    }
+
+    #[test]
+    fn maps_get_the_proportions_of_their_pictures() {
+        let square: Vec<f32> = (0..16).flat_map(|y| (0..16).map(move |x| (x + 10 * y) as f32)).collect();
+        let (values, size) = proportioned((square, [16, 16]), [640, 320]);
+        assert_eq!((size, values.len()), ([16, 8], 128));
+        // Rows are means of two.
+        assert_eq!((values[3], values[16]), (8.0, 25.0));
+        assert_eq!(proportioned((vec![1.0; 64], [8, 8]), [6, 3]).1, [6, 3]);
     }
 
     #[test]

@@ -229,6 +229,11 @@ fn figures(scene: &Scene, view: &View) -> ViewFigures {
     ViewFigures { name: view.name.clone(), mask, depth_correlation, depth_residual, exposure, iou: None }
 }
 
+/// Rank correlation of a prior of the view's size with the points that the view shows; none where they are too few.
+pub(super) fn follows_points(scene: &Scene, view: &View, prior: &Prior) -> Option<f64> {
+    against_points(prior, &seen(scene, &view.camera)).0
+}
+
 /// Rank correlation and residual of a prior against the points.
 fn against_points(prior: &Prior, points: &[Seen]) -> (Option<f64>, Option<f64>) {
     let known: Vec<&Seen> = points.iter().filter(|p| prior.values[p.pixel].is_finite()).collect();

@@ -404,6 +404,23 @@ impl Strokes {
     }
 }
 
+/// The object that the strokes mean within a box (x0, y0 and one past x1, y1): what lies beyond neither counts nor teaches
+/// colours.
+pub fn from_strokes_in_box(picture: &RgbImage, strokes: &Strokes, [x0, y0, x1, y1]: [u32; 4]) -> GrayImage {
+    let full = [picture.width(), picture.height()];
+    let size = [x1 - x0, y1 - y0];
+    let part = image::imageops::crop_imm(picture, x0, y0, size[0], size[1]).to_image();
+    let stroke = |x: u32, y: u32| {
+        let at = |v: u32, axis: usize| u64::from(v) * u64::from(strokes.size[axis]) / u64::from(full[axis]);
+        strokes.known[(at(y, 1) * u64::from(strokes.size[0]) + at(x, 0)) as usize]
+    };
+    let known = (0..size[0] * size[1]).map(|i| stroke(x0 + i % size[0], y0 + i / size[0])).collect();
+    let inside = from_strokes(&part, &Strokes { known, size });
+    let mut mask = GrayImage::new(full[0], full[1]);
+    image::imageops::replace(&mut mask, &inside, i64::from(x0), i64::from(y0));
+    mask
+}
+
 /// The object that the strokes mean. Without a stroke beside it, the picture's border is what it is told from.
 pub fn from_strokes(picture: &RgbImage, strokes: &Strokes) -> GrayImage {
     let full = [picture.width(), picture.height()];
@@ -430,6 +447,26 @@ pub fn from_strokes(picture: &RgbImage, strokes: &Strokes) -> GrayImage {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Two squares of one colour, a stroke on one of them, and a box around it: the other is not of the object.
+    #[test]
+    fn a_box_bounds_what_strokes_reach() {
+        let square = |x: u32, y: u32, at: u32| (at..at + 20).contains(&x) && (20..40).contains(&y);
+        let picture = RgbImage::from_fn(100, 60, |x, y| {
+            image::Rgb(if square(x, y, 15) || square(x, y, 65) { [40, 160, 60] } else { [200, 190, 180] })
+        });
+        let known = |x: u32, y: u32| {
+            if (20..30).contains(&x) && (28..32).contains(&y) { Known::Object } else { Known::MaybeBackground }
+        };
+        let strokes = Strokes { known: (0..6000).map(|i| known(i % 100, i / 100)).collect(), size: [100, 60] };
+        let count = |mask: &GrayImage, at: u32| {
+            mask.enumerate_pixels().filter(|(x, y, v)| square(*x, *y, at) && v.0[0] != 0).count()
+        };
+        let both = from_strokes(&picture, &strokes);
+        assert!(count(&both, 15) > 380 && count(&both, 65) > 380, "alike without a box");
+        let one = from_strokes_in_box(&picture, &strokes, [5, 10, 48, 52]);
+        assert!(count(&one, 15) > 380 && count(&one, 65) == 0, "{} {}", count(&one, 15), count(&one, 65));
+    }
 
     /// All labellings of a small grid, by their cost.
     fn cheapest(size: [usize; 2], terminals: &[[i64; 2]], edges: &[(usize, usize, i32)]) -> (i64, Vec<u32>) {

@@ -97,7 +97,7 @@ pub struct Pinhole {
 }
 
 impl Pinhole {
-    /// The pinhole for a lens; nothing if no focal length up to [`LARGEST`] times the lens's shows a part of the photograph
+    /// The pinhole for a lens; nothing if no focal length up to four times the lens's shows a part of the photograph
     /// alone.
     pub fn of(lens: Lens) -> Option<Self> {
         let [w, h] = lens.size.map(f64::from);
@@ -186,7 +186,7 @@ mod tests {
             lens("SIMPLE_RADIAL_FISHEYE", &[-0.02]),
             lens("RADIAL_FISHEYE", &[0.02, 0.01]),
             lens("THIN_PRISM_FISHEYE", &[0.02, -0.01, 0.001, -0.002, 0.003, 0.0, 0.002, -0.001]),
-            lens("FULL_OPENCV", &[-0.2, 0.05, 0.001, 0.002, -0.01, 0.02, 0.01, 0.001]),
+            lens("FULL_OPENCV", &[-0.15, 0.04, 0.001, 0.002, 0.01, 0.02, 0.01, 0.001]),
             lens("FULL_OPENCV", &[0.3, 0.1]),
             lens("FOV", &[0.9]),
         ]

@@ -6,6 +6,7 @@ pub mod fit;
 pub mod graph_cut;
 pub mod lens;
 pub mod masks;
+pub mod network;
 pub mod patchmatch;
 pub mod poses;
 pub mod record;
@@ -19,10 +20,11 @@ use std::path::{Path, PathBuf};
 use image::GrayImage;
 
 use crate::gpu::{self, Gpu};
-use crate::scene::{self, Scene, resample};
+use crate::scene::{self, PriorKind, Scene, resample};
 use crate::train::checkpoint::Fingerprint;
 
 use fit::Fit;
+use network::Inpainting;
 use poses::Capture;
 use record::{Batch, Folder, Inputs};
 use splats::Splats;
@@ -142,6 +144,10 @@ pub struct Request {
     pub fit_side: u32,
     /// Whether depth priors are made of the fit, NaN where nothing is known; a scene that has its own keeps those alone.
     pub depth: bool,
+    /// A network that fills what nobody saw, instead of PatchMatch: an ONNX file, see [`network`].
+    pub inpaint_model: Option<PathBuf>,
+    /// A network whose maps become the depth priors, instead of the fit's own depth: likewise.
+    pub depth_model: Option<PathBuf>,
     /// Seed of every random choice.
     pub seed: u64,
 }
@@ -158,6 +164,8 @@ impl Request {
             fit_steps: 600,
             fit_side: 256,
             depth: true,
+            inpaint_model: None,
+            depth_model: None,
             seed: 0,
         }
     }
@@ -209,6 +217,7 @@ pub fn prepare(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<()
         !path.canonicalize().is_ok_and(|path| own.as_ref().is_ok_and(|own| path.starts_with(own)))
     });
     // Mistakes in what the user named are found before anything is written.
+    let networks = Networks::open(request)?;
     let mut object = given(&capture, request)?;
     let mut folder = Folder::open(&request.out)?;
     object.extend(corrected(&folder, &capture, &object)?);
@@ -219,7 +228,7 @@ pub fn prepare(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<()
                 .into(),
         ));
     }
-    let mut preparation = Preparation { gpu, request, folder: &mut folder, watch, depth: request.depth };
+    let mut preparation = Preparation { gpu, request, folder: &mut folder, watch, depth: request.depth, networks };
     if request.wants(Step::Poses) {
         preparation.poses(&capture)?;
     }
@@ -270,6 +279,11 @@ fn no_such_view<'a>(name: &str, option: &str, views: impl Iterator<Item = &'a st
     Error::Request(format!("{option} {name}: no photograph has this name{hint}"))
 }
 
+/// Whether a box has an inside and lies within a picture of this size.
+fn is_box([x0, y0, x1, y1]: [u32; 4], size: [u32; 2]) -> bool {
+    x0 < x1 && y0 < y1 && x1 <= size[0] && y1 <= size[1]
+}
+
 /// The masks that the user named.
 fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>, Error> {
     let mut all = BTreeMap::new();
@@ -285,6 +299,13 @@ fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>
         let mask = capture.mask(name, checked(path, mask, size, true)?);
         all.insert(name.clone(), Given { mask, from: format!("{}", path.display()) });
     }
+    let on = |stem: &str, kind: &dyn Fn(&Evidence) -> bool| {
+        request
+            .object
+            .iter()
+            .find(|(name, evidence)| scene::stem(name) == stem && kind(evidence))
+            .map(|(_, evidence)| evidence)
+    };
     for (name, evidence) in &request.object {
         let stem = scene::stem(name).to_owned();
         let option = match evidence {
@@ -303,12 +324,16 @@ fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>
             }
             Evidence::Box(bounds) => {
                 let [x0, y0, x1, y1] = *bounds;
-                if x0 >= x1 || y0 >= y1 || x1 > size[0] || y1 > size[1] {
+                if !is_box(*bounds, size) {
                     return Err(Error::Request(format!(
                         "--box {name}={x0},{y0},{x1},{y1}: not a box within the photograph, which is {}x{}; give x0,y0,x1,y1 \
                          with x0 < x1 and y0 < y1",
                         size[0], size[1]
                     )));
+                }
+                if on(&stem, &|other| matches!(other, Evidence::Strokes(_))).is_some() {
+                    // It bounds what the strokes reach.
+                    continue;
                 }
                 let picture = scene::photograph(photograph, 1)?;
                 let mask = graph_cut::from_box(&picture, *bounds).ok_or_else(|| {
@@ -322,10 +347,21 @@ fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>
             Evidence::Strokes(path) => {
                 let picture = scene::photograph(photograph, 1)?;
                 let strokes = graph_cut::Strokes::read(path, size)?;
-                Given {
-                    mask: graph_cut::from_strokes(&picture, &strokes),
-                    from: format!("--strokes {}", path.display()),
+                let bounds = on(&stem, &|other| matches!(other, Evidence::Box(_)));
+                let (mask, within) = match bounds {
+                    Some(Evidence::Box(bounds)) if is_box(*bounds, size) => {
+                        let [x0, y0, x1, y1] = bounds;
+                        let mask = graph_cut::from_strokes_in_box(&picture, &strokes, *bounds);
+                        (mask, format!(" within --box {x0},{y0},{x1},{y1}"))
+                    }
+                    _ => (graph_cut::from_strokes(&picture, &strokes), String::new()),
+                };
+                if mask.as_raw().iter().all(|v| *v == 0) {
+                    return Err(Error::Request(format!(
+                        "--strokes {name}: no stroke on the object lies within the box; draw one there"
+                    )));
                 }
+                Given { mask, from: format!("--strokes {}{within}", path.display()) }
             }
         };
         let mask = capture.mask(&stem, given.mask);
@@ -389,8 +425,38 @@ struct Preparation<'a> {
     request: &'a Request,
     folder: &'a mut Folder,
     watch: &'a mut dyn Watch,
-    /// Whether the fit's depth is written.
+    /// Whether priors are written.
     depth: bool,
+    networks: Networks,
+}
+
+/// The networks that the user named, and the hashes of their files.
+struct Networks {
+    inpainting: Option<(Inpainting, String)>,
+    depth: Option<(network::Depth, String)>,
+}
+
+impl Networks {
+    fn open(request: &Request) -> Result<Self, Error> {
+        let Request { inpaint_model, depth_model, .. } = request;
+        Ok(Self {
+            inpainting: inpaint_model
+                .as_ref()
+                .map(|path| Ok::<_, Error>((Inpainting::open(path)?, record::hash(path)?)))
+                .transpose()?,
+            depth: depth_model
+                .as_ref()
+                .map(|path| Ok::<_, Error>((network::Depth::open(path)?, record::hash(path)?)))
+                .transpose()?,
+        })
+    }
+
+    /// What of them counts as input of a step.
+    fn inputs(&self, inputs: Inputs, inpainting: bool) -> Inputs {
+        let inputs = self.depth.iter().fold(inputs, |inputs, (_, hash)| inputs.with("depth").with(hash));
+        let inpainting = self.inpainting.iter().filter(|_| inpainting);
+        inpainting.fold(inputs, |inputs, (_, hash)| inputs.with("inpainting").with(hash))
+    }
 }
 
 impl Preparation<'_> {
@@ -603,6 +669,13 @@ impl Preparation<'_> {
         Ok(false)
     }
 
+    /// What the priors that were made are.
+    fn kind(&self) -> PriorKind {
+        let files = self.folder.record().steps.get(Step::Depth.name()).map(|step| &step.files);
+        let disparity = files.is_some_and(|files| files.keys().any(|path| path.starts_with("disparity/")));
+        if disparity { PriorKind::Disparity } else { PriorKind::Depth }
+    }
+
     /// Takes away the priors that were made before.
     fn no_depth(&mut self) -> Result<(), Error> {
         if self.folder.record().steps.get(Step::Depth.name()).is_some_and(|step| !step.files.is_empty()) {
@@ -616,12 +689,18 @@ impl Preparation<'_> {
             self.watch.say("depth: the scene has priors of its own, none are made");
             return Ok(());
         }
-        let inputs = self.inputs_behind_masks(masks).finish();
+        let inputs = self.networks.inputs(self.inputs_behind_masks(masks), false).finish();
         if self.skips(Step::Depth, &inputs) {
             return Ok(());
         }
         self.watch.begin(Step::Depth, 2 * scene.train.len() as u64);
-        let batch = depth::make(scene, splats, masks, self.watch)?;
+        let batch = match &self.networks.depth {
+            Some((network, _)) => {
+                let files = scene::pictures(&self.folder.root().join(poses::IMAGES))?;
+                depth::by_network(scene, network, &files, self.watch)?
+            }
+            None => depth::make(scene, splats, masks, self.watch)?,
+        };
         self.write(Step::Depth, inputs, batch)?;
         self.watch.end();
         Ok(())
@@ -629,7 +708,8 @@ impl Preparation<'_> {
 
     fn reference(&mut self, scene: &Scene, fit: &Fit, splats: &mut Splats, masks: &[GrayImage]) -> Result<(), Error> {
         let named = self.request.reference.clone().unwrap_or_default();
-        let inputs = self.inputs_behind_masks(masks).with(named).with([u8::from(self.depth)]).finish();
+        let inputs = self.inputs_behind_masks(masks).with(named).with([u8::from(self.depth)]);
+        let inputs = self.networks.inputs(inputs, true).finish();
         if self.skips(Step::Reference, &inputs) {
             return Ok(());
         }
@@ -642,6 +722,8 @@ impl Preparation<'_> {
             masks,
             named: self.request.reference.as_deref(),
             depth: self.depth,
+            inpainting: self.networks.inpainting.as_ref().map(|(network, _)| network),
+            depth_network: self.networks.depth.as_ref().map(|(network, _)| (network, self.kind())),
             seed: self.request.seed,
         };
         let batch = reference::make(&task, fit, splats, self.watch)?;

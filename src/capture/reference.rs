@@ -14,11 +14,12 @@ use rayon::prelude::*;
 use super::depth::{self, DepthMap, Witness};
 use super::fit::Fit;
 use super::masks::{self, Shares, Votes};
+use super::network::{self, Inpainting};
 use super::patchmatch::{self, Canvas};
 use super::record::Batch;
 use super::splats::Splats;
 use super::{Error, Watch};
-use crate::scene::{self, Camera, Scene, resample};
+use crate::scene::{self, Camera, PriorKind, Scene, resample};
 
 /// The longer side of the photographs that the hole is filled from, pixels; larger ones are reduced, and the filling is
 /// brought to their size.
@@ -43,6 +44,9 @@ const AWAY: f32 = 0.002;
 /// Photographs agree on a pixel if no channel of their means over 3 x 3 pixels differs by more.
 const SAME: f32 = 0.09;
 
+/// Where each pixel of the reference is from, below the scene's folder.
+pub const PROVENANCE: &str = "prepare/provenance.png";
+
 /// What a reference is made from.
 pub struct Task<'a> {
     /// The scene at the fit's size.
@@ -57,6 +61,10 @@ pub struct Task<'a> {
     pub named: Option<&'a str>,
     /// Whether its depth is written.
     pub depth: bool,
+    /// What fills the pixels that nobody saw, in place of PatchMatch.
+    pub inpainting: Option<&'a Inpainting>,
+    /// What tells its depth, in place of the fit, and what it tells.
+    pub depth_network: Option<(&'a network::Depth, PriorKind)>,
     /// Of every random choice.
     pub seed: u64,
 }
@@ -327,7 +335,16 @@ fn fill(
     }
     membrane(&mut disparity, [w, h], |_| true);
     watch.at(2 * task.scene.train.len() as u64 + 3);
-    inpaint(&mut rgb, &guessed, hole.as_raw(), &disparity, [w, h], task.seed);
+    let guesser = match task.inpainting {
+        Some(network) => {
+            network.fill(&mut rgb, &guessed, [w, h])?;
+            "the inpainting network"
+        }
+        None => {
+            inpaint(&mut rgb, &guessed, hole.as_raw(), &disparity, [w, h], task.seed);
+            "PatchMatch"
+        }
+    };
 
     // At the photograph's own size.
     let files = scene::pictures(&task.root.join(super::poses::IMAGES))?;
@@ -358,14 +375,18 @@ fn fill(
     batch.rgb(
         format!("reference/{name}.png"),
         &picture,
-        "the photograph; in the hole the colours that two or more other photographs agree on, and PatchMatch where none does",
+        format!("the photograph; in the hole the colours that two or more other photographs agree on, and {guesser}'s where none does"),
     );
     batch.rgb(
-        "prepare/provenance.png",
+        PROVENANCE,
         &provenance,
-        "black: the reference's own photograph; green: seen in two or more others; red: seen by none, PatchMatch's guess",
+        format!("black: the reference's own photograph; green: seen in two or more others; red: seen by none, {guesser}'s guess"),
     );
-    if task.depth {
+    if let Some((network, kind)) = task.depth_network.filter(|_| task.depth) {
+        let (values, size) = depth::proportioned(network.of(&picture)?, full);
+        let from = format!("{}, of the reference picture", network.path().display());
+        batch.npy(format!("reference/{name}_{}.npy", depth::word(kind)), size, values, from);
+    } else if task.depth {
         let inverse = |i: usize| {
             let [u, v] = [i as u32 % coarse[0], i as u32 / coarse[0]];
             let [x, y] = [(u * size[0] + size[0] / 2) / coarse[0], (v * size[1] + size[1] / 2) / coarse[1]];

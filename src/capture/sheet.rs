@@ -25,8 +25,10 @@ pub struct Sheet {
     pub names: Vec<String>,
 }
 
-/// Draws the sheet of a scene: masks are tinted red with a yellow border; the reference picture comes last.
-pub fn draw(scene: &Scene) -> Sheet {
+/// Draws the sheet of a scene: masks are tinted red with a yellow border; the reference picture comes last, and behind it,
+/// where `prepare` has noted it (`provenance`, as large as the photograph), what other views see of its hole (green) and what
+/// none does (red).
+pub fn draw(scene: &Scene, provenance: Option<&RgbImage>) -> Sheet {
     let tallest = scene.train.iter().map(|view| view.camera.size).map(|[w, h]| f64::from(h) / f64::from(w));
     let height = (f64::from(WIDTH) * tallest.fold(0.1, f64::max)).round().max(1.0) as u32;
     let cell = [WIDTH, height];
@@ -56,7 +58,16 @@ pub fn draw(scene: &Scene) -> Sheet {
         let view = &scene.train[reference.view];
         let [w, h] = view.camera.size;
         let to = [WIDTH, ((u64::from(WIDTH) * u64::from(h) / u64::from(w)).max(1) as u32).min(height)];
-        cells.push((format!("{} (reference)", view.name), resample::photograph(&reference.image, to)));
+        let small = resample::photograph(&reference.image, to);
+        let map = provenance.map(|map| {
+            let map = image::imageops::resize(map, to[0], to[1], image::imageops::FilterType::Nearest);
+            RgbImage::from_fn(to[0], to[1], |x, y| match map.get_pixel(x, y).0 {
+                [0, 0, 0] => Rgb(small.get_pixel(x, y).0.map(|v| v / 3)),
+                hole => Rgb(hole),
+            })
+        });
+        cells.push((format!("{} (reference)", view.name), small));
+        cells.extend(map.map(|map| (format!("{} (green: seen by others, red: by none)", view.name), map)));
     }
     let columns = COLUMNS.min(cells.len() as u32).max(1);
     let rows = (cells.len() as u32).div_ceil(columns);

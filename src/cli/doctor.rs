@@ -6,12 +6,13 @@ use atomic_write_file::AtomicWriteFile;
 
 use super::{next, pictures};
 use crate::capture::doctor::{self, Report, Severity};
+use crate::capture::reference::PROVENANCE;
 use crate::capture::sheet;
 
 /// Look over a scene before training: masks, names, sizes, depth, reference, exposure
 ///
 /// Problems and notes go to stdout, the worst first. A contact sheet of all views with their masks, as PNG and as a page,
-/// goes into the folder that --sheet names.
+/// goes into the folder that --sheet names; of a scene that prepare made it shows what no view sees of the hole.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   gscream-vk doctor scene
@@ -43,7 +44,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         print!("{}", text(&report));
     }
     if let (Some(folder), Some(scene)) = (&args.sheet, &scene) {
-        let sheet = sheet::draw(scene);
+        // A picture that is not there, or not readable, leaves its cell out.
+        let provenance = image::open(args.scene.join(PROVENANCE)).ok().map(image::DynamicImage::into_rgb8);
+        let sheet = sheet::draw(scene, provenance.as_ref());
         let rgb: Vec<[f32; 3]> = sheet.picture.pixels().map(|p| p.0.map(|v| f32::from(v) / 255.0)).collect();
         pictures::write_png(&folder.join(sheet::PICTURE), [sheet.picture.width(), sheet.picture.height()], &rgb)?;
         let page = folder.join(sheet::PAGE);

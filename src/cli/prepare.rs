@@ -40,6 +40,8 @@ pub(super) struct Args {
     #[arg(long = "box", value_name = "NAME=x0,y0,x1,y1", value_parser = bounds)]
     bounds: Vec<(String, Evidence)>,
     /// Picture of strokes on one view: white or green on the object, black or red beside it, else grey or transparent
+    ///
+    /// With a --box of the same view they count within it alone: for one leaf of many.
     #[arg(long, value_name = "NAME=FILE", value_parser = strokes)]
     strokes: Vec<(String, Evidence)>,
     /// View to become the reference [default: the one whose hole is seen best by others]
@@ -53,6 +55,18 @@ pub(super) struct Args {
     /// A scene that has priors of its own in depth/ or disparity/ keeps those alone.
     #[arg(long)]
     no_depth: bool,
+    /// Network that fills what no photograph shows, instead of PatchMatch: LaMa as ONNX file
+    ///
+    /// It takes the picture [1, 3, H, W], RGB from 0 to 1, and the hole [1, 1, H, W], 1 in it, and gives the picture, from 0
+    /// to 1 or to 255. H and W are the file's, or 512.
+    #[arg(long, value_name = "FILE")]
+    inpaint_model: Option<PathBuf>,
+    /// Network whose maps become the depth priors, instead of the fit's own depth: Depth Anything V2 and others as ONNX file
+    ///
+    /// It takes the picture [1, 3, H, W] with ImageNet's mean and deviation and gives [1, H, W]. H and W are the file's, or
+    /// 518 for the shorter side. Depth or disparity: what the sparse points follow.
+    #[arg(long, value_name = "FILE", conflicts_with = "no_depth")]
+    depth_model: Option<PathBuf>,
     /// Steps of the fit
     #[arg(long, value_name = "N", default_value_t = 600, value_parser = clap::value_parser!(u32).range(1..))]
     fit_steps: u32,
@@ -105,6 +119,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         reference: args.reference.clone(),
         only: args.only.clone(),
         depth: !args.no_depth,
+        inpaint_model: args.inpaint_model.clone(),
+        depth_model: args.depth_model.clone(),
         fit_steps: args.fit_steps,
         fit_side: args.fit_side,
         seed: args.seed.into(),

@@ -37,6 +37,9 @@ pub struct Lens {
     pub size: [u32; 2],
 }
 
+/// Lenses by COLMAP's camera id.
+pub type Lenses = BTreeMap<u32, Lens>;
+
 /// A registered photograph.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Image {
@@ -168,12 +171,12 @@ pub fn read(scene: &Path) -> Result<Model, Error> {
 ///
 /// # Errors
 /// As [`read`], points apart; a camera model that not even its name is known of.
-pub fn lenses(scene: &Path) -> Result<(BTreeMap<u32, Lens>, Vec<Image>), Error> {
+pub fn lenses(scene: &Path) -> Result<(Lenses, Vec<Image>), Error> {
     cameras_and_images(scene, READ).map(|(_, cameras, images)| (cameras, images))
 }
 
 /// The model's folder, its cameras, which must be of the first `models`, and its photographs.
-fn cameras_and_images(scene: &Path, models: usize) -> Result<(PathBuf, BTreeMap<u32, Lens>, Vec<Image>), Error> {
+fn cameras_and_images(scene: &Path, models: usize) -> Result<(PathBuf, Lenses, Vec<Image>), Error> {
     let folders = [scene.join("sparse/0"), scene.join("sparse")];
     let has = |folder: &Path, extension: &str| {
         ["cameras", "images"].iter().all(|stem| folder.join(stem).with_extension(extension).is_file())
@@ -279,7 +282,7 @@ fn checked_size(width: u64, height: u64) -> Option<[u32; 2]> {
     Some([u32::try_from(width).ok()?, u32::try_from(height).ok()?])
 }
 
-fn binary_cameras(path: &Path, models: usize) -> Result<BTreeMap<u32, Lens>, Error> {
+fn binary_cameras(path: &Path, models: usize) -> Result<Lenses, Error> {
     let mut file = Binary::open(path)?;
     let count = file.u64(&|| "the number of cameras".into())?;
     let mut cameras = BTreeMap::new();
@@ -415,7 +418,7 @@ impl<'a> Fields<'a> {
     }
 }
 
-fn text_cameras(path: &Path, models: usize) -> Result<BTreeMap<u32, Lens>, Error> {
+fn text_cameras(path: &Path, models: usize) -> Result<Lenses, Error> {
     let text = read_text(path)?;
     let mut cameras = BTreeMap::new();
     for (line, rest) in lines(&text, false) {

@@ -428,7 +428,7 @@ mod tests {
         let answers: Vec<_> = visitors.into_iter().map(|visitor| visitor.join().unwrap()).collect();
         let whole = |answer: &&Result<Vec<u8>, Refusal>| answer.as_ref().is_ok_and(|b| b.starts_with(&[0xff, 0xd8]));
         assert_eq!(answers.iter().filter(whole).count(), 2);
-        assert!(answers.iter().any(|answer| *answer == Err(Refusal::Gone)));
+        assert!(answers.contains(&Err(Refusal::Gone)));
         assert_eq!(board.get("/picture.jpg", QUERY).unwrap_err(), Refusal::Gone);
     }
 
