@@ -102,7 +102,7 @@ fn what_is_absent_has_no_pass_and_no_buffer() {
         assert_eq!((plan.masks, plan.depth, plan.depth_gradient), (wanted.masks, wanted.priors, wanted.priors));
         assert_eq!(plan.attention, wanted.attention && wanted.masks, "{wanted:?}");
         assert_eq!(
-            (plan.growth, plan.references),
+            (plan.growth, plan.references.clone()),
             (wanted.growth, Vec::from_iter(wanted.reference.then_some(3))),
             "{wanted:?}"
         );

@@ -122,7 +122,7 @@ fn show(address: SocketAddr, name: &str, scene: &Scene, settings: &Settings) -> 
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
-    let began = Some(Instant::now());
+    let began = Instant::now();
     let given = |scene: &PathBuf| SceneArgs { scene: scene.clone(), settings: args.settings.clone() };
     let given = args.scene.as_ref().map(given);
     let (scene, settings, name, folder, begun) = if let Some(folder) = &args.resume {
@@ -159,13 +159,11 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     eprintln!("doctor: {}", looked.verdict());
     let options = Options { timestamps: args.profile, ..args.device.options() };
     let settings = match args.minutes {
-        Some(time) => {
-            with_gpu(&options, |gpu| minutes::fitted(gpu, &scene, &settings, time, began.unwrap_or_else(Instant::now)))?
-        }
+        Some(time) => with_gpu(&options, |gpu| minutes::fitted(gpu, &scene, &settings, time, began))?,
         None => settings,
     };
     let board = args.view.map(|address| show(address, &name, &scene, &settings)).transpose()?;
-    let manner = Manner { began, board };
+    let manner = Manner { began: Some(began), board };
     with_gpu(&options, |gpu| {
         eprintln!("device: {} ({})", gpu.info().name, gpu.info().driver);
         let Trained { summary, report, mut written } = if begun {

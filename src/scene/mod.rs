@@ -432,7 +432,8 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
         notes.push(format!("{file} is not used: without masks there is no hole to fill"));
         references.clear();
     }
-    if !references.is_empty() && !(config.masks && config.reference) {
+    let wanted = config.masks && config.reference;
+    if !wanted && !references.is_empty() {
         references.clear();
         notes.push("the reference view is ignored, as configured".into());
     }
