@@ -112,7 +112,7 @@ impl Settings {
     }
 
     /// These settings for a run of so many steps: what starts and ends at a step keeps its place in the run. Rounds of
-    /// growing come as often as before or more, but not below [`SHORTEST_ROUND`] steps, so that each has something to go
+    /// growing come as often as before or more, but not below `SHORTEST_ROUND` steps, so that each has something to go
     /// by. Nothing is evaluated or saved on the way.
     pub fn rescheduled(&self, iterations: u32) -> Self {
         let mut new = self.clone();
