@@ -642,7 +642,7 @@ fn contradictions_are_refused() {
     masks/a.png: not a readable picture: Format error decoding Png: Invalid PNG signature.
     SCENE: depth/ and disparity/ are both there; keep the one to train with
     SCENE: no pictures in images/; put the photographs (.jpg or .png) there, or make a scene of them: gscream-vk prepare SCENE --out SCENE
-    SCENE: no COLMAP model; sparse/0/ (or sparse/) must hold cameras and images, both .bin or both .txt; gscream-vk prepare SCENE/images --out SCENE makes one, where colmap is installed
+    SCENE: no COLMAP model; sparse/0/ (or sparse/) must hold cameras and images, both .bin or both .txt; gscream-vk prepare images --out SCENE makes one, where colmap is installed
     SCENE: none of the 4 pictures is in the model (pictures like a, model images like p.jpg); the names must agree up to the extension
     reference/b.png: the model has no pose for the view of this inpainted picture
     sparse/0: the model has no points, and the Gaussians are built around them; export points3D.bin, .txt or .ply
