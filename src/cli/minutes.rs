@@ -10,7 +10,7 @@ use crate::scene::Scene;
 use crate::train::run::Run;
 
 /// Steps that are timed at each size of the pictures, behind as many that only make room and compile.
-const TIMED: u32 = 10;
+const TIMED: u32 = 5;
 /// Part of the steps that smaller pictures take where the settings do not say.
 const COARSE: f64 = 0.4;
 /// A step of the whole run takes so much longer than one of the first: Gaussians become more. Between 1.2 and 1.5 was seen

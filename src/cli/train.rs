@@ -158,13 +158,13 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let looked = doctor::look(&scene);
     eprintln!("doctor: {}", looked.verdict());
     let options = Options { timestamps: args.profile, ..args.device.options() };
-    let settings = match args.minutes {
-        Some(time) => with_gpu(&options, |gpu| minutes::fitted(gpu, &scene, &settings, time, began))?,
-        None => settings,
-    };
-    let board = args.view.map(|address| show(address, &name, &scene, &settings)).transpose()?;
-    let manner = Manner { began: Some(began), board };
     with_gpu(&options, |gpu| {
+        let settings = match args.minutes {
+            Some(time) => minutes::fitted(gpu, &scene, &settings, time, began)?,
+            None => settings,
+        };
+        let board = args.view.map(|address| show(address, &name, &scene, &settings)).transpose()?;
+        let manner = Manner { began: Some(began), board };
         eprintln!("device: {} ({})", gpu.info().name, gpu.info().driver);
         let Trained { summary, report, mut written } = if begun {
             resume(gpu, &scene, &settings, &name, &folder, &manner)?

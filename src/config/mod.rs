@@ -113,7 +113,7 @@ impl Settings {
 
     /// These settings for a run of so many steps: what starts and ends at a step keeps its place in the run. Rounds of
     /// growing come as often as before or more, but not below `SHORTEST_ROUND` steps, so that each has something to go
-    /// by. Nothing is evaluated or saved on the way.
+    /// by. Fewer steps take larger learning rates. Nothing is evaluated or saved on the way.
     pub fn rescheduled(&self, iterations: u32) -> Self {
         let mut new = self.clone();
         let share = f64::from(iterations) / f64::from(self.train.iterations);
@@ -122,6 +122,19 @@ impl Settings {
         new.train.coarse.until = at(self.train.coarse.until);
         (new.train.eval_interval, new.train.save_interval) = (0, 0);
         new.optimizer.schedule_length = at(self.optimizer.schedule_length);
+        let rates = &mut new.optimizer.learning_rate;
+        let all = [
+            &mut rates.offset,
+            &mut rates.feature,
+            &mut rates.log_scaling,
+            &mut rates.mlp_opacity,
+            &mut rates.mlp_cov,
+            &mut rates.mlp_color,
+            &mut rates.attention,
+        ];
+        for rate in all.into_iter().flatten() {
+            *rate *= share.powf(-RATE_EXPONENT);
+        }
         new.model.attention.start = at(self.model.attention.start);
         let (old, densify) = (&self.densify, &mut new.densify);
         densify.every = at(old.every).clamp(SHORTEST_ROUND.min(old.every), old.every.max(SHORTEST_ROUND));
@@ -142,6 +155,10 @@ impl Settings {
 
 /// Fewest steps between two rounds of growing in a run that [`Settings::rescheduled`] has shortened.
 const SHORTEST_ROUND: u32 = 25;
+
+/// Learning rates go with the number of steps to minus this power. On spin-1 without masks 600 steps gain 0.4, 0.7 and 0.9
+/// dB with 2, 3 and 5 times the paper's rates, which are for 30,000.
+const RATE_EXPONENT: f64 = 0.4;
 
 /// `Err` naming `key` and `value` unless the condition holds; `reason` completes "is VALUE, but ...".
 pub fn ensure(

@@ -18,6 +18,11 @@ pub struct Config {
     pub voxel_factor: f64,
     /// Gaussians per anchor (Scaffold-GS: 10).
     pub offsets: u32,
+    /// The first three features of an anchor begin as the mean colour of its points, from -1 to 1 times this; 0: all
+    /// features begin as 0 (Scaffold-GS).
+    pub color_features: f64,
+    /// Offsets begin uniformly in +- this, in units of the anchor's scaling; 0: all begin as 0 (Scaffold-GS).
+    pub spread: f64,
     /// Bidirectional cross-attention between anchors inside and around the mask.
     pub attention: Attention,
 }
@@ -45,7 +50,15 @@ pub struct Attention {
 
 impl Default for Config {
     fn default() -> Self {
-        Self { voxel: 0.001, voxel_pixels: 0.0, voxel_factor: 1.0, offsets: 10, attention: Attention::default() }
+        Self {
+            voxel: 0.001,
+            voxel_pixels: 0.0,
+            voxel_factor: 1.0,
+            offsets: 10,
+            color_features: 0.0,
+            spread: 0.0,
+            attention: Attention::default(),
+        }
     }
 }
 
@@ -64,6 +77,9 @@ impl Config {
         let factor = self.voxel_factor;
         ensure(factor.is_finite() && factor > 0.0, "voxel_factor", factor, "must be positive")?;
         ensure((1..=32).contains(&self.offsets), "offsets", self.offsets, "must be between 1 and 32")?;
+        let gain = self.color_features;
+        ensure((0.0..=100.0).contains(&gain), "color_features", gain, "must be between 0 and 100")?;
+        ensure((0.0..=10.0).contains(&self.spread), "spread", self.spread, "must be between 0 and 10")?;
         let attention = &self.attention;
         ensure(attention.patch > 0, "attention.patch", attention.patch, "must be at least 1 pixel")?;
         ensure(

@@ -7,6 +7,8 @@ use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rand::distr::{Distribution, Uniform};
 use rand_pcg::Pcg64;
 
+use crate::scene::Point;
+
 use super::files::{ATTENTION_WIDTH, Anchors, FEATURES, Tensor, Weights, weight_shapes};
 
 /// Why a model cannot start from these points.
@@ -69,7 +71,7 @@ pub fn anchors(points: &[[f32; 3]], voxel: f64, offsets_per_anchor: usize) -> Re
     let voxel = if voxel > 0.0 { voxel } else { median_nearest_distance(points).ok_or(Error::NoSpacing)? };
     let mut cells = Vec::with_capacity(points.len());
     for (index, &position) in points.iter().enumerate() {
-        let cell = position.map(|v| (f64::from(v) / voxel).round_ties_even());
+        let cell = cell(position, voxel);
         if cell.iter().any(|v| v.abs() > f64::from(i32::MAX)) {
             return Err(Error::TooFar { index, position, voxel });
         }
@@ -91,12 +93,49 @@ pub fn anchors(points: &[[f32; 3]], voxel: f64, offsets_per_anchor: usize) -> Re
 
 /// Anchors for these points at the voxel that the settings name, or at the one derived from the points times its factor.
 ///
+/// The first three features are the mean colour of the anchor's points, from -1 to 1 times `color_features`; the offsets
+/// are uniform in +-`spread`, drawn from `seed`. Both settings are 0 for Scaffold-GS's zeros.
+///
 /// # Errors
 /// As [`anchors`].
-pub fn from_points(points: &[[f32; 3]], config: &super::Config) -> Result<Initial, Error> {
-    let derived = || median_nearest_distance(points).map_or(0.0, |d| d * config.voxel_factor);
+pub fn from_points(points: &[Point], config: &super::Config, seed: u64) -> Result<Initial, Error> {
+    let positions: Vec<[f32; 3]> = points.iter().map(|p| p.position).collect();
+    let derived = || median_nearest_distance(&positions).map_or(0.0, |d| d * config.voxel_factor);
     let voxel = if config.voxel > 0.0 { config.voxel } else { derived() };
-    anchors(points, voxel, config.offsets as usize)
+    let mut initial = anchors(&positions, voxel, config.offsets as usize)?;
+    if config.color_features > 0.0 {
+        let feature = &mut initial.anchors.feature;
+        for (feature, color) in feature.iter_mut().zip(mean_colors(points, voxel)) {
+            for (feature, color) in feature.iter_mut().zip(color) {
+                *feature = (config.color_features * (color / 127.5 - 1.0)) as f32;
+            }
+        }
+    }
+    if config.spread > 0.0 {
+        let mut generator = Pcg64::new(u128::from(seed), OFFSETS_STREAM);
+        let spread = config.spread as f32;
+        let uniform = Uniform::new_inclusive(-spread, spread).expect("the bound is positive and finite");
+        initial.anchors.offset.fill_with(|| uniform.sample(&mut generator));
+    }
+    Ok(initial)
+}
+
+/// Mean 8-bit RGB of the points in each occupied cell, in the order of [`anchors`].
+fn mean_colors(points: &[Point], voxel: f64) -> impl Iterator<Item = [f64; 3]> {
+    let mut cells = BTreeMap::<[i64; 3], ([u64; 3], u64)>::new();
+    for point in points {
+        let (sum, count) = cells.entry(cell(point.position, voxel).map(|v| v as i64)).or_default();
+        for (sum, color) in sum.iter_mut().zip(point.color) {
+            *sum += u64::from(color);
+        }
+        *count += 1;
+    }
+    cells.into_values().map(|(sum, count)| sum.map(|v| v as f64 / count as f64))
+}
+
+/// The cell of the grid that a position is snapped to.
+fn cell(position: [f32; 3], voxel: f64) -> [f64; 3] {
+    position.map(|v| (f64::from(v) / voxel).round_ties_even())
 }
 
 /// Mean distance of each position to its three nearest neighbours, or to as many as there are; at least `floor`.
@@ -148,6 +187,8 @@ fn nearest_distances(positions: &[[f32; 3]], count: usize) -> Vec<Vec<f64>> {
 
 /// Stream of the generator that draws initial weights, apart from the streams of other random choices of the same seed.
 const WEIGHTS_STREAM: u128 = 0x6465_636f_6465_7273;
+/// The same for initial offsets.
+const OFFSETS_STREAM: u128 = 0x6f66_6673_6574_7300;
 
 /// Networks in PyTorch's default initialisation of `Linear`: weights and biases uniform in
 /// +-1/sqrt(fan in). Decoders first, so that they are the same with and without attention.
@@ -235,6 +276,29 @@ mod tests {
         let mut doubled: Vec<_> = points.iter().rev().copied().collect();
         doubled.extend(points);
         assert_eq!(anchors(&doubled, 0.5, 1).expect("points"), initial);
+    }
+
+    #[test]
+    fn features_begin_as_the_mean_colour_of_a_cells_points_and_offsets_within_the_spread() {
+        let point = |position, color| Point { position, color };
+        let points = [
+            point([0.1, 0.0, 0.0], [255, 0, 51]),
+            point([9.0, 0.0, 0.0], [0, 255, 0]),
+            point([-0.1, 0.0, 0.0], [0, 0, 204]),
+        ];
+        let config = crate::model::Config { voxel: 1.0, color_features: 2.0, spread: 0.25, ..Default::default() };
+        let made = |points: &[Point], seed| from_points(points, &config, seed).expect("points").anchors;
+        let anchors = made(&points, 1);
+        assert_eq!(anchors.feature[0][..4], [0.0, -2.0, 0.0, 0.0]);
+        assert_eq!(anchors.feature[1][..4], [-2.0, 2.0, -2.0, 0.0]);
+        assert!(anchors.offset.iter().all(|v| v.abs() <= 0.25));
+        assert!(anchors.offset.iter().any(|v| *v > 0.15) && anchors.offset.iter().any(|v| *v < -0.15));
+        let backwards: Vec<Point> = points.iter().rev().cloned().collect();
+        assert_eq!(made(&backwards, 1), anchors, "the order of the points does not matter");
+        assert_ne!(made(&points, 2).offset, anchors.offset, "another seed, other offsets");
+        let plain = from_points(&points, &crate::model::Config { voxel: 1.0, ..Default::default() }, 1).expect("points");
+        let positions: Vec<[f32; 3]> = points.iter().map(|p| p.position).collect();
+        assert_eq!(plain, super::anchors(&positions, 1.0, 10).expect("points"), "zeros unless asked for");
     }
 
     #[test]

@@ -62,8 +62,7 @@ impl Survey {
 /// # Errors
 /// Points that make no anchor.
 pub fn initial(scene: &Scene, settings: &Settings) -> Result<Initial, init::Error> {
-    let points: Vec<[f32; 3]> = scene.points.iter().map(|p| p.position).collect();
-    init::from_points(&points, &settings.fitted(scene).model)
+    init::from_points(&scene.points, &settings.fitted(scene).model, settings.train.seed)
 }
 
 /// Most cameras that a survey looks through: it comes before the first step, and what they miss the margin of

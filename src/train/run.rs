@@ -359,9 +359,8 @@ const DEPTH: usize = 2;
 fn fresh(gpu: &Gpu, scene: &Scene, settings: &Settings) -> Result<Step, Error> {
     let settings = &settings.fitted(scene);
     let plan = Plan::new(scene, settings);
-    let points: Vec<[f32; 3]> = scene.points.iter().map(|p| p.position).collect();
     let offsets = settings.model.offsets as usize;
-    let initial = init::from_points(&points, &settings.model)?;
+    let initial = init::from_points(&scene.points, &settings.model, settings.train.seed)?;
     let weights = init::weights(settings.train.seed, offsets, plan.attention);
     Ok(Step::new(gpu, plan, settings, &initial.anchors, &weights, initial.voxel)?)
 }
