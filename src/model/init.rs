@@ -296,7 +296,8 @@ mod tests {
         let backwards: Vec<Point> = points.iter().rev().cloned().collect();
         assert_eq!(made(&backwards, 1), anchors, "the order of the points does not matter");
         assert_ne!(made(&points, 2).offset, anchors.offset, "another seed, other offsets");
-        let plain = from_points(&points, &crate::model::Config { voxel: 1.0, ..Default::default() }, 1).expect("points");
+        let plain =
+            from_points(&points, &crate::model::Config { voxel: 1.0, ..Default::default() }, 1).expect("points");
         let positions: Vec<[f32; 3]> = points.iter().map(|p| p.position).collect();
         assert_eq!(plain, super::anchors(&positions, 1.0, 10).expect("points"), "zeros unless asked for");
     }

@@ -1,4 +1,4 @@
-//! Depth priors on disk: `.npy`, `.exr` and `.png`, in any resolution with the picture's proportions.
+//! Depth priors, and how they stand on disk: `.npy`, `.exr` and `.png`, in any resolution with the picture's proportions.
 
 use std::path::Path;
 
@@ -6,7 +6,83 @@ use image::DynamicImage;
 use ndarray::ArrayD;
 use ndarray_npy::{ReadNpyError, ReadableElement, read_npy};
 
-use super::{Error, Prior, PriorKind, resample};
+use super::{Error, resample};
+
+/// What the values of a prior mean, up to an unknown positive scale and a shift.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PriorKind {
+    /// Grows with the distance z from the camera plane.
+    Depth,
+    /// Grows with 1 / z.
+    Disparity,
+}
+
+impl PriorKind {
+    pub(super) fn folder(self) -> &'static str {
+        match self {
+            PriorKind::Depth => "depth",
+            PriorKind::Disparity => "disparity",
+        }
+    }
+
+    pub(super) fn suffix(self) -> &'static str {
+        match self {
+            PriorKind::Depth => "_depth",
+            PriorKind::Disparity => "_disparity",
+        }
+    }
+
+    pub(super) fn other(self) -> PriorKind {
+        match self {
+            PriorKind::Depth => PriorKind::Disparity,
+            PriorKind::Disparity => PriorKind::Depth,
+        }
+    }
+}
+
+/// A monocular depth map, known up to scale and shift. Views of one scene may differ in kind.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Prior {
+    /// Depth or disparity.
+    pub kind: PriorKind,
+    /// [row-major pixel], height x width of its view; NaN where there is none.
+    pub values: Vec<f32>,
+}
+
+/// A prior's values in their own range, from the 2nd to the 98th hundredth of them, NaN where there is none: about 0 to
+/// 1, whatever its unit. The depth losses' weights mean that range; it is the unit of the priors that GScream's weights
+/// were chosen for, and of no other.
+pub fn in_own_range(values: &[f32]) -> Vec<f32> {
+    let mut sorted: Vec<f32> = values.iter().copied().filter(|v| v.is_finite()).collect();
+    if sorted.is_empty() {
+        return values.to_vec();
+    }
+    sorted.sort_unstable_by(f32::total_cmp);
+    let at = |share: f64| f64::from(sorted[((sorted.len() - 1) as f64 * share).round() as usize]);
+    let range = |low: f64, high: f64| (high > low).then_some((low, high - low));
+    // A map that is flat but for a few pixels still has a range.
+    let (low, width) = range(at(0.02), at(0.98)).or_else(|| range(at(0.0), at(1.0))).unwrap_or((at(0.0), 1.0));
+    values.iter().map(|v| ((f64::from(*v) - low) / width) as f32).collect()
+}
+
+impl Prior {
+    /// Whether some pixels have no value.
+    pub fn has_gaps(&self) -> bool {
+        self.values.iter().any(|v| v.is_nan())
+    }
+
+    /// See [`in_own_range`].
+    pub fn in_own_range(&self) -> Vec<f32> {
+        in_own_range(&self.values)
+    }
+
+    /// Whether it has one value only, or none.
+    pub(super) fn is_flat(&self) -> bool {
+        let mut values = self.values.iter().filter(|v| v.is_finite());
+        let first = values.next();
+        values.all(|v| Some(v) == first)
+    }
+}
 
 /// File extensions read here, lower case.
 pub(super) const EXTENSIONS: [&str; 3] = ["npy", "exr", "png"];

@@ -383,10 +383,25 @@ impl Step {
             .expect("the plan lists the sizes of all training pictures")
     }
 
-    /// Records step `step` (counted from 1) on a photograph.
-    pub fn record(&self, rec: &mut Recorder<'_>, photograph: &Photograph, step: u32, rates: Rates) {
-        let view = self.view(photograph, step);
-        let compared = (&photograph.camera, view.depth.is_some());
+    /// Records step `step` (counted from 1) on a photograph. With an `eye` the decoders are told that the anchors are seen
+    /// from there (world), and what lies inside the mask counts alone.
+    pub fn record(
+        &self,
+        rec: &mut Recorder<'_>,
+        photograph: &Photograph,
+        step: u32,
+        rates: Rates,
+        eye: Option<[f64; 3]>,
+    ) {
+        let mut view = self.view(photograph, step);
+        if eye.is_some() {
+            view.weights.outside = 0.0;
+            if let Some(depth) = &mut view.depth {
+                depth.weights.outside = 0.0;
+            }
+        }
+        let eye = eye.unwrap_or_else(|| photograph.camera.center());
+        let compared = (&photograph.camera, eye, view.depth.is_some());
         self.line(rec, compared, Some(photograph), step, rates, |rec, canvas| {
             let Canvas { picture, losses } = canvas;
             losses.forward_backward(rec, &view, &picture.rgb, picture.depth.as_ref())
@@ -402,7 +417,7 @@ impl Step {
         step: u32,
         rates: Rates,
     ) {
-        self.line(rec, (camera, depth.is_some()), None, step, rates, |rec, canvas| {
+        self.line(rec, (camera, camera.center(), depth.is_some()), None, step, rates, |rec, canvas| {
             let Canvas { picture, losses } = canvas;
             losses.compare(rec, depth, &picture.rgb, picture.depth.as_ref())
         });
@@ -447,7 +462,7 @@ impl Step {
     fn line<'s>(
         &'s self,
         rec: &mut Recorder<'_>,
-        (camera, depth): (&Camera, bool),
+        (camera, eye, depth): (&Camera, [f64; 3], bool),
         photograph: Option<&Photograph>,
         step: u32,
         rates: Rates,
@@ -483,7 +498,7 @@ impl Step {
             visible: &forward.visible.list,
         };
         rec.stage(stage::DECODE);
-        forward.decode.record(rec, model, &forward.visible.count, camera.center());
+        forward.decode.record(rec, model, &forward.visible.count, camera.center(), eye);
         rec.stage(stage::PROJECT);
         forward.project.record(rec, &forward.decode.existing, forward.gaussians(), camera, *near);
         rec.stage(stage::BIN);
