@@ -11,15 +11,13 @@ use crate::train::run::Run;
 
 /// Steps that are timed at each size of the pictures, behind as many that only make room and compile.
 const TIMED: u32 = 5;
-/// Part of the steps that smaller pictures take where the settings do not say.
-const COARSE: f64 = 0.4;
 /// A step of the whole run takes so much longer than one of the first: Gaussians become more. Between 1.2 and 1.5 was seen
 /// with the presets.
 const GROWTH: f64 = 1.35;
 
 /// The settings for a training that ends about `minutes` after `began`: their schedule fitted to as many steps as this
-/// device takes in that time, the first of them on smaller pictures. The steps are counted before training, so that a
-/// seed and the settings written down still make the same bytes.
+/// device takes in that time. The steps are counted before training, so that a seed and the settings written down still
+/// make the same bytes. Where the settings have smaller pictures first, these keep their share of the steps.
 ///
 /// # Errors
 /// When the device has no room; when the time is over before training begins.
@@ -30,16 +28,9 @@ pub(super) fn fitted(
     minutes: f64,
     began: Instant,
 ) -> anyhow::Result<Settings> {
-    let mut settings = settings.clone();
-    let iterations = settings.train.iterations;
-    if settings.train.coarse.until == 0 {
-        settings.train.coarse.until = (COARSE * f64::from(iterations)) as u32;
-    }
-    let coarse = settings.train.coarse.until.min(iterations);
+    let coarse = f64::from(settings.train.coarse.until) / f64::from(settings.train.iterations);
     let mut probe = settings.clone();
-    // Nothing that begins late is timed as if it ran from the start, and nothing is left out either: steps of both sizes
-    // are those behind the end of the smaller pictures and before it.
-    probe.train.coarse.until = TIMED * 2;
+    probe.train.coarse.until = if coarse > 0.0 { 2 * TIMED } else { 0 };
     let mut run = Run::new(gpu, scene, &probe)?;
     let mut timed = |first: u32| -> anyhow::Result<f64> {
         for step in first..first + TIMED {
@@ -51,23 +42,20 @@ pub(super) fn fitted(
         }
         Ok(start.elapsed().as_secs_f64() / f64::from(TIMED))
     };
-    let (small, full) = (timed(1)?, timed(1 + 2 * TIMED)?);
+    let first = timed(1)?;
+    let full = if coarse > 0.0 { timed(1 + 2 * TIMED)? } else { first };
     drop(run);
-    let share = f64::from(coarse) / f64::from(iterations);
-    let mean = GROWTH * (share * small + (1.0 - share) * full);
+    let mean = GROWTH * (coarse * first + (1.0 - coarse) * full);
     let left = Duration::from_secs_f64(60.0 * minutes).saturating_sub(began.elapsed()).as_secs_f64();
     let steps = (left / mean) as u32;
     ensure!(
         steps >= FEWEST,
-        "--minutes {minutes}: {:.0} s are left when training begins and a step takes about {mean:.2} s, which is too few \
-         steps: give more time, or --downscale the pictures",
-        left
+        "--minutes {minutes}: {left:.0} s are left when training begins and a step takes about {mean:.2} s, which is too \
+         few steps: give more time, or --downscale the pictures",
     );
     eprintln!(
-        "minutes: {steps} steps of about {:.0} ms fit into what is left of {minutes} min (--iterations {steps}), the first \
-         {:.0} % on smaller pictures",
-        1e3 * mean,
-        100.0 * share
+        "minutes: {steps} steps of about {:.0} ms fit into what is left of {minutes} min (--iterations {steps})",
+        1e3 * mean
     );
     Ok(settings.rescheduled(steps))
 }

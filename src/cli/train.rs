@@ -80,8 +80,8 @@ pub(super) struct Args {
     view: Option<SocketAddr>,
     /// Train for about so many minutes: the schedule is fitted to as many steps as this device takes in that time
     ///
-    /// The steps are counted before training begins, and the settings written down repeat the run to the byte. The first of
-    /// them see smaller pictures, and nothing is evaluated before the end.
+    /// The steps are counted before training begins, and the settings written down repeat the run to the byte. Learning
+    /// rates follow the number of steps, and nothing is evaluated before the end.
     #[arg(long, value_name = "N", conflicts_with_all = ["iterations", "resume", "resume_or_start"], value_parser = positive)]
     minutes: Option<f64>,
     /// Measure every pass: prints milliseconds per pass and writes trace.json (for chrome://tracing or Perfetto)

@@ -220,6 +220,13 @@ pub struct Prior<'a> {
     pub valid: Option<&'a Buffer<f32>>,
 }
 
+/// A fit that is given, `aligned = scale x + shift`, as [`Align::forward`] has them. It has no gradient: what the gradient
+/// through the fit is multiplied by is zero.
+pub fn fixed([scale, shift]: [f64; 2]) -> [f32; 11] {
+    let (scale, shift) = (scale as f32, shift as f32);
+    [scale, shift, 0.0, shift, scale, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]
+}
+
 /// The fit and its gradient.
 #[derive(Debug)]
 pub struct Align {
@@ -281,16 +288,17 @@ impl Align {
         fit
     }
 
-    /// Records the gradient by `rendered` \[pixel\] from that by the aligned values, directly and through the fit, of
-    /// what [`Align::forward`] fitted.
+    /// Records the gradient by `rendered` \[pixel\] from that by the aligned values, directly and through the fit: the one
+    /// that [`Align::forward`] returned, or a [`fixed`] one.
     pub fn backward(
         &self,
         rec: &mut Recorder<'_>,
         grad_aligned: &Buffer<f32>,
         rendered: &Buffer<f32>,
         prior: Prior<'_>,
+        fit: &Buffer<f32>,
     ) -> &Buffer<f32> {
-        let Self { pixels, partial, grad_sums, fit, grad_depth, .. } = self;
+        let Self { pixels, partial, grad_sums, grad_depth, .. } = self;
         let (pixels, near) = (*pixels, prior.quantity.near());
         let buffers = align_backward::Buffers { grad_aligned, rendered, fit, partial };
         rec.run(align_backward::Kernel, buffers, align_backward::Push { pixels, near }, threads(pixels));

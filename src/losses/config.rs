@@ -30,6 +30,10 @@ pub struct Depth {
     pub reference_inside_weight: f64,
     /// Where the added weight applies on the reference view.
     pub reference_inside_region: Region,
+    /// The reference's prior is brought to the scene's depth by the points of the model, once; `false` fits the rendered
+    /// depth to it in every step (GScream, equation 4). Rendered depth is nearer than the surface where something thin hangs
+    /// in front of it, and a fit hands that error on to the hole.
+    pub align_to_points: bool,
     /// L1 weight outside the mask on the other views.
     pub other_weight: f64,
     /// The multi-scale gradient of the depth difference.
@@ -74,6 +78,7 @@ impl Default for Depth {
             reference_weight: 1.0,
             reference_inside_weight: 99.0,
             reference_inside_region: Region::Mask,
+            align_to_points: true,
             other_weight: 0.1,
             gradient: DepthGradient::default(),
         }

@@ -89,6 +89,9 @@ pub struct DepthView<'a> {
     pub gradient_inside: bool,
     /// Whether the prior lacks pixels ([`NO_PRIOR`]); with masks only.
     pub gaps: bool,
+    /// What brings the rendered depth (or disparity) to the prior's values, [`align::fixed`]; without it that is fitted in
+    /// each step (GScream, equation 4).
+    pub fit: Option<&'a Buffer<f32>>,
 }
 
 /// Gradients of all losses by what was rendered.
@@ -179,7 +182,7 @@ impl Losses {
         let grad_depth = planned.map(|((Depth { align, l1, gradient }, depth), view)| {
             rec.stage(stage::DEPTH);
             let prior = align::Prior { values: view.prior, quantity: view.quantity, valid: frame.valid() };
-            let fit = align.forward(rec, depth, prior);
+            let fit = view.fit.unwrap_or_else(|| align.forward(rec, depth, prior));
             let weight =
                 frame.depth_weight().map_or(depth_l1::Weight::All(view.weights.outside), depth_l1::Weight::Each);
             let slot = Term::DepthL1 as u32;
@@ -191,7 +194,7 @@ impl Losses {
                 gradient.forward_backward(rec, difference, grad_aligned, valid, view.gradient, terms, slot);
                 rec.stage(stage::DEPTH);
             }
-            align.backward(rec, grad_aligned, depth, prior)
+            align.backward(rec, grad_aligned, depth, prior, fit)
         });
         Gradients { rgb: grad_rgb, depth: grad_depth }
     }
@@ -265,7 +268,7 @@ mod tests {
             let (difference, grad_aligned) = l1.forward_backward(&mut rec, &rendered, prior, fit, weight, &terms, 0);
             let mask = gradient_valid.then_some(&valid);
             gradient.forward_backward(&mut rec, difference, grad_aligned, mask, 0.5, &terms, 1);
-            let grad = align.backward(&mut rec, grad_aligned, &rendered, prior);
+            let grad = align.backward(&mut rec, grad_aligned, &rendered, prior, fit);
             finish(rec);
             let fit = gpu.read(fit).expect("read");
             let terms = gpu.read(&terms).expect("read");
@@ -472,6 +475,7 @@ mod tests {
                 let prior = gpu.upload("prior", &maps.prior).expect("upload");
                 let rectangle = Some(Rectangle { low: [1, 1], high: [20, 20], added: 99.0 });
                 let of_depth = DepthView {
+                    fit: None,
                     prior: &prior,
                     quantity: DISPARITY,
                     weights: Weights { outside: 1.0, inside: 1.0 },
@@ -483,6 +487,7 @@ mod tests {
                 let reference =
                     View { picture: &picture, weights: Weights { outside: 1.0, inside: 20.0 }, depth: Some(of_depth) };
                 let other_depth = DepthView {
+                    fit: None,
                     weights: Weights { outside: 0.1, inside: 0.0 },
                     rectangle: None,
                     gradient: 0.05,
@@ -528,6 +533,7 @@ mod tests {
                 picture: &picture,
                 weights: Weights { outside: 1.0, inside: 20.0 },
                 depth: Some(DepthView {
+                    fit: None,
                     prior: &prior,
                     quantity: Quantity::Depth,
                     weights: Weights { outside: 1.0, inside: 100.0 },
@@ -559,7 +565,7 @@ mod tests {
             let values = maps.prior.iter().map(|p| (scale * (f64::from(*p) + shift)) as f32).collect();
             let prior = crate::scene::Prior { kind: crate::scene::PriorKind::Depth, values };
             let maps = Maps {
-                prior: prior.in_own_range(),
+                prior: crate::scene::in_own_range(&prior.values),
                 rendered: maps.rendered.clone(),
                 size,
                 valid: maps.valid.clone(),

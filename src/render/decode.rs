@@ -688,18 +688,9 @@ impl Decode {
     }
 
     /// Records the decoding of the first `visible_count` anchors of the visible list for a camera centre (world).
-    /// More than the capacity are not decoded. `eye` is where the networks are told that the anchors are seen from: the
-    /// centre, but where training asks for what does not depend on it.
-    pub fn record(
-        &self,
-        rec: &mut Recorder<'_>,
-        anchors: Anchors<'_>,
-        visible_count: &Buffer<u32>,
-        center: [f64; 3],
-        eye: [f64; 3],
-    ) {
+    /// More than the capacity are not decoded.
+    pub fn record(&self, rec: &mut Recorder<'_>, anchors: Anchors<'_>, visible_count: &Buffer<u32>, center: [f64; 3]) {
         let [center, center_low] = split(center);
-        let [eye, eye_low] = split(eye);
         let (offsets, tile) = (self.layout.offsets as u32, self.tile);
         self.count(rec, visible_count);
         let Self { packed, inputs, hidden, positive, opacity, flags, slot_count, existing, segments, bound, .. } = self;
@@ -714,8 +705,7 @@ impl Decode {
             feature: anchors.feature,
             inputs,
         };
-        let push = decode_input::Push { center: eye, center_low: eye_low };
-        rec.run(decode_input::Kernel, buffers, push, &self.per_anchor);
+        rec.run(decode_input::Kernel, buffers, decode_input::Push { center, center_low }, &self.per_anchor);
         if self.lanes {
             let buffers = decode_hidden_lanes::Buffers { groups, packed, inputs, hidden, positive };
             rec.run(decode_hidden_lanes::Kernel, buffers, (), &self.per_hidden);
@@ -1310,7 +1300,7 @@ mod tests {
         };
         let step = || {
             let mut rec = gpu.recorder().expect(fine);
-            forward.record(&mut rec, anchors, &count, m.center, m.center);
+            forward.record(&mut rec, anchors, &count, m.center);
             backward.record(&mut rec, &forward, anchors, grad, to);
             rec.submit().and_then(crate::gpu::Submission::wait).expect("the device runs it")
         };

@@ -120,7 +120,7 @@ impl Forward {
             weights,
             visible: &self.visible.list,
         };
-        self.decode.record(rec, model, &self.visible.count, camera.center(), camera.center());
+        self.decode.record(rec, model, &self.visible.count, camera.center());
         self.project.record(rec, &self.decode.existing, self.gaussians(), camera, near);
         self.bin.record(rec, self.projected(), camera.size, limits)
     }

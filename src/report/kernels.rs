@@ -407,7 +407,7 @@ impl Bench {
             self.restore(gpu)?;
             let begun = Instant::now();
             let mut rec = recorder(gpu)?;
-            self.step.record(&mut rec, &self.photographs[view], self.number, self.rates, None);
+            self.step.record(&mut rec, &self.photographs[view], self.number, self.rates);
             let recorded = Instant::now();
             let submission = rec.submit()?;
             let taken = take(submission, [begun, recorded, Instant::now()])?;

@@ -42,7 +42,7 @@ use config::{NO_PRIOR, STEREO_PRIOR};
 pub use error::Error;
 pub(crate) use layout::stem;
 pub(crate) use priors::rank_correlation;
-pub use priors::{Prior, PriorKind, in_own_range};
+pub use priors::{Prior, PriorKind, in_own_range, own_range};
 
 /// A photograph at the training resolution and what is known about it.
 #[derive(Clone, Debug)]

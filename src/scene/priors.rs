@@ -53,27 +53,27 @@ pub struct Prior {
 /// 1, whatever its unit. The depth losses' weights mean that range; it is the unit of the priors that GScream's weights
 /// were chosen for, and of no other.
 pub fn in_own_range(values: &[f32]) -> Vec<f32> {
+    let [low, width] = own_range(values);
+    values.iter().map(|v| ((f64::from(*v) - low) / width) as f32).collect()
+}
+
+/// Where the range of [`in_own_range`] begins, and its width: 0 and 1 without a value.
+pub fn own_range(values: &[f32]) -> [f64; 2] {
     let mut sorted: Vec<f32> = values.iter().copied().filter(|v| v.is_finite()).collect();
     if sorted.is_empty() {
-        return values.to_vec();
+        return [0.0, 1.0];
     }
     sorted.sort_unstable_by(f32::total_cmp);
     let at = |share: f64| f64::from(sorted[((sorted.len() - 1) as f64 * share).round() as usize]);
-    let range = |low: f64, high: f64| (high > low).then_some((low, high - low));
+    let range = |low: f64, high: f64| (high > low).then_some([low, high - low]);
     // A map that is flat but for a few pixels still has a range.
-    let (low, width) = range(at(0.02), at(0.98)).or_else(|| range(at(0.0), at(1.0))).unwrap_or((at(0.0), 1.0));
-    values.iter().map(|v| ((f64::from(*v) - low) / width) as f32).collect()
+    range(at(0.02), at(0.98)).or_else(|| range(at(0.0), at(1.0))).unwrap_or([at(0.0), 1.0])
 }
 
 impl Prior {
     /// Whether some pixels have no value.
     pub fn has_gaps(&self) -> bool {
         self.values.iter().any(|v| v.is_nan())
-    }
-
-    /// See [`in_own_range`].
-    pub fn in_own_range(&self) -> Vec<f32> {
-        in_own_range(&self.values)
     }
 
     /// Whether it has one value only, or none.

@@ -15,10 +15,6 @@ pub struct Config {
     /// Share of the steps that see the reference view, evenly spread; 0 visits it as often as any other view (GScream).
     /// What only it shows is trained in its steps alone.
     pub reference_share: f64,
-    /// Share of the reference view's steps in which its hole alone counts, and the decoders are told that another training
-    /// camera looks at the anchors; 0 never does (GScream). What one view alone shows says nothing about how it looks from
-    /// elsewhere: so it is asked to look alike.
-    pub reference_eyes: f64,
     /// Colour behind the scene, RGB in \[0, 1\] (GScream: black).
     pub background: [f64; 3],
     /// Steps between two lines of the JSON log.
@@ -78,7 +74,6 @@ impl Default for Config {
             seed: 0,
             view_order: ViewOrder::Shuffled,
             reference_share: 0.18,
-            reference_eyes: 0.0,
             background: [0.0; 3],
             log_interval: 100,
             eval_interval: 5_000,
@@ -108,8 +103,6 @@ impl Config {
         )?;
         let share = self.reference_share;
         ensure((0.0..=0.9).contains(&share), "reference_share", share, "must be between 0 and 0.9")?;
-        let share = self.reference_eyes;
-        ensure((0.0..=1.0).contains(&share), "reference_eyes", share, "must be between 0 and 1")?;
         ensure(self.log_interval > 0, "log_interval", self.log_interval, "must be at least 1")?;
         let factor = self.coarse.factor;
         ensure((2..=16).contains(&factor), "coarse.factor", factor, "must be between 2 and 16")

@@ -259,7 +259,7 @@ pub fn rehearse(
             for &view in &kinds {
                 let mut rec = gpu.recorder()?;
                 let rates = Rates::at(settings, f64::from(scene.radius), number);
-                step.record(&mut rec, &photographs[view], number, rates, None);
+                step.record(&mut rec, &photographs[view], number, rates);
                 let submission = rec.submit()?;
                 schedules.insert((number, view), submission.schedule.clone());
                 submission.wait()?;

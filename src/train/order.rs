@@ -90,8 +90,6 @@ pub enum Stream {
     Rectangle = 3,
     /// Where a favourite view's steps lie.
     Favorite = 4,
-    /// From where the decoders are told that a reference's hole is seen, by step.
-    Eye = 5,
 }
 
 /// The generator of a stream at a round or step.

@@ -39,6 +39,8 @@ pub struct PriorMap {
     pub values: Buffer<f32>,
     /// Whether there is none somewhere.
     pub gaps: bool,
+    /// What brings the rendered depth to these values, where that is known: see [`losses::DepthView::fit`].
+    pub fit: Option<Buffer<f32>>,
 }
 
 /// One word per pixel.
@@ -85,11 +87,15 @@ pub fn upload(gpu: &Gpu, scene: &Scene, plan: &Plan, reduction: u32) -> Result<V
         let prior = match prior.filter(|_| plan.depth_losses(reference.is_some()).any()) {
             Some(prior) => {
                 let reduced = smaller.then(|| resample::map(&prior.values, full, size));
-                let mut values = reduced.map_or_else(|| prior.in_own_range(), |values| scene::in_own_range(&values));
+                let stored = reduced.as_ref().unwrap_or(&prior.values);
+                let mut values = scene::in_own_range(stored);
+                let line = reference.filter(|_| plan.align_to_points).and_then(|r| scene.depth_line(r));
+                let fit = line.map(|line| losses::align::fixed(inverse(line, scene::own_range(stored))));
+                let fit = fit.map(|fit| gpu.stage(stage::PICTURES, || gpu.upload("fit", &fit))).transpose()?;
                 let gaps = values.iter().any(|v| v.is_nan());
                 values.iter_mut().filter(|v| v.is_nan()).for_each(|v| *v = losses::NO_PRIOR);
                 let values = gpu.stage(stage::PICTURES, || gpu.upload("prior", &values))?;
-                Some(PriorMap { kind: prior.kind, values, gaps })
+                Some(PriorMap { kind: prior.kind, values, gaps, fit })
             }
             None => None,
         };
@@ -107,9 +113,25 @@ pub fn upload(gpu: &Gpu, scene: &Scene, plan: &Plan, reduction: u32) -> Result<V
     Ok(all)
 }
 
+/// `[scale, shift]` that take a depth (or disparity) `x = slope p + x0` of a prior's value p to that value in its own range,
+/// `(p - low) / width`.
+fn inverse([slope, x0]: [f64; 2], [low, width]: [f64; 2]) -> [f64; 2] {
+    [1.0 / (slope * width), -(x0 / slope + low) / width]
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_depth_comes_to_its_priors_value_in_the_priors_range() {
+        let (line, range) = ([2.5, -0.5], [0.25, 8.0]);
+        let [scale, shift] = inverse(line, range);
+        for p in [0.0, 0.25, 3.0] {
+            let depth = line[0] * p + line[1];
+            assert!((scale * depth + shift - (p - range[0]) / range[1]).abs() < 1e-12);
+        }
+    }
 
     #[test]
     fn packing_and_boxes() {

@@ -79,6 +79,8 @@ pub struct Plan {
     pub depth_gradient: bool,
     /// Losses that look at the reference view's depth.
     pub reference_depth: DepthLosses,
+    /// A reference's prior has its depth from the points, instead of being fitted in each step.
+    pub align_to_points: bool,
     /// Losses that look at the other views' depth.
     pub other_depth: DepthLosses,
     /// Cross-attention, from `model.attention.start` on.
@@ -238,6 +240,7 @@ impl Plan {
             depth,
             depth_gradient,
             reference_depth,
+            align_to_points: settings.losses.depth.align_to_points,
             other_depth,
             attention,
             growth: rounds.is_some(),

@@ -11,9 +11,8 @@ use atomic_write_file::AtomicWriteFile;
 use serde::Serialize;
 
 use super::checkpoint::{self, History, LastFigures, Model, Owner, State};
-use rand::RngExt as _;
 
-use super::order::{Order, Stream, random};
+use super::order::Order;
 use super::photographs::{self, Photograph};
 use super::plan::Plan;
 use super::step::{Rates, Step};
@@ -513,19 +512,7 @@ impl<'a> Run<'a> {
 
     fn record_view(&self, rec: &mut gpu::Recorder<'_>, step: u32, view: usize) {
         let rates = Rates::at(self.settings, f64::from(self.scene.radius), step);
-        self.step.record(rec, &self.photographs[view], step, rates, self.eye(step, view));
-    }
-
-    /// Where the decoders are told that the camera is, if that is not where the view's camera is
-    /// ([`crate::train::Config::reference_eyes`]).
-    fn eye(&self, step: u32, view: usize) -> Option<[f64; 3]> {
-        let config = &self.settings.train;
-        if !self.photographs[view].reference || config.reference_eyes == 0.0 || self.photographs.len() < 2 {
-            return None;
-        }
-        let mut rng = random(config.seed, Stream::Eye, step);
-        let other = rng.random_bool(config.reference_eyes).then(|| rng.random_range(1..self.photographs.len()))?;
-        Some(self.photographs[(view + other) % self.photographs.len()].camera.center())
+        self.step.record(rec, &self.photographs[view], step, rates);
     }
 
     fn submit(&mut self, step: u32, mailbox: usize) -> Result<InFlight<'a>, Error> {

@@ -383,25 +383,10 @@ impl Step {
             .expect("the plan lists the sizes of all training pictures")
     }
 
-    /// Records step `step` (counted from 1) on a photograph. With an `eye` the decoders are told that the anchors are seen
-    /// from there (world), and what lies inside the mask counts alone.
-    pub fn record(
-        &self,
-        rec: &mut Recorder<'_>,
-        photograph: &Photograph,
-        step: u32,
-        rates: Rates,
-        eye: Option<[f64; 3]>,
-    ) {
-        let mut view = self.view(photograph, step);
-        if eye.is_some() {
-            view.weights.outside = 0.0;
-            if let Some(depth) = &mut view.depth {
-                depth.weights.outside = 0.0;
-            }
-        }
-        let eye = eye.unwrap_or_else(|| photograph.camera.center());
-        let compared = (&photograph.camera, eye, view.depth.is_some());
+    /// Records step `step` (counted from 1) on a photograph.
+    pub fn record(&self, rec: &mut Recorder<'_>, photograph: &Photograph, step: u32, rates: Rates) {
+        let view = self.view(photograph, step);
+        let compared = (&photograph.camera, view.depth.is_some());
         self.line(rec, compared, Some(photograph), step, rates, |rec, canvas| {
             let Canvas { picture, losses } = canvas;
             losses.forward_backward(rec, &view, &picture.rgb, picture.depth.as_ref())
@@ -417,7 +402,7 @@ impl Step {
         step: u32,
         rates: Rates,
     ) {
-        self.line(rec, (camera, camera.center(), depth.is_some()), None, step, rates, |rec, canvas| {
+        self.line(rec, (camera, depth.is_some()), None, step, rates, |rec, canvas| {
             let Canvas { picture, losses } = canvas;
             losses.compare(rec, depth, &picture.rgb, picture.depth.as_ref())
         });
@@ -429,31 +414,33 @@ impl Step {
         let (reference, near) = (photograph.reference, self.near);
         let inside = |on_reference: f64| if reference { on_reference as f32 } else { 0.0 };
         let looked_at = self.plan.depth_losses(reference).any();
-        let depth = photograph.prior.as_ref().filter(|_| looked_at).map(|PriorMap { kind, values: prior, gaps }| {
-            let depth = &config.depth;
-            let gradient = &depth.gradient;
-            let outside = if reference { depth.reference_weight } else { depth.other_weight };
-            let boxed = reference && depth.reference_inside_region == Region::RandomRectangle;
-            let added = if boxed { 0.0 } else { depth.reference_inside_weight };
-            let rectangle = photograph.mask_box.filter(|_| boxed).map(|bounds| {
-                let mut rng = random(self.config.train.seed, Stream::Rectangle, step);
-                let (low, high) = random_rectangle(&mut rng, bounds, photograph.camera.size);
-                Rectangle { low, high, added: depth.reference_inside_weight as f32 }
+        let depth =
+            photograph.prior.as_ref().filter(|_| looked_at).map(|PriorMap { kind, values: prior, gaps, fit }| {
+                let depth = &config.depth;
+                let gradient = &depth.gradient;
+                let outside = if reference { depth.reference_weight } else { depth.other_weight };
+                let boxed = reference && depth.reference_inside_region == Region::RandomRectangle;
+                let added = if boxed { 0.0 } else { depth.reference_inside_weight };
+                let rectangle = photograph.mask_box.filter(|_| boxed).map(|bounds| {
+                    let mut rng = random(self.config.train.seed, Stream::Rectangle, step);
+                    let (low, high) = random_rectangle(&mut rng, bounds, photograph.camera.size);
+                    Rectangle { low, high, added: depth.reference_inside_weight as f32 }
+                });
+                let factor = if reference { gradient.reference_weight } else { gradient.other_weight };
+                DepthView {
+                    prior,
+                    quantity: match kind {
+                        PriorKind::Depth => Quantity::Depth,
+                        PriorKind::Disparity => Quantity::Disparity { near },
+                    },
+                    weights: Weights { outside: outside as f32, inside: inside(depth.reference_weight + added) },
+                    rectangle,
+                    gradient: (gradient.weight * factor) as f32,
+                    gradient_inside: reference,
+                    gaps: *gaps,
+                    fit: fit.as_ref(),
+                }
             });
-            let factor = if reference { gradient.reference_weight } else { gradient.other_weight };
-            DepthView {
-                prior,
-                quantity: match kind {
-                    PriorKind::Depth => Quantity::Depth,
-                    PriorKind::Disparity => Quantity::Disparity { near },
-                },
-                weights: Weights { outside: outside as f32, inside: inside(depth.reference_weight + added) },
-                rectangle,
-                gradient: (gradient.weight * factor) as f32,
-                gradient_inside: reference,
-                gaps: *gaps,
-            }
-        });
         let weights = Weights { outside: 1.0, inside: inside(config.reference_inside_weight) };
         View { picture: &photograph.picture, weights, depth }
     }
@@ -462,7 +449,7 @@ impl Step {
     fn line<'s>(
         &'s self,
         rec: &mut Recorder<'_>,
-        (camera, eye, depth): (&Camera, [f64; 3], bool),
+        (camera, depth): (&Camera, bool),
         photograph: Option<&Photograph>,
         step: u32,
         rates: Rates,
@@ -498,7 +485,7 @@ impl Step {
             visible: &forward.visible.list,
         };
         rec.stage(stage::DECODE);
-        forward.decode.record(rec, model, &forward.visible.count, camera.center(), eye);
+        forward.decode.record(rec, model, &forward.visible.count, camera.center());
         rec.stage(stage::PROJECT);
         forward.project.record(rec, &forward.decode.existing, forward.gaussians(), camera, *near);
         rec.stage(stage::BIN);

@@ -297,7 +297,7 @@ impl Maps {
         let (difference, grad_aligned) =
             l1.forward_backward(&mut rec, &rendered, prior, fit, Weight::Each(&weight), &terms, 0);
         gradient.forward_backward(&mut rec, difference, grad_aligned, Some(&valid), 0.5, &terms, 1);
-        let grad = align.backward(&mut rec, grad_aligned, &rendered, prior);
+        let grad = align.backward(&mut rec, grad_aligned, &rendered, prior, fit);
         finish(rec);
         let terms = gpu.read(&terms).expect("read");
         Got {

@@ -172,7 +172,7 @@ fn run_with(gpu: &Gpu, method: Method, model: &Model, camera: &Camera, near: f32
         weights: &weights,
         visible: &forward.visible.list,
     };
-    forward.decode.record(&mut rec, of, &forward.visible.count, camera.center(), camera.center());
+    forward.decode.record(&mut rec, of, &forward.visible.count, camera.center());
     // What does not exist is not written: absent.
     rec.zero(&forward.project.mean);
     rec.zero(&forward.project.covariance);

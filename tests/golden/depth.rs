@@ -48,7 +48,7 @@ fn depth() {
         let (difference, grad_aligned) =
             l1.forward_backward(&mut rec, &rendered, prior, fit, Weight::Each(&weight), &losses, 0);
         gradient.forward_backward(&mut rec, difference, grad_aligned, None, 0.5, &losses, 1);
-        let grad = align.backward(&mut rec, grad_aligned, &rendered, prior);
+        let grad = align.backward(&mut rec, grad_aligned, &rendered, prior, fit);
         rec.submit().and_then(|s| s.wait()).expect("the step runs");
 
         let fit = gpu.read(fit).expect("read");

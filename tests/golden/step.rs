@@ -76,6 +76,7 @@ fn step() {
             let depth_weight = if reference { map(1.0, 100.0) } else { map(0.1, 0.0) };
             gpu.write(frame.depth_weight().unwrap(), &depth_weight).unwrap();
             let depth = DepthView {
+                fit: None,
                 prior: &priors[view],
                 quantity: Quantity::Depth,
                 weights: Weights { outside: 0.0, inside: 0.0 },

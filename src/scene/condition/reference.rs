@@ -13,12 +13,23 @@ pub(super) fn hole_depths(scene: &Scene) -> Vec<Option<Vec<f32>>> {
     scene.references.iter().map(|reference| hole_depth(scene, reference)).collect()
 }
 
+impl Scene {
+    /// `[slope, shift]` of the line that brings a reference's prior to the depth z of the scene (or 1 / z, if it is a
+    /// disparity): `z = slope prior + shift`, robustly through the points around its hole. `None` without a prior, without
+    /// enough points, or if the prior runs against them.
+    pub fn depth_line(&self, reference: &Reference) -> Option<[f64; 2]> {
+        let view = &self.train[reference.view];
+        let samples = samples(&view.camera, &self.points, view.mask.as_ref());
+        fit(reference.prior.as_ref()?, &samples).filter(|line| line[0] > 0.0)
+    }
+}
+
 fn hole_depth(scene: &Scene, reference: &Reference) -> Option<Vec<f32>> {
     let prior = reference.prior.as_ref()?;
     let view = &scene.train[reference.view];
     let mask = view.mask.as_ref()?;
     let samples = samples(&view.camera, &scene.points, Some(mask));
-    let [slope, shift] = fit(prior, &samples).filter(|line| line[0] > 0.0)?;
+    let [slope, shift] = scene.depth_line(reference)?;
     let (near, far) = samples.iter().fold((f64::INFINITY, 0.0_f64), |(a, b), s| (a.min(s.depth), b.max(s.depth)));
     let depth = |(m, p): (&u8, &f32)| {
         let value = slope * f64::from(*p) + shift;
