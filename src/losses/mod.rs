@@ -316,6 +316,40 @@ mod tests {
 
     const DISPARITY: Quantity = Quantity::Disparity { near: 0.2 };
 
+    /// What is drawn elsewhere, right or wrong, changes nothing at a pixel where the alignment is given.
+    #[test]
+    fn a_given_fit_has_no_gradient_of_its_own() {
+        let gpu = testing::gpu();
+        let size = [53, 37];
+        let maps = Maps::new(size, 3, 0.12, Quantity::Depth);
+        let [rendered, values, weight] =
+            [&maps.rendered, &maps.prior, &maps.weight].map(|data| gpu.upload("map", data).expect("upload"));
+        let terms = gpu.upload("terms", &[UNWRITTEN; 1]).expect("upload");
+        let align = align::Align::new(&gpu, size).expect("buffers");
+        let l1 = depth_l1::DepthL1::new(&gpu, size).expect("buffers");
+        let [scale, shift] = [0.125_f32, -0.5];
+        let fit = gpu.upload("fit", &align::fixed([scale.into(), shift.into()])).expect("upload");
+        let prior = align::Prior { values: &values, quantity: Quantity::Depth, valid: None };
+        let mut rec = gpu.checked().expect("recorder");
+        let weight = depth_l1::Weight::Each(&weight);
+        let (_, grad_aligned) = l1.forward_backward(&mut rec, &rendered, prior, &fit, weight, &terms, 0);
+        let grad = align.backward(&mut rec, grad_aligned, &rendered, prior, &fit);
+        finish(rec);
+        let grad = gpu.read(grad).expect("read");
+        let pixels = f64::from(size[0] * size[1]);
+        let mut loss = 0.0;
+        for (i, grad) in grad.iter().enumerate() {
+            let d = f64::from(scale) * f64::from(maps.rendered[i]) + f64::from(shift) - f64::from(maps.prior[i]);
+            loss += f64::from(maps.weight[i]) * d.abs() / pixels;
+            let want = f64::from(scale * maps.weight[i]) * d.signum() / pixels;
+            // Two roundings; a sign is not asked for within the rounding of the difference.
+            assert!(d.abs() < 1e-6 || (f64::from(*grad) - want).abs() <= 3e-7 * want.abs(), "{i}: {grad} {want}");
+        }
+        // 2,000 terms of one sign in a tree.
+        let got = f64::from(gpu.read(&terms).expect("read")[0]);
+        assert!((got - loss).abs() < 3e-6 * loss, "{got} {loss}");
+    }
+
     #[test]
     fn every_pass_of_the_depth_losses_matches_its_twin() {
         let gpu = testing::gpu();
