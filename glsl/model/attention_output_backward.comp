@@ -22,7 +22,7 @@ layout(push_constant, scalar) uniform Push {
   uint capacity; // tokens at most
   uint to_out;   // vec4 offset of the matrix (32, 512) in the weights
 } push;
-shared vec4 products[ROWS / 4u][ACROSS]; // of four rows and a thread's four columns
+shared vec4 products[ROWS / 4u][ACROSS / 2u]; // of four rows and a run of eight columns
 uint first, last, matrix;
 void put(uint run) {
   EACH(i, 2u * ROWS) put_left(i / 2u, i % 2u, grad_updated[min(first + i / 2u, last) * TOKEN + 2u * run + i % 2u]);
@@ -39,18 +39,25 @@ void main() {
   matrix = push.to_out + head * HEAD;
   vec4 sum[4] = vec4[4](vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0));
   add_product(TOKEN / 2u, sum);
+  // The terms in attention_backward's order, which takes the product from one that equals it where a share is 1: their
+  // difference is 0 then, not a rounding. A run of 8 begins with one thread's columns and goes on with its neighbour's.
   uint row = block_row(), column = block_column(), token = first + 4u * row;
-  vec4 product;
-  [[unroll]] for (uint r = 0u; r < 4u; ++r) {
-    uint at = min(token + r, last) * INNER + head * HEAD + column;
-    product[r] = sum4(sum[r] * mixed[at]);
-    if (token + r < n) grad_mixed[at] = sum[r];
+  for (uint turn = 0u; turn < 2u; ++turn) {
+    if (column % 2u == turn) {
+      vec4 part = turn == 0u ? vec4(0.0) : products[row][column / 2u];
+      [[unroll]] for (uint r = 0u; r < 4u; ++r) {
+        uint at = min(token + r, last) * INNER + head * HEAD + column;
+        vec4 m = mixed[at];
+        [[unroll]] for (uint c = 0u; c < 4u; ++c) part[r] = fma(sum[r][c], m[c], part[r]);
+        if (token + r < n) grad_mixed[at] = sum[r];
+      }
+      products[row][column / 2u] = part;
+    }
+    barrier();
   }
-  products[row][column] = product;
-  barrier();
   if (column >= 4u || token + column >= n) return;
   float total = 0.0;
-  for (uint c = 0u; c < ACROSS; ++c) total += products[row][c][column];
+  for (uint run = 0u; run < ACROSS / 2u; ++run) total += products[row][run][column];
   uint at = (token + column) * HEADS + head;
   rows[at] = vec3(softmax[at], total);
 }

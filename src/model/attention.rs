@@ -695,7 +695,7 @@ impl Attention {
                 if let Some(partial) = partials.next() {
                     let push = attention_weight_backward::Push { own, capacity, rows, columns, bias };
                     let buffers = attention_weight_backward::Buffers { tokens, grad_output, inputs, partial };
-                    let threads = rows / 2 * (columns / 2) * SLICES as u32;
+                    let threads = rows / 8 * (columns / 8) * SLICES as u32 * 64;
                     rec.run(attention_weight_backward::Kernel, buffers, push, threads);
                 } else {
                     let matrix = (matrix / 4) as u32;
