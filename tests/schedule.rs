@@ -6,7 +6,7 @@
 #[allow(dead_code)]
 mod common;
 
-use gscream_vk::gpu::{Gpu, testing};
+use gscream_vk::gpu::{Form, Gpu, testing};
 use gscream_vk::render::bin::Tiling;
 use gscream_vk::scene::Scene;
 use gscream_vk::train::run::Run;
@@ -22,13 +22,23 @@ fn schedule(gpu: &Gpu, scene: &Scene, step: u32) -> String {
 
 #[test]
 fn passes_and_barriers_of_a_step() {
-    let gpu = testing::gpu();
-    // Kernels come in a narrow form for subgroups of 8, with tiles of their own.
-    let size = gpu.info().subgroup_size;
-    if Tiling::of(size) != Tiling::of(8) {
-        println!("skipped: the schedules kept here are those of subgroups of 8, and this device has {size}");
-        return;
+    for gpu in testing::gpu_in_both_forms() {
+        let form = match gpu.form() {
+            Form::Gpu => "gpu",
+            Form::Cpu if Tiling::of(&gpu) == Tiling::Narrow => "subgroups_of_8",
+            Form::Cpu => {
+                let size = gpu.info().subgroup_size;
+                println!(
+                    "skipped: the CPU's schedules kept here are those of subgroups of 8, and this device has {size}"
+                );
+                continue;
+            }
+        };
+        schedules(&gpu, form);
     }
+}
+
+fn schedules(gpu: &Gpu, form: &str) {
     let whole = common::tiny();
     let bare = {
         let mut scene = whole.clone();
@@ -46,6 +56,6 @@ fn passes_and_barriers_of_a_step() {
         // Photographs alone, with statistics.
         ("bare", &bare, 4),
     ] {
-        insta::assert_snapshot!(format!("{name}_subgroups_of_8"), schedule(&gpu, scene, step));
+        insta::assert_snapshot!(format!("{name}_{form}"), schedule(gpu, scene, step));
     }
 }

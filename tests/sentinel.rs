@@ -39,9 +39,12 @@ fn ended(error: Error, folder: &Path, scene: &Scene, settings: &Settings) -> End
 
 #[test]
 fn a_healthy_step_has_no_such_value() {
-    let gpu = testing::gpu();
+    testing::gpu_in_both_forms().for_each(|gpu| a_healthy_step_has_no_such_value_in_one_form(&gpu));
+}
+
+fn a_healthy_step_has_no_such_value_in_one_form(gpu: &Gpu) {
     let (scene, settings) = (common::tiny(), common::settings(20));
-    let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
+    let mut run = Run::new(gpu, &scene, &settings).expect("the device has room");
     for step in 1..=6 {
         if [1, 4, 5].contains(&step) {
             let mut rec = gpu.inspected().expect("a recorder");

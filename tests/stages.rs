@@ -85,7 +85,10 @@ const BUFFERS: [(&str, Present); 24] = [
 
 #[test]
 fn what_is_absent_has_no_pass_and_no_buffer() {
-    let gpu = testing::gpu();
+    testing::gpu_in_both_forms().for_each(|gpu| what_is_absent_has_no_pass_and_no_buffer_in_one_form(&gpu));
+}
+
+fn what_is_absent_has_no_pass_and_no_buffer_in_one_form(gpu: &Gpu) {
     let folder = common::folder();
     let mut names = std::collections::BTreeSet::new();
     for wanted in Wanted::all() {
@@ -95,7 +98,7 @@ fn what_is_absent_has_no_pass_and_no_buffer() {
         // Command buffers keep their crash markers.
         let before: Vec<_> = gpu.buffers().into_iter().filter(|(name, ..)| *name != "markers").collect();
         assert!(before.is_empty(), "{wanted:?}: buffers of the run before are left: {before:?}");
-        let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
+        let mut run = Run::new(gpu, &scene, &settings).expect("the device has room");
 
         let plan = run.step().plan.clone();
         let left_out = |what: &str| plan.left_out.iter().any(|left| left.what == what);

@@ -69,29 +69,35 @@ fn scene_without_tests() -> Scene {
 
 #[test]
 fn the_same_seed_gives_the_same_bytes() {
-    let gpu = testing::gpu();
+    testing::gpu_in_both_forms().for_each(|gpu| the_same_seed_gives_the_same_bytes_in_one_form(&gpu));
+}
+
+fn the_same_seed_gives_the_same_bytes_in_one_form(gpu: &Gpu) {
     let scene = scene_without_tests();
     let mut settings = common::settings(13);
     settings.train.view_order = gscream_vk::train::config::ViewOrder::Shuffled;
-    let first = train(&gpu, &scene, &settings, None);
+    let first = train(gpu, &scene, &settings, None);
     assert!(first.watch.lines.len() == 5, "five changes of the anchors: {:?}", first.watch.lines);
     assert!(first.watch.lines.iter().any(|line| !line.contains(": 0 new")), "{:?}", first.watch.lines);
     let initial = first.watch.steps[0].anchors;
     assert_ne!(first.summary.anchors, initial, "anchors came and went");
-    first.assert_same(&train(&gpu, &scene, &settings, None), "once more");
+    first.assert_same(&train(gpu, &scene, &settings, None), "once more");
     settings.train.seed = 1;
-    let other = train(&gpu, &scene, &settings, None);
+    let other = train(gpu, &scene, &settings, None);
     assert!(other.model != first.model && other.figures() != first.figures(), "another seed");
 }
 
 #[test]
 fn steps_that_overflow_are_taken_again() {
-    let gpu = testing::gpu();
+    testing::gpu_in_both_forms().for_each(|gpu| steps_that_overflow_are_taken_again_in_one_form(&gpu));
+}
+
+fn steps_that_overflow_are_taken_again_in_one_form(gpu: &Gpu) {
     let scene = scene_without_tests();
     for write_back in [false, true] {
         let mut settings = common::settings(13);
         settings.model.attention.write_back = write_back;
-        let ample = train(&gpu, &scene, &settings, Some(Capacity { anchors: 0, visible: 4096, pairs: 1 << 18 }));
+        let ample = train(gpu, &scene, &settings, Some(Capacity { anchors: 0, visible: 4096, pairs: 1 << 18 }));
         assert_eq!(ample.summary.repeated, 0, "there was room");
         let pairs = ample.watch.steps.iter().map(|p| p.pairs).max().expect("steps");
         // Anchors grow behind the fourth step, and the room for visible ones with them.
@@ -102,7 +108,7 @@ fn steps_that_overflow_are_taken_again() {
             // Falls short in a late step, with attention and statistics under way.
             ("too few pairs", Capacity { anchors: 0, visible: 4096, pairs: pairs - 1 }),
         ] {
-            let tight = train(&gpu, &scene, &settings, Some(capacity));
+            let tight = train(gpu, &scene, &settings, Some(capacity));
             assert!(tight.summary.repeated > 0, "{what}: it fitted");
             tight.assert_same(&ample, &format!("{what}, write_back {write_back}"));
         }
@@ -156,10 +162,13 @@ fn smaller_pictures_come_first() {
 
 #[test]
 fn every_pass_agrees_with_its_reference() {
-    let gpu = testing::gpu();
+    testing::gpu_in_both_forms().for_each(|gpu| every_pass_agrees_with_its_reference_in_one_form(&gpu));
+}
+
+fn every_pass_agrees_with_its_reference_in_one_form(gpu: &Gpu) {
     let scene = common::tiny();
     let settings = common::settings(20);
-    let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
+    let mut run = Run::new(gpu, &scene, &settings).expect("the device has room");
     let mut failed = vec![];
     for step in 1..=6 {
         // 1: nothing optional; 4: the reference view; 5: another view, both with statistics and attention.
@@ -192,11 +201,15 @@ fn mean_loss(watch: &Watch, steps: std::ops::Range<usize>) -> f64 {
 
 #[test]
 fn training_learns_and_what_it_saves_draws_the_same_picture() {
-    let gpu = testing::gpu();
+    testing::gpu_in_both_forms()
+        .for_each(|gpu| training_learns_and_what_it_saves_draws_the_same_picture_in_one_form(&gpu));
+}
+
+fn training_learns_and_what_it_saves_draws_the_same_picture_in_one_form(gpu: &Gpu) {
     let scene = common::tiny();
     let settings = common::settings(60);
     let folder = tempfile::tempdir().expect("a temporary folder");
-    let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
+    let mut run = Run::new(gpu, &scene, &settings).expect("the device has room");
     let psnr = |run: &mut Run<'_>| {
         let report = run.evaluate(|_, _| ()).expect("an evaluation").expect("there are test views");
         report.mean.expect("means").metrics.full.psnr
@@ -227,7 +240,7 @@ fn training_learns_and_what_it_saves_draws_the_same_picture() {
     assert!(memory == file, "what was saved is what was trained");
     let pictures = |(anchors, weights): &(files::Anchors, files::Weights)| {
         let mut renderer =
-            Renderer::new(&gpu, anchors, weights, &settings.render, [0.0; 3]).expect("the device has room");
+            Renderer::new(gpu, anchors, weights, &settings.render, [0.0; 3]).expect("the device has room");
         let views = scene.test.iter().chain(&scene.train);
         views.map(|view| renderer.render(&view.camera).expect("a picture")).collect::<Vec<_>>()
     };

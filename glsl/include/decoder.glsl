@@ -11,6 +11,7 @@ const uint UNITS = 16u;            // units or features of a thread
 const uint UNITS_VEC4 = UNITS / 4u;
 const uint OPACITIES = 5u;         // of an anchor in a thread
 const uint SECOND_VEC4 = 91u;      // vec4s of one Gaussian's second layer: 11 rows, 11 biases
+const uint SECOND_THREADS = 88u;   // threads of its gradient in the form for GPUs: 11 rows of 8 vec4s
 const uint LANES_ANCHORS = 64u; // anchors of a subgroup of 8 in the forms of lanes
 const uint BLOCK = 64u;            // anchors of the smallest chunk of the first layer's weight gradient, Gaussians of the second's
 const uint CHUNKS = 1024u;         // chunks of the first layer's at most

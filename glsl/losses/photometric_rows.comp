@@ -5,10 +5,14 @@
 #include "thread.glsl"
 #include "ssim.glsl"
 // variant outside: OUTSIDE
+// variant wide: RUN=4
+// variant outside_wide: OUTSIDE RUN=4
 // SSIM's moments along rows. A thread makes RUN neighbouring pixels, so that a sample is loaded once for all of them.
 // `outside` takes pixels without weight as if both pictures agreed there: the window of a pixel beside the mask does not
-// compare what is behind the object with the object.
-const int RUN = 8;
+// compare what is behind the object with the object. `wide` is for GPUs: samples of fewer pixels fit the registers.
+#ifndef RUN
+#define RUN 8
+#endif
 layout(local_size_x = 64) in;
 layout(binding = 0, scalar) readonly buffer Rendered { vec3 rendered[]; }; // [pixel] rgb
 layout(binding = 1, scalar) readonly buffer Target { vec3 target[]; };     // [pixel] rgb

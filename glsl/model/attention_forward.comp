@@ -2,14 +2,12 @@
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_EXT_control_flow_attributes : require
 #extension GL_GOOGLE_include_directive : require
+// One direction: softmax(q k / 8) v over the other side's tokens, online (Milakov and Gimelshein 2018), 32 keys at a time. A
+// workgroup: 32 tokens of one head.
+layout(local_size_x = 128) in;
 #include "thread.glsl"
 #include "attention.glsl"
-// One direction: softmax(q k / 8) v over the other side's tokens, online (Milakov and Gimelshein 2018), two keys at a
-// time. A thread: QUERIES tokens of one head, in registers; more of them use each loaded key more often.
-#ifndef QUERIES
-#define QUERIES 1
-#endif
-layout(local_size_x = 64) in;
+#include "attention_tile.glsl"
 layout(binding = 0, scalar) readonly buffer Tokens { uint tokens[]; };      // [2] tokens inside, around
 layout(binding = 1, scalar) readonly buffer Query { vec4 query[]; };        // [capacity * 128] of the own side
 layout(binding = 2, scalar) readonly buffer Key { vec4 key[]; };            // [capacity * 128] of the other side
@@ -20,59 +18,54 @@ layout(push_constant, scalar) uniform Push {
   uint own;      // 0: the queries are inside, 1: around
   uint capacity; // tokens of a side at most
 } push;
-const float LOWEST = -3e38; // below every logit; its exponential is 0
+shared vec4 shares[TILE * STRIDE]; // by key, then by query: exponentials
+shared vec4 columns[16u * TILE / 4u]; // what each thread has of its four queries
 void main() {
   uvec2 n = sides(tokens[push.own], tokens[1u - push.own], push.capacity);
-  uint blocks = (n.x + QUERIES - 1u) / QUERIES;
-  uint id = thread_index();
+  uint blocks = (n.x + TILE - 1u) / TILE, id = group_index();
   if (id >= blocks * HEADS) return;
-  uint head = (id / blocks) * HEAD, block = id % blocks;
-  vec4 q[QUERIES][16], o[QUERIES][16];
-  float top[QUERIES], sum[QUERIES];
-  [[unroll]] for (uint r = 0u; r < QUERIES; r++) {
-    uint at = min(r * blocks + block, n.x - 1u) * INNER + head;
-    [[unroll]] for (uint d = 0u; d < 16u; d++) {
-      q[r][d] = 0.125 * query[at + d];
-      o[r][d] = vec4(0.0);
+  uint head = id / blocks * HEAD, first = TILE * (id % blocks), row = own_row(), column = other_column();
+  vec4 o[4] = vec4[4](vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0)); // a query's four of 64 values each
+  vec4 top = vec4(LOWEST), sum = vec4(0.0); // of the queries; the sum is of this thread's keys alone
+  for (uint from = 0u; from < n.y; from += TILE) {
+    vec4 s[2];
+    TILE_PRODUCTS(s, query, first, n.x - 1u, key, from, n.y - 1u, head)
+    s[0] *= 0.125;
+    s[1] *= 0.125;
+    // Absent keys repeat the last one.
+    columns[column * (TILE / 4u) + row] = max(s[0], s[1]);
+    barrier();
+    vec4 peak = top;
+    [[unroll]] for (uint c = 0u; c < 16u; ++c) peak = max(peak, columns[c * (TILE / 4u) + row]);
+    vec4 old = mix(exp(top - peak), vec4(0.0), equal(top, vec4(LOWEST)));
+    [[unroll]] for (uint i = 0u; i < 2u; ++i) {
+      s[i] = from + column + 16u * i < n.y ? exp(s[i] - peak) : vec4(0.0);
+      shares[(column + 16u * i) * STRIDE + row] = s[i];
     }
-    top[r] = LOWEST;
-    sum[r] = 0.0;
-  }
-  for (uint j = 0u; j < n.y; j += 2u) {
-    bool second = j + 1u < n.y;
-    uint a = j * INNER + head, b = second ? a + INNER : a;
-    vec4 s[QUERIES], t[QUERIES];
-    [[unroll]] for (uint r = 0u; r < QUERIES; r++) s[r] = t[r] = vec4(0.0);
-    [[unroll]] for (uint d = 0u; d < 16u; d++) {
-      vec4 ka = key[a + d], kb = key[b + d];
-      [[unroll]] for (uint r = 0u; r < QUERIES; r++) {
-        s[r] = fma(q[r][d], ka, s[r]);
-        t[r] = fma(q[r][d], kb, t[r]);
-      }
-    }
-    float pa[QUERIES], pb[QUERIES], old[QUERIES];
-    [[unroll]] for (uint r = 0u; r < QUERIES; r++) {
-      float sa = sum4(s[r]), sb = sum4(t[r]);
-      float peak = max(top[r], max(sa, sb)); // an absent second key repeats the first
-      old[r] = top[r] == LOWEST ? 0.0 : exp(top[r] - peak);
-      pa[r] = exp(sa - peak);
-      pb[r] = second ? exp(sb - peak) : 0.0;
-      sum[r] = fma(sum[r], old[r], pa[r] + pb[r]);
-      top[r] = peak;
-    }
-    [[unroll]] for (uint d = 0u; d < 16u; d++) {
-      vec4 va = value[a + d], vb = value[b + d];
-      [[unroll]] for (uint r = 0u; r < QUERIES; r++) {
-        o[r][d] = fma(vec4(pb[r]), vb, fma(vec4(pa[r]), va, old[r] * o[r][d]));
+    sum = fma(sum, old, s[0] + s[1]);
+    top = peak;
+    [[unroll]] for (uint r = 0u; r < 4u; ++r) o[r] *= old[r];
+    for (uint k = 0u; k < TILE; k += RUN) {
+      barrier();
+      run_other[gl_LocalInvocationID.x] = value[min(from + k + gl_LocalInvocationID.x / HEAD, n.y - 1u) * INNER + head + column];
+      barrier();
+      [[unroll]] for (uint i = 0u; i < RUN; ++i) {
+        vec4 p = shares[(k + i) * STRIDE + row], v = run_other[i * HEAD + column];
+        [[unroll]] for (uint r = 0u; r < 4u; ++r) o[r] = fma(vec4(p[r]), v, o[r]);
       }
     }
   }
-  [[unroll]] for (uint r = 0u; r < QUERIES; r++) {
-    uint token = r * blocks + block;
+  barrier();
+  columns[column * (TILE / 4u) + row] = sum;
+  barrier();
+  vec4 total = vec4(0.0);
+  [[unroll]] for (uint c = 0u; c < 16u; ++c) total += columns[c * (TILE / 4u) + row];
+  vec4 inverse = 1.0 / total; // the largest logit's exponential is 1: the sum is at least that
+  [[unroll]] for (uint r = 0u; r < 4u; ++r) {
+    uint token = first + 4u * row + r;
     if (token < n.x) {
-      float inverse = 1.0 / sum[r]; // the largest logit's exponential is 1: the sum is at least that
-      [[unroll]] for (uint d = 0u; d < 16u; d++) mixed[token * INNER + head + d] = inverse * o[r][d];
-      softmax[token * HEADS + head / HEAD] = vec2(top[r], inverse);
+      mixed[token * INNER + head + column] = inverse[r] * o[r];
+      if (column == 0u) softmax[token * HEADS + head / HEAD] = vec2(top[r], inverse[r]);
     }
   }
 }

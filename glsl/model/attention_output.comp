@@ -2,10 +2,15 @@
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_EXT_control_flow_attributes : require
 #extension GL_GOOGLE_include_directive : require
+// Output projection of one side: (32, 512) and bias. A workgroup: 16 tokens; each of 8 slices takes the terms of a head.
+layout(local_size_x = 256) in;
+#define ROWS 16u
+#define COLUMNS 32u
+#define SLICES 8u
 #include "thread.glsl"
 #include "attention.glsl"
-// Output projection of one side: (32, 512) and bias. A thread: 4 tokens, 4 features.
-layout(local_size_x = 64) in;
+#include "product.glsl"
+#include "slices.glsl"
 layout(binding = 0, scalar) readonly buffer Tokens { uint tokens[]; };      // [2] tokens inside, around
 layout(binding = 1, scalar) readonly buffer Mixed { vec4 mixed[]; };        // [capacity * 128] attended values
 layout(binding = 2, scalar) readonly buffer Weights { vec4 weights[]; };    // [24592] all weights
@@ -15,32 +20,23 @@ layout(push_constant, scalar) uniform Push {
   uint capacity; // tokens at most
   uint to_out;   // vec4 offset of the matrix (32, 512) in the weights, its bias behind it
 } push;
+uint first, last;
+void put(uint run) {
+  uint from = block_slice() * HEAD + 2u * run;
+  EACH(i, 2u * ROWS) put_left(i / 2u, i % 2u, mixed[min(first + i / 2u, last) * INNER + from + i % 2u]);
+  EACH(i, 2u * COLUMNS) put_right(i / 2u, i % 2u, weights[push.to_out + i / 2u * INNER + from + i % 2u]);
+}
 void main() {
   uint n = sides(tokens[push.own], tokens[1u - push.own], push.capacity).x;
-  uint quads = (n + 3u) / 4u;
-  uint id = thread_index();
-  if (id >= quads * TOKEN) return;
-  uint row = id / quads, first = 4u * (id % quads);
-  uint at[4];
-  vec4 sum[4][4];
-  [[unroll]] for (uint t = 0u; t < 4u; t++) {
-    at[t] = min(first + t, n - 1u) * INNER;
-    [[unroll]] for (uint r = 0u; r < 4u; r++) sum[t][r] = vec4(0.0);
-  }
-  uint matrix = push.to_out + 4u * row * INNER;
-  for (uint c = 0u; c < INNER; c += 2u) {
-    [[unroll]] for (uint k = c; k < c + 2u; k++) {
-      vec4 x[4];
-      [[unroll]] for (uint t = 0u; t < 4u; t++) x[t] = mixed[at[t] + k];
-      [[unroll]] for (uint r = 0u; r < 4u; r++) {
-        vec4 w = weights[matrix + r * INNER + k];
-        [[unroll]] for (uint t = 0u; t < 4u; t++) sum[t][r] = fma(w, x[t], sum[t][r]);
-      }
-    }
-  }
-  vec4 bias = weights[push.to_out + 32u * INNER + row];
-  [[unroll]] for (uint t = 0u; t < 4u; t++) {
-    vec4 y = vec4(sum4(sum[t][0]), sum4(sum[t][1]), sum4(sum[t][2]), sum4(sum[t][3]));
-    if (first + t < n) updated[(first + t) * TOKEN + row] = y + bias;
+  first = ROWS * group_index();
+  if (first >= n) return;
+  last = n - 1u;
+  vec4 sum[4] = vec4[4](vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0));
+  add_product(HEAD / 2u, sum);
+  add_slices(sum);
+  uint token = first + 4u * block_row();
+  vec4 bias = weights[push.to_out + COLUMNS * INNER + block_column()];
+  [[unroll]] for (uint r = 0u; r < 4u; ++r) {
+    if (block_slice() == 0u && token + r < n) updated[(token + r) * TOKEN + block_column()] = sum[r] + bias;
   }
 }

@@ -2,10 +2,16 @@
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_EXT_control_flow_attributes : require
 #extension GL_GOOGLE_include_directive : require
+// Gradient of one side's features through both its matrices. A workgroup: 16 tokens; each of 8 slices takes a quarter of the
+// terms of one matrix.
+layout(local_size_x = 256) in;
+#define ROWS 16u
+#define COLUMNS 32u
+#define SLICES 8u
 #include "thread.glsl"
 #include "attention.glsl"
-// Gradient of one side's features through both its matrices. A thread: 4 tokens, 4 features.
-layout(local_size_x = 64) in;
+#include "product.glsl"
+#include "slices.glsl"
 layout(binding = 0, scalar) readonly buffer Tokens { uint tokens[]; };              // [2] tokens inside, around
 layout(binding = 1, scalar) readonly buffer Weights { vec4 weights[]; };            // [24592] all weights
 layout(binding = 2, scalar) readonly buffer GradQk { vec4 grad_qk[]; };             // [capacity * 128]
@@ -17,34 +23,28 @@ layout(push_constant, scalar) uniform Push {
   uint to_qk;    // vec4 offset of the matrix (512, 32) in the weights
   uint to_v;     // vec4 offset of the matrix (512, 32) in the weights
 } push;
+const uint TERMS = 4u * INNER * 2u / SLICES; // of a slice
+uint first, last;
+void put(uint run) {
+  uint slice = block_slice(), term = slice % (SLICES / 2u) * TERMS + RUN * run;
+  bool values = slice >= SLICES / 2u;
+  EACH(i, 2u * ROWS) {
+    uint at = min(first + i / 2u, last) * INNER + term / 4u + i % 2u;
+    put_left(i / 2u, i % 2u, values ? grad_value[at] : grad_qk[at]);
+  }
+  uint matrix = (values ? push.to_v : push.to_qk) + term * TOKEN;
+  EACH(i, RUN * TOKEN) put_right_across(i / TOKEN, i % TOKEN, weights[matrix + i]);
+}
 void main() {
   uint n = sides(tokens[push.own], tokens[1u - push.own], push.capacity).x;
-  uint quads = (n + 3u) / 4u;
-  uint id = thread_index();
-  if (id >= quads * TOKEN) return;
-  uint column = id / quads, first = 4u * (id % quads);
-  uint at[4];
-  vec4 sum[2][4];
-  [[unroll]] for (uint t = 0u; t < 4u; t++) {
-    at[t] = min(first + t, n - 1u) * INNER;
-    sum[0][t] = sum[1][t] = vec4(0.0);
-  }
-  uint a = push.to_qk + column, b = push.to_v + column;
-  for (uint c = 0u; c < INNER; c++) {
-    vec4 x[4], y[4];
-    [[unroll]] for (uint t = 0u; t < 4u; t++) {
-      x[t] = grad_qk[at[t] + c];
-      y[t] = grad_value[at[t] + c];
-    }
-    [[unroll]] for (uint r = 0u; r < 4u; r++) {
-      vec4 u = weights[a + (4u * c + r) * TOKEN], w = weights[b + (4u * c + r) * TOKEN];
-      [[unroll]] for (uint t = 0u; t < 4u; t++) {
-        sum[0][t] = fma(vec4(x[t][r]), u, sum[0][t]);
-        sum[1][t] = fma(vec4(y[t][r]), w, sum[1][t]);
-      }
-    }
-  }
-  [[unroll]] for (uint t = 0u; t < 4u; t++) {
-    if (first + t < n) grad_feature[(first + t) * TOKEN + column] = sum[0][t] + sum[1][t];
+  first = ROWS * group_index();
+  if (first >= n) return;
+  last = n - 1u;
+  vec4 sum[4] = vec4[4](vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0));
+  add_product(TERMS / RUN, sum);
+  add_slices(sum);
+  uint token = first + 4u * block_row();
+  [[unroll]] for (uint r = 0u; r < 4u; ++r) {
+    if (block_slice() == 0u && token + r < n) grad_feature[(token + r) * TOKEN + block_column()] = sum[r];
   }
 }

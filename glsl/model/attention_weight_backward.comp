@@ -2,11 +2,14 @@
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_EXT_control_flow_attributes : require
 #extension GL_GOOGLE_include_directive : require
+// Gradient of one matrix, output gradient times input summed over one of 8 slices of the tokens; with a bias (behind
+// the matrix) also the sum of the output gradient. A workgroup: 32 rows, 32 columns, one slice.
+layout(local_size_x = 64) in;
+#define ROWS 32u
+#define COLUMNS 32u
 #include "thread.glsl"
 #include "attention.glsl"
-// Gradient of one matrix, output gradient times input summed over one of 8 slices of the tokens; with a bias (behind
-// the matrix) also the sum of the output gradient. A thread: 8 rows, 8 columns, one slice.
-layout(local_size_x = 64) in;
+#include "product.glsl"
 layout(binding = 0, scalar) readonly buffer Tokens { uint tokens[]; };          // [2] tokens inside, around
 layout(binding = 1, scalar) readonly buffer GradOutput { vec4 grad_output[]; }; // [capacity * rows / 4]
 layout(binding = 2, scalar) readonly buffer Input { vec4 inputs[]; };           // [capacity * columns / 4]
@@ -18,36 +21,34 @@ layout(push_constant, scalar) uniform Push {
   uint columns;  // vec4 of an input
   uint bias;     // 1: a bias follows
 } push;
-const uint SLICES = 8u;
+const uint PARTS = 8u; // slices
+uint begin, end, row, column; // tokens of the slice; vec4s of the block
+void put(uint run) {
+  EACH(i, RUN * ACROSS) {
+    uint term = i / ACROSS, quad = i % ACROSS, token = begin + RUN * run + term;
+    bool present = token < end;
+    put_left_across(term, quad, present ? grad_output[token * push.rows + row + quad] : vec4(0.0));
+    put_right_across(term, quad, present ? inputs[token * push.columns + column + quad] : vec4(0.0));
+  }
+}
 void main() {
   uint n = sides(tokens[push.own], tokens[1u - push.own], push.capacity).x;
-  uint tiles = (push.rows / 2u) * (push.columns / 2u);
-  uint id = thread_index();
-  if (n == 0u || id >= tiles * SLICES) return;
-  uint slice = id / tiles, tile = id % tiles;
-  uint row = 2u * (tile / (push.columns / 2u)), column = 2u * (tile % (push.columns / 2u));
-  uint length = (n + SLICES - 1u) / SLICES;
-  vec4 sum[8][2], total[2] = vec4[2](vec4(0.0), vec4(0.0));
-  [[unroll]] for (uint r = 0u; r < 8u; r++) sum[r][0] = sum[r][1] = vec4(0.0);
-  for (uint t = slice * length; t < min(slice * length + length, n); t++) {
-    uint g = t * push.rows + row, x = t * push.columns + column;
-    vec4 a[2] = vec4[2](grad_output[g], grad_output[g + 1u]);
-    vec4 u = inputs[x], v = inputs[x + 1u];
-    total[0] += a[0];
-    total[1] += a[1];
-    [[unroll]] for (uint r = 0u; r < 8u; r++) {
-      sum[r][0] = fma(vec4(a[r / 4u][r % 4u]), u, sum[r][0]);
-      sum[r][1] = fma(vec4(a[r / 4u][r % 4u]), v, sum[r][1]);
-    }
-  }
-  uint at = slice * (4u * push.rows * push.columns + push.bias * push.rows);
-  [[unroll]] for (uint r = 0u; r < 8u; r++) {
-    partial[at + (4u * row + r) * push.columns + column] = sum[r][0];
-    partial[at + (4u * row + r) * push.columns + column + 1u] = sum[r][1];
-  }
-  if (push.bias != 0u && column == 0u) {
-    uint behind = at + 4u * push.rows * push.columns + row;
-    partial[behind] = total[0];
-    partial[behind + 1u] = total[1];
+  uint across = push.columns / ACROSS, blocks = push.rows / ACROSS * across, id = group_index();
+  if (n == 0u || id >= blocks * PARTS) return;
+  uint part = id / blocks, length = (n + PARTS - 1u) / PARTS;
+  row = ACROSS * (id % blocks / across);
+  column = ACROSS * (id % blocks % across);
+  begin = min(part * length, n);
+  end = min(begin + length, n);
+  vec4 sum[4] = vec4[4](vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0));
+  add_product((end - begin + RUN - 1u) / RUN, sum);
+  uint at = part * (4u * push.rows * push.columns + push.bias * push.rows);
+  uint first = at + 4u * (row + block_row()) * push.columns + column + block_column();
+  [[unroll]] for (uint r = 0u; r < 4u; ++r) partial[first + r * push.columns] = sum[r];
+  if (push.bias != 0u && column == 0u && gl_LocalInvocationID.x < ACROSS) {
+    uint quad = row + gl_LocalInvocationID.x;
+    vec4 total = vec4(0.0);
+    for (uint t = begin; t < end; ++t) total += grad_output[t * push.rows + quad];
+    partial[at + 4u * push.rows * push.columns + quad] = total;
   }
 }

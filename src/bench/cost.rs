@@ -523,6 +523,15 @@ pub const TABLE: &[Formula] = &[
         },
     },
     Formula {
+        pass: "render/decode_backward_second_wide",
+        variants: &[],
+        derivation: "per visible anchor hidden units 384 B; per Gaussian that exists its place in the list 4 B and 44 B of gradients of 11 outputs, times 33; per chunk of 64 a second layer's share of 1452 B written",
+        work: |c, _| {
+            let bytes = 384.0 * c.visible + (48.0 + 1452.0 / 64.0) * c.gaussians;
+            work(bytes, 11.0 * 33.0 * c.gaussians, 0.0)
+        },
+    },
+    Formula {
         pass: "render/decode_backward_weights",
         variants: &[],
         derivation: "per chunk of anchors a first layer read and added; its gradient written",
@@ -551,7 +560,7 @@ pub const TABLE: &[Formula] = &[
     },
     Formula {
         pass: "losses/photometric_rows",
-        variants: &["outside"],
+        variants: &["outside", "wide", "outside_wide"],
         derivation: "per pixel rgb twice 24, moments 48 B, with weights 4; per channel difference and terms 8, window 11 x 4, \
                      variances 10 operations",
         work: |c, d| work((72.0 + 4.0 * if_so(d.is("outside"))) * c.pixels, 3.0 * 62.0 * c.pixels, 0.0),

@@ -7,9 +7,9 @@ use serde::{Deserialize, Serialize};
 
 use super::ceilings::span;
 use crate::config::Settings;
-use crate::gpu::{self, Gpu};
+use crate::gpu::{self, Form, Gpu};
 use crate::math::attention::{FEATURE, WEIGHTS};
-use crate::model::attention::{Attention, Form, Pair};
+use crate::model::attention::{Attention, Pair, Sharing};
 use crate::primitives::Count;
 use crate::primitives::sort::{self, Pairs, Sort, Tuning};
 use crate::render::bin::Tiling;
@@ -92,8 +92,7 @@ fn tiles(
     repetitions: usize,
     make: &mut dyn FnMut(&Settings) -> Result<Bench, Error>,
 ) -> Result<Option<ChoiceFigures>, Error> {
-    let shipped = Tiling::of(gpu.info().subgroup_size);
-    if shipped != Tiling::Narrow {
+    if Tiling::of(gpu) != Tiling::Narrow {
         // The narrow shape needs subgroups of 8.
         return Ok(None);
     }
@@ -118,9 +117,8 @@ fn tiles(
 
 /// How the attention's kernels share the work.
 fn attention(gpu: &Gpu, tokens: u32, repetitions: usize) -> Result<Option<ChoiceFigures>, gpu::Error> {
-    let info = gpu.info();
-    let forms = Form::all(info.subgroup_size);
-    if forms.len() < 2 {
+    let ways = Sharing::all(gpu);
+    if ways.len() < 2 {
         return Ok(None);
     }
     let n = tokens as usize * FEATURE;
@@ -132,11 +130,11 @@ fn attention(gpu: &Gpu, tokens: u32, repetitions: usize) -> Result<Option<Choice
     let weights = gpu.upload("weights", &Attention::initial_weights(&mut Pcg64::new(0, 4)))?;
     let grad_weights = gpu.buffer::<f32>("grad_weights", WEIGHTS)?;
     let counts = gpu.upload("tokens", &[tokens, tokens])?;
-    let stages = forms.iter().map(|&form| Attention::with_form(gpu, tokens, form)).collect::<Result<Vec<_>, _>>()?;
-    let best = Form::best(info.kind, info.subgroup_size, tokens);
-    let shipped = forms.iter().position(|&form| form == best).expect("the best form is one of all");
+    let stages = ways.iter().map(|&way| Attention::of(gpu, tokens, way)).collect::<Result<Vec<_>, _>>()?;
+    let best = Sharing::best(gpu, tokens);
+    let shipped = ways.iter().position(|&way| way == best).expect("the best way is one of all");
     let pair = |of: &'_ [gpu::Buffer<f32>; 2]| (of[0].view(), of[1].view());
-    let times = rounds(forms.len(), repetitions, |which| {
+    let times = rounds(ways.len(), repetitions, |which| {
         let stage = &stages[which];
         let mut rec = gpu.recorder()?;
         let ((a, b), (c, d)) = (pair(&features), pair(&upstream));
@@ -145,14 +143,14 @@ fn attention(gpu: &Gpu, tokens: u32, repetitions: usize) -> Result<Option<Choice
         stage.backward(&mut rec, &counts, features, &weights, upstream, &grad_weights);
         Ok::<_, gpu::Error>(span(&rec.submit()?.wait()?) * 1e-6)
     })?;
-    let names: Vec<String> = forms.iter().map(|form| format!("{form:?}").to_lowercase()).collect();
+    let names: Vec<String> = ways.iter().map(|way| format!("{way:?}").to_lowercase()).collect();
     let work = format!("attention both ways, {tokens} tokens a side");
     Ok(Some(ChoiceFigures::new("attention kernels", work, &names, &times, shipped)))
 }
 
 /// Keys of a thread and bits of a digit of the radix sort.
 fn sorting(gpu: &Gpu, keys: u32, bits: u32, repetitions: usize) -> Result<ChoiceFigures, gpu::Error> {
-    let cpu = gpu.info().kind == "cpu";
+    let cpu = gpu.form() == Form::Cpu;
     let of = |items, digit_bits| Tuning { items, digit_bits };
     let tunings = [
         if cpu { sort::CPU } else { sort::GPU },

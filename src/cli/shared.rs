@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, bail};
 
 use crate::config::{Settings, SettingsArgs};
-use crate::gpu::{Gpu, Options};
+use crate::gpu::{Form, Gpu, Options};
 use crate::scene::{self, Scene, synthetic};
 
 /// The word that stands for the built-in scene where a folder is expected.
@@ -24,6 +24,9 @@ pub struct DeviceArgs {
     /// Put a barrier after every pass instead of only where a hazard demands one
     #[arg(long)]
     pub serialize: bool,
+    /// Kernels for a GPU or for a CPU driver, for comparisons [default: the device's own kind]
+    #[arg(long, value_name = "FORM", hide_possible_values = true)]
+    pub form: Option<Form>,
 }
 
 impl DeviceArgs {
@@ -34,6 +37,7 @@ impl DeviceArgs {
             validate: self.validate,
             serialize: self.serialize,
             cache: self.cache(),
+            form: self.form,
             ..Options::default()
         }
     }

@@ -10,6 +10,7 @@ use ash::vk;
 use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, Allocator, AllocatorCreateDesc};
 
 use super::error::{Error, Named};
+use super::form::Form;
 use super::kernel::Kernel;
 use super::ledger::{Ledger, Rehearsal};
 use super::recorder::Context;
@@ -42,6 +43,8 @@ pub struct Options {
     pub statistics: bool,
     /// Threads of a subgroup in place of the driver's own choice, where the device can.
     pub subgroup_size: Option<u32>,
+    /// Form of the work in place of the one made for the device's kind.
+    pub form: Option<Form>,
 }
 
 /// What a device is and can.

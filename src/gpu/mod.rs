@@ -7,6 +7,7 @@
 pub mod check;
 pub mod device;
 pub mod error;
+pub mod form;
 pub mod hazards;
 pub mod kernel;
 pub mod ledger;
@@ -19,6 +20,7 @@ pub mod timings;
 pub use check::{Check, Difference};
 pub use device::{DeviceInfo, Gpu, Options};
 pub use error::Error;
+pub use form::Form;
 pub use hazards::{Entry, Schedule};
 pub use kernel::{Access, Binding, Kernel, Reference, Slot};
 pub use ledger::Used;

@@ -4,6 +4,7 @@ use std::ops::Deref;
 
 use super::check::Difference;
 use super::device::{Gpu, Options};
+use super::form::Form;
 use super::kernel::Reference;
 use super::recorder::Threads;
 
@@ -29,6 +30,11 @@ pub fn gpu_with(options: Options) -> TestGpu {
         Ok(gpu) => TestGpu(gpu),
         Err(error) => panic!("tests need a Vulkan device and the validation layer: {error}"),
     }
+}
+
+/// As [`gpu`], opened once for each form of the work, one after the other.
+pub fn gpu_in_both_forms() -> impl Iterator<Item = TestGpu> {
+    Form::ALL.into_iter().map(|form| gpu_with(Options { form: Some(form), ..Options::default() }))
 }
 
 impl Deref for TestGpu {

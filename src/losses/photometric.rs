@@ -8,24 +8,27 @@ use crate::gpu::kernels::losses::{
     photometric_gradient as gradient, photometric_gradient_l1 as gradient_l1,
     photometric_gradient_l1_weighted as gradient_l1_weighted, photometric_gradient_weighted as gradient_weighted,
     photometric_gradient_weighted_outside as gradient_outside, photometric_rows as rows,
-    photometric_rows_outside as rows_outside,
+    photometric_rows_outside as rows_outside, photometric_rows_outside_wide as rows_outside_wide,
+    photometric_rows_wide as rows_wide,
 };
-use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
+use crate::gpu::{Buffer, Check, Error, Form, Gpu, Recorder, Reference};
 use crate::math::ssim;
 
 use super::sum;
 
 /// Pixels that a thread makes along the blur's direction; RUN in the kernels.
 const RUN: usize = 8;
+/// Pixels of a thread in the form for GPUs of `photometric_rows`.
+const WIDE_RUN: u32 = 4;
 
 /// With `weight` both pictures agree where it is 0.
 fn rows_reference(
     [rendered, target]: [&[[f32; 3]]; 2],
     weight: Option<&[f32]>,
     moments: &mut [[f32; 4]],
-    push: rows::Push,
+    size: [u32; 2],
 ) {
-    let [width, height] = push.size.map(|v| v as usize);
+    let [width, height] = size.map(|v| v as usize);
     for y in 0..height {
         for x in 0..width {
             for c in 0..3 {
@@ -48,24 +51,24 @@ fn rows_reference(
 /// At most 18 roundings of 6e-8 each of terms no larger than the squared contrast of the run's surroundings.
 const ROWS: Check = Check { relative: 1e-5, absolute: 2e-6, band: 0.0 };
 
-impl Reference for rows::Kernel {
-    fn reference(host: rows::Host<'_>, push: rows::Push, (): ()) {
-        rows_reference([host.rendered, host.target], None, host.moments, push);
-    }
-    fn check(_binding: &'static str) -> Check {
-        ROWS
-    }
+macro_rules! rows_twin {
+    ($module:ident $(, $weight:ident)?) => {
+        impl Reference for $module::Kernel {
+            fn reference(host: $module::Host<'_>, push: $module::Push, (): ()) {
+                let mut _weight = None;
+                $(_weight = Some(host.$weight);)?
+                rows_reference([host.rendered, host.target], _weight, host.moments, push.size);
+            }
+            fn check(_binding: &'static str) -> Check {
+                ROWS
+            }
+        }
+    };
 }
-
-impl Reference for rows_outside::Kernel {
-    fn reference(host: rows_outside::Host<'_>, push: rows_outside::Push, (): ()) {
-        let push = bytemuck::cast(push);
-        rows_reference([host.rendered, host.target], Some(host.weight), host.moments, push);
-    }
-    fn check(_binding: &'static str) -> Check {
-        ROWS
-    }
-}
+rows_twin!(rows);
+rows_twin!(rows_wide);
+rows_twin!(rows_outside, weight);
+rows_twin!(rows_outside_wide, weight);
 
 fn columns_reference(
     moments: &[[f32; 4]],
@@ -262,6 +265,11 @@ fn row_runs([width, height]: [u32; 2]) -> u32 {
     width.div_ceil(RUN as u32) * height
 }
 
+/// Runs along rows in the form for GPUs.
+fn wide_runs([width, height]: [u32; 2]) -> u32 {
+    width.div_ceil(WIDE_RUN) * height
+}
+
 /// Runs along columns.
 fn column_runs([width, height]: [u32; 2]) -> u32 {
     width * height.div_ceil(RUN as u32)
@@ -357,12 +365,17 @@ impl Photometric {
             return grad_rendered;
         };
         let outside = weight.filter(|_| !self.across);
-        match outside {
-            None => rec.run(rows::Kernel, rows::Buffers { rendered, target, moments }, rows::Push { size }, across),
-            Some(weight) => {
-                let buffers = rows_outside::Buffers { rendered, target, moments, weight };
-                rec.run(rows_outside::Kernel, buffers, rows_outside::Push { size }, across);
-            }
+        macro_rules! rows {
+            ($module:ident, $threads:expr $(, $weight:ident)?) => {{
+                let buffers = $module::Buffers { rendered, target, moments $(, $weight)? };
+                rec.run($module::Kernel, buffers, $module::Push { size }, $threads);
+            }};
+        }
+        match (outside, rec.gpu().form()) {
+            (None, Form::Cpu) => rows!(rows, across),
+            (None, Form::Gpu) => rows!(rows_wide, wide_runs(size)),
+            (Some(weight), Form::Cpu) => rows!(rows_outside, across, weight),
+            (Some(weight), Form::Gpu) => rows!(rows_outside_wide, wide_runs(size), weight),
         }
         match weight {
             None => {
@@ -402,6 +415,7 @@ impl Photometric {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::gpu::Kernel as _;
     use crate::gpu::testing::{self, UNWRITTEN};
     use rand::{RngExt, SeedableRng};
 
@@ -446,6 +460,8 @@ mod tests {
                     moments: vec![[UNWRITTEN; 4]; n + 2],
                 };
                 testing::assert_twin(rows::Kernel, &gpu, case.clone(), rows::Push { size }, row_runs(size));
+                let wide = rows_wide::Kernel::arrays(&rows::Kernel::words(case.clone()));
+                testing::assert_twin(rows_wide::Kernel, &gpu, wide, rows_wide::Push { size }, wide_runs(size));
                 let moments =
                     testing::run_once::<rows::Kernel>(&gpu, &case, rows::Push { size }, row_runs(size)).moments;
                 let case = columns::Arrays {
@@ -509,7 +525,10 @@ mod tests {
                     moments: vec![[UNWRITTEN; 4]; 3 * rendered.len()],
                     weight: weight.clone(),
                 };
+                let wide = rows_outside_wide::Kernel::arrays(&rows_outside::Kernel::words(outside.clone()));
                 testing::assert_twin(rows_outside::Kernel, &gpu, outside, rows_outside::Push { size }, row_runs(size));
+                let push = rows_outside_wide::Push { size };
+                testing::assert_twin(rows_outside_wide::Kernel, &gpu, wide, push, wide_runs(size));
                 let case = gradient_outside::Arrays { grad_rows, rendered, target, grad_rendered, partial, weight };
                 let push = gradient_outside::Push { size, factor: 0.7, first };
                 testing::assert_twin(gradient_outside::Kernel, &gpu, case, push, down);

@@ -7,7 +7,7 @@
 use std::ops::Range;
 
 use crate::gpu::kernels::primitives::{sort_count, sort_scan, sort_scatter, sort_scatter_index};
-use crate::gpu::{Buffer, Error, Gpu, Recorder, Reference};
+use crate::gpu::{Buffer, Error, Form, Gpu, Recorder, Reference};
 
 use super::dispatch::{Blocks, Count, Shape};
 
@@ -152,7 +152,7 @@ impl Sort {
     /// # Errors
     /// As [`Gpu::buffer`].
     pub fn new(gpu: &Gpu, capacity: u32) -> Result<Self, Error> {
-        Self::tuned(gpu, capacity, if gpu.info().kind == "cpu" { CPU } else { GPU })
+        Self::tuned(gpu, capacity, if gpu.form() == Form::Cpu { CPU } else { GPU })
     }
 
     pub(crate) fn tuned(gpu: &Gpu, capacity: u32, tuning: Tuning) -> Result<Self, Error> {

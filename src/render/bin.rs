@@ -148,9 +148,9 @@ pub enum Tiling {
 }
 
 impl Tiling {
-    /// The better shape for a device: narrow where its subgroups have 8 threads.
-    pub fn of(subgroup_size: u32) -> Self {
-        if subgroup_size == 8 { Self::Narrow } else { Self::Wide }
+    /// The better shape for a device: narrow where kernels of lanes are taken.
+    pub fn of(gpu: &Gpu) -> Self {
+        if gpu.lanes() { Self::Narrow } else { Self::Wide }
     }
     /// Side of a tile in pixels.
     pub fn side(self) -> u32 {

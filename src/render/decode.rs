@@ -5,11 +5,11 @@
 //! computed for those alone. What is not listed is not written. On the way back those of them that touch no tile have a
 //! gradient of 0, whatever its arrays hold.
 //!
-//! Both layers and all their gradients are matrix products in which a thread holds a tile of the result in registers
-//! (16 units of 8 anchors, of 16 on a CPU, whose loads cost more than what does not fit its registers), so that a load
-//! serves several products; Gaussians of one thread have the same k and so the same weights. In the forms of lanes, for
-//! CPU drivers with subgroups of 8, the lanes also share what they load: the sums are the same. Activations are kept from
-//! the forward pass: 40 + 96 values per visible anchor, 11 K padded to heads of 8 more for the backward pass; at K = 10
+//! Both layers and all their gradients are matrix products. In the form for GPUs a workgroup takes blocks of both operands
+//! through shared memory, and a thread sums 4 x 4 of the result in registers (`product.glsl`); the second layer, whose
+//! Gaussians are few of each k, has 2 Gaussians to a thread. In the form of lanes, for CPU drivers with subgroups of 8, a
+//! thread has 16 units of 8 anchors, or outputs of 16 Gaussians, and the lanes share what they load; Gaussians of one
+//! thread have the same k and so the same weights. Activations are kept from the forward pass: 40 + 96 values per visible anchor, 11 K padded to heads of 8 more for the backward pass; at K = 10
 //! each of these buffers stays below 128 MiB up to 240,000 visible anchors.
 //!
 //! Weight gradients sum in a fixed tree: in float32 over chunks of 64 anchors, of 64 listed Gaussians of the same k (more
@@ -21,11 +21,11 @@ use super::slots::Slots;
 use crate::gpu::kernels::render::{
     decode, decode_backward, decode_backward_feature, decode_backward_feature_lanes, decode_backward_first,
     decode_backward_first_lanes, decode_backward_fixed, decode_backward_fixed_offset, decode_backward_fixed_scaling,
-    decode_backward_hidden, decode_backward_hidden_lanes, decode_backward_second, decode_backward_weights,
-    decode_backward_weights_second, decode_hidden, decode_hidden_lanes, decode_input, decode_lists, decode_opacity,
-    decode_pack,
+    decode_backward_hidden, decode_backward_hidden_lanes, decode_backward_second, decode_backward_second_wide,
+    decode_backward_weights, decode_backward_weights_second, decode_hidden, decode_hidden_lanes, decode_input,
+    decode_lists, decode_opacity, decode_pack,
 };
-use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Kernel, Recorder, Reference};
+use crate::gpu::{Buffer, Check, Error, Form, Gpu, Groups, Kernel, Recorder, Reference};
 use crate::math::camera::{from_center, split};
 use crate::math::decoder::{
     FEATURE, Gaussian, HEADS, HIDDEN, INPUT, Layout, activate, activate_backward, input, outputs_of,
@@ -39,8 +39,10 @@ const GROUP: u32 = 64;
 const UNITS: u32 = 16;
 /// Opacities of an anchor in a thread.
 const OPACITIES: u32 = 5;
-/// Threads that sum one chunk of the first layer's weight gradients.
-const FIRST_PARTS: u32 = 24;
+/// Anchors of a block of a product: in the forms for GPUs, where a workgroup has one.
+const BLOCK_ANCHORS: u32 = 32;
+/// Threads of the gradient of one Gaussian's second layer in its form for GPUs.
+const SECOND_THREADS: u32 = 88;
 /// In the forms of lanes: threads of a workgroup, its anchors, and parts of the hidden units.
 const LANES: u32 = 8;
 const LANES_ANCHORS: u32 = 64;
@@ -69,14 +71,9 @@ fn chunk_listed(listed: usize) -> usize {
     BLOCK * listed.div_ceil(BLOCK * SECOND_CHUNKS).max(1)
 }
 
-/// Anchors or Gaussians of a thread in the kernels that multiply with the weights.
+/// Anchors or Gaussians of a thread in the kernels of the second layer: more share a load, fewer leave registers free.
 fn tile(gpu: &Gpu) -> u32 {
-    if gpu.info().kind == "cpu" { 16 } else { 8 }
-}
-
-/// Whether the forms of lanes are taken.
-fn lanes(gpu: &Gpu) -> bool {
-    gpu.info().kind == "cpu" && gpu.info().subgroup_size == LANES
+    if gpu.form() == Form::Cpu { 16 } else { 2 }
 }
 
 fn wide<const C: usize>(v: [f32; C]) -> [f64; C] {
@@ -411,27 +408,35 @@ fn listed_chunks(segments: &[u32], listed: &[u32], offsets: usize) -> Vec<(usize
         .collect()
 }
 
-impl Reference for decode_backward_second::Kernel {
-    fn reference(host: decode_backward_second::Host<'_>, (): (), constants: decode_backward_second::Constants) {
-        let layout = Layout { offsets: constants.offsets as usize };
-        let head = constants.head as usize;
-        let (hidden, partial) = (host.hidden.as_flattened(), host.partial.as_flattened_mut());
-        for (part, (k, anchors)) in listed_chunks(host.segments, host.listed, layout.offsets).into_iter().enumerate() {
-            let partial = &mut partial[4 * SECOND_VEC4 * part..][..4 * SECOND_VEC4];
-            for (at, (of, output)) in outputs_of(k).enumerate().filter(|(_, (of, _))| *of == head) {
-                let grad = |v: usize| f64::from(host.grad_output[v * layout.rows() + layout.row(of) + output]);
-                for j in 0..HIDDEN {
-                    let product = |&v: &usize| grad(v) * f64::from(hidden[(v * HEADS + head) * HIDDEN + j]);
-                    partial[at * HIDDEN + j] = anchors.iter().map(product).sum::<f64>() as f32;
+/// Of the head that the constants name, or of all.
+macro_rules! backward_second_twin {
+    ($module:ident $(, $head:ident)?) => {
+        impl Reference for $module::Kernel {
+            fn reference(host: $module::Host<'_>, (): (), constants: $module::Constants) {
+                let layout = Layout { offsets: constants.offsets as usize };
+                let wanted = |_of: usize| true $(&& _of == constants.$head as usize)?;
+                let (hidden, partial) = (host.hidden.as_flattened(), host.partial.as_flattened_mut());
+                let chunks = listed_chunks(host.segments, host.listed, layout.offsets);
+                for (part, (k, anchors)) in chunks.into_iter().enumerate() {
+                    let partial = &mut partial[4 * SECOND_VEC4 * part..][..4 * SECOND_VEC4];
+                    for (at, (of, output)) in outputs_of(k).enumerate().filter(|(_, (of, _))| wanted(*of)) {
+                        let grad = |v: usize| f64::from(host.grad_output[v * layout.rows() + layout.row(of) + output]);
+                        for j in 0..HIDDEN {
+                            let product = |&v: &usize| grad(v) * f64::from(hidden[(v * HEADS + of) * HIDDEN + j]);
+                            partial[at * HIDDEN + j] = anchors.iter().map(product).sum::<f64>() as f32;
+                        }
+                        partial[11 * HIDDEN + at] = anchors.iter().map(|&v| grad(v)).sum::<f64>() as f32;
+                    }
                 }
-                partial[11 * HIDDEN + at] = anchors.iter().map(|&v| grad(v)).sum::<f64>() as f32;
+            }
+            fn check(_: &'static str) -> Check {
+                sums(2 * BLOCK)
             }
         }
-    }
-    fn check(_: &'static str) -> Check {
-        sums(2 * BLOCK)
-    }
+    };
 }
+backward_second_twin!(decode_backward_second, head);
+backward_second_twin!(decode_backward_second_wide);
 
 impl Reference for decode_backward_weights::Kernel {
     fn reference(host: decode_backward_weights::Host<'_>, (): (), constants: decode_backward_weights::Constants) {
@@ -584,6 +589,7 @@ pub struct Decode {
     layout: Layout,
     capacity: u32,
     above: f32,
+    form: Form,
     tile: u32,
     lanes: bool,
 }
@@ -609,9 +615,20 @@ impl Decode {
     pub fn of(gpu: &Gpu, capacity: u32, offsets: u32, above: f32) -> Result<Self, Error> {
         let (anchors, layout) = (capacity as usize, Layout { offsets: offsets as usize });
         let slots = anchors * layout.offsets;
-        let lanes = lanes(gpu);
-        let group = if lanes { LANES } else { GROUP };
-        let shapes = [GROUP, group, GROUP, GROUP, group, group, group];
+        let lanes = gpu.lanes();
+        // Workgroups of the passes over hidden units, back through them, to the features, to the first layer.
+        let [hidden, back, feature, first] = if lanes {
+            [LANES; 4]
+        } else {
+            [
+                decode_hidden::Kernel::GROUP,
+                decode_backward_hidden::Kernel::GROUP,
+                decode_backward_feature::Kernel::GROUP,
+                decode_backward_first::Kernel::GROUP,
+            ]
+            .map(|[threads, ..]| threads)
+        };
+        let shapes = [GROUP, hidden, GROUP, GROUP, back, feature, first];
         let [per_anchor, per_hidden, per_opacity, per_flag, per_hidden_backward, per_feature, per_first] =
             dispatch::several(gpu, "anchor groups", shapes)?;
         let [per_existing, per_listed, per_second] = dispatch::several(gpu, "listed groups", [GROUP; 3])?;
@@ -648,6 +665,7 @@ impl Decode {
             layout,
             capacity,
             above,
+            form: gpu.form(),
             tile: tile(gpu),
             lanes,
         })
@@ -671,18 +689,18 @@ impl Decode {
     /// How many threads the passes over visible anchors have, and those over their slots.
     fn count(&self, rec: &mut Recorder<'_>, visible_count: &Buffer<u32>) {
         let (offsets, tile, lanes) = (self.layout.offsets as u32, self.tile, self.lanes);
-        let units = (HEADS * HIDDEN) as u32 / UNITS;
         let of = |tile: u32, factor: u32| Shape { tile, factor };
-        // The forms of lanes have LANES threads for each tile and part.
-        let shared = |parts: u32| of(LANES_ANCHORS, LANES * parts);
+        // A workgroup for each tile and part.
+        let parts =
+            |groups: &Groups, parts: u32| of(if lanes { LANES_ANCHORS } else { BLOCK_ANCHORS }, groups.group * parts);
         let shapes = [
             (&self.per_anchor, Shape::EACH),
-            (&self.per_hidden, if lanes { shared(LANES_PARTS) } else { of(tile, units) }),
+            (&self.per_hidden, parts(&self.per_hidden, if lanes { LANES_PARTS } else { 1 })),
             (&self.per_opacity, of(tile, offsets.div_ceil(OPACITIES))),
             (&self.per_flag, of(scan::SHAPE.tile, offsets)),
-            (&self.per_hidden_backward, if lanes { shared(HEADS as u32) } else { of(tile, units) }),
-            (&self.per_feature, if lanes { shared(1) } else { of(tile, FEATURE as u32 / UNITS) }),
-            (&self.per_first, of(BLOCK as u32, if lanes { LANES } else { FIRST_PARTS })),
+            (&self.per_hidden_backward, parts(&self.per_hidden_backward, HEADS as u32)),
+            (&self.per_feature, parts(&self.per_feature, 1)),
+            (&self.per_first, of(BLOCK as u32, self.per_first.group)),
         ];
         dispatch::record_several(rec, visible_count, self.capacity, shapes);
     }
@@ -711,7 +729,7 @@ impl Decode {
             rec.run(decode_hidden_lanes::Kernel, buffers, (), &self.per_hidden);
         } else {
             let buffers = decode_hidden::Buffers { groups, packed, inputs, hidden, positive };
-            rec.run_with(decode_hidden::Kernel, decode_hidden::Constants { tile }, buffers, (), &self.per_hidden);
+            rec.run(decode_hidden::Kernel, buffers, (), &self.per_hidden);
         }
         let buffers = decode_opacity::Buffers { groups, packed, hidden, opacity, flags };
         let push = decode_opacity::Push { above: self.above };
@@ -720,7 +738,7 @@ impl Decode {
         self.compact.record(rec, flags, listed, listed_count, self.slots());
         let buffers = decode_lists::Buffers { groups, listed, listed_count, segments, bound };
         rec.run_with(decode_lists::Kernel, decode_lists::Constants { offsets }, buffers, (), offsets + 1);
-        let parts = HIDDEN as u32 / UNITS;
+        let parts = if self.form == Form::Gpu { SECOND_THREADS } else { HIDDEN as u32 / UNITS };
         let shapes = [
             (&existing.groups, Shape::EACH),
             (&self.per_listed, Shape { tile, factor: 1 }),
@@ -838,7 +856,7 @@ impl DecodeBackward {
             return;
         }
         let grad_hidden = self.grad_hidden.as_ref().expect("made with features or weights");
-        let Decode { packed, inputs, hidden, positive, segments, existing, tile, lanes, .. } = forward;
+        let Decode { packed, inputs, hidden, positive, segments, existing, form, lanes, .. } = forward;
         let listed = &existing.list;
         let groups = &forward.per_hidden_backward;
         if *lanes {
@@ -848,13 +866,13 @@ impl DecodeBackward {
             rec.run_with(decode_backward_hidden_lanes::Kernel, constants, buffers, (), groups);
         } else {
             let buffers = decode_backward_hidden::Buffers { groups: count, packed, positive, grad_output, grad_hidden };
-            let constants = decode_backward_hidden::Constants { offsets, tile: *tile };
+            let constants = decode_backward_hidden::Constants { offsets };
             rec.run_with(decode_backward_hidden::Kernel, constants, buffers, (), groups);
         }
         if let Some(grad_feature) = to.feature {
             let groups = &forward.per_feature;
+            let grad_feature = &grad_feature.view();
             if *lanes {
-                let grad_feature = &grad_feature.view();
                 let buffers = decode_backward_feature_lanes::Buffers {
                     groups: count,
                     visible,
@@ -866,8 +884,7 @@ impl DecodeBackward {
             } else {
                 let buffers =
                     decode_backward_feature::Buffers { groups: count, visible, packed, grad_hidden, grad_feature };
-                let constants = decode_backward_feature::Constants { tile: *tile };
-                rec.run_with(decode_backward_feature::Kernel, constants, buffers, (), groups);
+                rec.run(decode_backward_feature::Kernel, buffers, (), groups);
             }
         }
         let Some(grad_weights) = to.weights else { return };
@@ -879,12 +896,19 @@ impl DecodeBackward {
             let buffers = decode_backward_first::Buffers { groups: count, inputs, grad_hidden, partial: first };
             rec.run(decode_backward_first::Kernel, buffers, (), &forward.per_first);
         }
-        let rows = self.grad_output.view();
-        for head in 0..HEADS as u32 {
+        let rows = &self.grad_output.view();
+        if *form == Form::Gpu {
             let buffers =
-                decode_backward_second::Buffers { segments, listed, hidden, grad_output: &rows, partial: second };
-            let constants = decode_backward_second::Constants { offsets, head };
-            rec.run_with(decode_backward_second::Kernel, constants, buffers, (), &forward.per_second);
+                decode_backward_second_wide::Buffers { segments, listed, hidden, grad_output: rows, partial: second };
+            let constants = decode_backward_second_wide::Constants { offsets };
+            rec.run_with(decode_backward_second_wide::Kernel, constants, buffers, (), &forward.per_second);
+        } else {
+            for head in 0..HEADS as u32 {
+                let buffers =
+                    decode_backward_second::Buffers { segments, listed, hidden, grad_output: rows, partial: second };
+                let constants = decode_backward_second::Constants { offsets, head };
+                rec.run_with(decode_backward_second::Kernel, constants, buffers, (), &forward.per_second);
+            }
         }
         let buffers = decode_backward_weights::Buffers { groups: count, partial: first, grad_weights };
         let constants = decode_backward_weights::Constants { offsets };
@@ -981,7 +1005,7 @@ mod tests {
         let every = [(0, 10), (1, 10), (63, 10), (64, 10), (65, 10), (1000, 10), (65, 5), (3, 1), (130, 20)];
         // Tiles of both sizes; those that exist, all, none.
         for ((count, offsets), (tile, above)) in
-            every.into_iter().zip([(8, 0.0), (16, 0.0), (16, -2.0), (8, 2.0)].into_iter().cycle())
+            every.into_iter().zip([(2, 0.0), (16, 0.0), (16, -2.0), (2, 2.0)].into_iter().cycle())
         {
             let m = model(&mut rng, count, offsets);
             let (layout, slots, k) = (m.layout(), count * offsets, offsets as u32);
@@ -1021,9 +1045,9 @@ mod tests {
             }
             let case = hidden!(decode_hidden);
             let tiles = |n: usize| n.div_ceil(tile as usize);
-            let constants = decode_hidden::Constants { tile };
+            let blocks = count.div_ceil(BLOCK_ANCHORS as usize);
             let decode_hidden::Arrays { hidden, positive, .. } =
-                twin(decode_hidden::Kernel, &gpu, constants, case, (), tiles(count) * 6);
+                twin(decode_hidden::Kernel, &gpu, (), case, (), blocks * 192);
             let case = decode_opacity::Arrays {
                 groups: m.counted(),
                 packed: packed.clone(),
@@ -1127,8 +1151,8 @@ mod tests {
                 twin(decode_backward_hidden_lanes::Kernel, &gpu, constants, case, (), groups_of(3));
             }
             let case = backward_hidden!(decode_backward_hidden);
-            let constants = decode_backward_hidden::Constants { offsets: k, tile };
-            let threads = tiles(count) * 6;
+            let constants = decode_backward_hidden::Constants { offsets: k };
+            let threads = blocks * 3 * 64;
             let grad_hidden = twin(decode_backward_hidden::Kernel, &gpu, constants, case, (), threads).grad_hidden;
             if shared {
                 let case = decode_backward_feature_lanes::Arrays {
@@ -1145,10 +1169,9 @@ mod tests {
                 visible: m.visible.clone(),
                 packed: packed.clone(),
                 grad_hidden: grad_hidden.clone(),
-                grad_feature: vec![testing::UNWRITTEN; m.feature.len()],
+                grad_feature: unwritten(m.feature.len() / 4),
             };
-            let constants = decode_backward_feature::Constants { tile };
-            twin(decode_backward_feature::Kernel, &gpu, constants, case, (), tiles(count) * 2);
+            twin(decode_backward_feature::Kernel, &gpu, (), case, (), blocks * 64);
             let parts = count.div_ceil(BLOCK);
             if shared {
                 let case = decode_backward_first_lanes::Arrays {
@@ -1165,7 +1188,7 @@ mod tests {
                 grad_hidden: grad_hidden.clone(),
                 partial: unwritten(parts * FIRST_VEC4 + 3),
             };
-            let first = twin(decode_backward_first::Kernel, &gpu, (), case, (), parts * 24).partial;
+            let first = twin(decode_backward_first::Kernel, &gpu, (), case, (), parts * 240).partial;
             let grad_weights = vec![testing::UNWRITTEN; layout.weights() + 3];
             let chunks = listed_chunks(&segments, &listed, offsets).len();
             let rows = grad_output.into_flattened();
@@ -1181,6 +1204,15 @@ mod tests {
                 let constants = decode_backward_second::Constants { offsets: k, head };
                 second = twin(decode_backward_second::Kernel, &gpu, constants, case, (), chunks * 2).partial;
             }
+            let case = decode_backward_second_wide::Arrays {
+                segments: segments.clone(),
+                listed: listed.clone(),
+                hidden: hidden.clone(),
+                grad_output: rows.clone(),
+                partial: unwritten(chunks * SECOND_VEC4 + 3),
+            };
+            let constants = decode_backward_second_wide::Constants { offsets: k };
+            twin(decode_backward_second_wide::Kernel, &gpu, constants, case, (), chunks * SECOND_THREADS as usize);
             let case = decode_backward_weights::Arrays { groups: m.counted(), partial: first, grad_weights };
             let constants = decode_backward_weights::Constants { offsets: k };
             let grad_weights =
@@ -1209,7 +1241,7 @@ mod tests {
             grad_hidden: random(&mut rng, count * HIDDEN_VEC4, -1.0, 1.0),
             partial: unwritten(parts * FIRST_VEC4 + 3),
         };
-        let partial = twin(decode_backward_first::Kernel, &gpu, (), case, (), parts * 24).partial;
+        let partial = twin(decode_backward_first::Kernel, &gpu, (), case, (), parts * 240).partial;
         let grad_weights = vec![testing::UNWRITTEN; layout.weights() + 3];
         let case = decode_backward_weights::Arrays { groups, partial, grad_weights };
         let constants = decode_backward_weights::Constants { offsets: 9 };

@@ -23,11 +23,10 @@ impl Method {
     /// # Errors
     /// [`Error::Missing`] when the device cannot run the tiles asked for.
     pub fn new(gpu: &Gpu, config: &Config) -> Result<Self, Error> {
-        let best = Tiling::of(gpu.info().subgroup_size);
         let tiling = match config.tiles {
-            Tiles::Auto => best,
+            Tiles::Auto => Tiling::of(gpu),
             Tiles::Wide => Tiling::Wide,
-            Tiles::Narrow if best == Tiling::Narrow => best,
+            Tiles::Narrow if gpu.info().subgroup_size == Tiling::Narrow.threads() => Tiling::Narrow,
             Tiles::Narrow => {
                 return Err(Error::Missing {
                     device: gpu.info().name.clone(),

@@ -188,8 +188,8 @@ fn saturated(gpu: &Gpu) {
     assert!(want == 0.0 && got < 1e-4, "gradient of the similarity {got:e}, {want:e}");
 }
 
-/// A logit is a sum of 64 products of projections, each a sum of 32 products: 16 + 3 and 8 + 3 roundings on a term's way,
-/// twice the latter, 40 altogether and 10 to spare, of the sum of magnitudes A: e = 50 u A / 8. Shares are then within
+/// A logit is a sum of 64 products of projections, each a sum of 32 products: 16 + 3 and 8 + 3 roundings on a term's way
+/// (8 + 8 and 8 + 4 in the form for GPUs), twice the latter, 41 altogether at most and 9 to spare, of the sum of magnitudes A: e = 50 u A / 8. Shares are then within
 /// exp(2 e) of their own, and an attended value moves by at most (exp(2 e) - 1) sum p |v - mean|.
 fn enormous(gpu: &Gpu) {
     for n in [[64, 64], [1, 200], [33, 12]] {

@@ -19,7 +19,7 @@ mod primitives;
 mod project;
 mod screen;
 
-use gscream_vk::gpu::{Gpu, testing};
+use gscream_vk::gpu::{Form, Gpu, Options, testing};
 use libtest_mimic::{Arguments, Trial};
 
 /// A case and what is guaranteed for it.
@@ -53,6 +53,9 @@ fn cases() -> Vec<&'static Case> {
     stages.into_iter().flatten().collect()
 }
 
+/// Stages whose work takes another form on a GPU.
+const FORMED: [&str; 5] = ["attention", "bin", "bin, rasterize", "cull to decode_backward", "decode"];
+
 fn table(cases: &[&Case]) -> String {
     let mut text = String::from("| stage | case | guarantee |\n| --- | --- | --- |\n");
     for Case { stage, case, guarantee, .. } in cases {
@@ -65,18 +68,20 @@ fn main() {
     let arguments = Arguments::from_args();
     let cases = cases();
     let guarantees = table(&cases);
-    let mut trials: Vec<Trial> = cases
-        .into_iter()
-        .map(|case| {
-            let trial = Trial::test(format!("{}: {}", case.stage, case.case), || {
-                let gpu = testing::gpu();
-                (case.run)(&gpu);
-                Ok(())
-            });
-            // Minutes: `.ci/run` has it.
-            trial.with_ignored_flag(long::CASES.iter().any(|long| long.case == case.case))
-        })
-        .collect();
+    let trial = |case: &'static Case, form: Option<Form>| {
+        let name = format!("{}: {}{}", case.stage, case.case, form.map_or("", |_| " (form of GPUs)"));
+        let trial = Trial::test(name, move || {
+            let gpu = testing::gpu_with(Options { form, ..Options::default() });
+            (case.run)(&gpu);
+            Ok(())
+        });
+        // Minutes: `.ci/run` has it.
+        trial.with_ignored_flag(long::CASES.iter().any(|long| long.case == case.case))
+    };
+    let mut trials: Vec<Trial> = cases.iter().map(|case| trial(case, None)).collect();
+    // On a CPU driver, what has a form for GPUs is tried in that form, too.
+    let formed = cases.iter().filter(|case| FORMED.contains(&case.stage));
+    trials.extend(formed.map(|case| trial(case, Some(Form::Gpu))));
     trials.push(Trial::test("guarantees", move || {
         insta::with_settings!({snapshot_path => "../snapshots", prepend_module_to_snapshot => false}, {
             insta::assert_snapshot!("extreme__guarantees", guarantees);

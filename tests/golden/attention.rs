@@ -1,6 +1,6 @@
 //! Golden cases of kind `attention`.
 
-use gscream_vk::gpu::{Check, testing};
+use gscream_vk::gpu::{Check, Gpu, testing};
 use gscream_vk::math::attention::{FEATURE, TENSORS, WEIGHTS};
 use gscream_vk::model::attention::{Attention, Pair};
 
@@ -15,7 +15,10 @@ fn check(name: &str) -> Check {
 
 #[test]
 fn attention() {
-    let gpu = testing::gpu();
+    testing::gpu_in_both_forms().for_each(|gpu| attention_in_one_form(&gpu));
+}
+
+fn attention_in_one_form(gpu: &Gpu) {
     for case in cases("attention") {
         let check = check(&case.name);
         let n = ["inside", "around"].map(|side| case.shape(side)[0]);
@@ -32,7 +35,7 @@ fn attention() {
         let weights = gpu.upload("weights", &flat).expect("memory for the case");
         let grad_weights = gpu.upload("grad_weights", &vec![testing::UNWRITTEN; WEIGHTS]).expect("memory for the case");
         let tokens = gpu.upload("tokens", &n.map(|n| n as u32)).expect("memory for the case");
-        let attention = Attention::new(&gpu, capacity as u32).expect("memory for the case");
+        let attention = Attention::new(gpu, capacity as u32).expect("memory for the case");
         let features = Pair { inside: &inside, around: &around };
         let upstream = Pair { inside: &up_inside, around: &up_around };
         let mut rec = gpu.recorder().expect("a recorder");

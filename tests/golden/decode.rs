@@ -1,6 +1,6 @@
 //! Golden cases of kind `decode`.
 
-use gscream_vk::gpu::{Buffer, Check, testing};
+use gscream_vk::gpu::{Buffer, Check, Gpu, testing};
 use gscream_vk::render::decode::{AnchorGradients, Anchors, Decode, DecodeBackward, GaussianGradients};
 
 use crate::support::cases;
@@ -16,7 +16,10 @@ fn by_slot<T: Copy>(rows: &[T], [n, k]: [usize; 2]) -> Vec<T> {
 
 #[test]
 fn decode() {
-    let gpu = testing::gpu();
+    testing::gpu_in_both_forms().for_each(|gpu| decode_in_one_form(&gpu));
+}
+
+fn decode_in_one_form(gpu: &Gpu) {
     let fine = "the device runs a small case";
     for case in cases("decode") {
         let shape = case.shape("offset");
@@ -48,8 +51,8 @@ fn decode() {
         let (to_feature, to_scaling) = (empty("grad_feature", n * 32), empty("grad_log_scaling", n * 6));
         let to_weights = empty("grad_weights", flat.len());
         let to_offset = gpu.upload("grad_offset", &vec![[testing::UNWRITTEN; 3]; n * k]).expect(fine);
-        let forward = Decode::of(&gpu, n as u32, k as u32, Decode::ALL).expect(fine);
-        let backward = DecodeBackward::new(&gpu, &forward).expect(fine);
+        let forward = Decode::of(gpu, n as u32, k as u32, Decode::ALL).expect(fine);
+        let backward = DecodeBackward::new(gpu, &forward).expect(fine);
         let anchors = Anchors {
             position: &position,
             feature: &feature,

@@ -1,6 +1,6 @@
 //! Golden cases of kind `rasterize`: binning, blending and its gradients, on every tiling the device can run.
 
-use gscream_vk::gpu::{Check, testing};
+use gscream_vk::gpu::{Check, Gpu, testing};
 use gscream_vk::math::camera::{factors, factors_backward};
 use gscream_vk::primitives::Count;
 use gscream_vk::primitives::limit::Limits;
@@ -71,7 +71,10 @@ fn narrow(v: [f64; 3]) -> [f32; 3] {
 
 #[test]
 fn rasterize() {
-    let gpu = testing::gpu();
+    testing::gpu_in_both_forms().for_each(|gpu| rasterize_in_one_form(&gpu));
+}
+
+fn rasterize_in_one_form(gpu: &Gpu) {
     let tilings: &[Tiling] =
         if gpu.info().subgroup_size == 8 { &[Tiling::Wide, Tiling::Narrow] } else { &[Tiling::Wide] };
     for case in cases("rasterize") {
@@ -91,14 +94,14 @@ fn rasterize() {
             let opacity = gpu.upload("opacity", &case.f32("opacity")).unwrap();
             let color = gpu.upload("color", &case.vectors::<3>("color")).unwrap();
             let background = case.vectors::<3>("background")[0];
-            let limits = Limits::new(&gpu).unwrap();
+            let limits = Limits::new(gpu).unwrap();
             let count = gpu.upload("count", &[n]).unwrap();
-            let existing = Slots::all(&gpu, n).unwrap();
+            let existing = Slots::all(gpu, n).unwrap();
             let grid = tiling.grid(size);
             let pairs = n * grid[0] * grid[1];
-            let bin = Bin::new(&gpu, tiling, n, pairs, size).unwrap();
-            let picture = Picture::new(&gpu, size, pixels, Outputs::Transmittance).unwrap();
-            let backward = Backward::new(&gpu, tiling, n as usize, pairs as usize, Outputs::Transmittance).unwrap();
+            let bin = Bin::new(gpu, tiling, n, pairs, size).unwrap();
+            let picture = Picture::new(gpu, size, pixels, Outputs::Transmittance).unwrap();
+            let backward = Backward::new(gpu, tiling, n as usize, pairs as usize, Outputs::Transmittance).unwrap();
             let grad_rgb = gpu.upload("grad_rgb", &case.vectors::<3>("upstream.rgb")).unwrap();
             let grad_z = gpu.upload("grad_depth_map", &case.f32("upstream.z")).unwrap();
             let grad_t = gpu.upload("grad_transmittance", &case.f32("upstream.transmittance")).unwrap();

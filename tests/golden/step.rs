@@ -1,7 +1,7 @@
 //! Golden cases of kind `step`: gradients of the whole step by name, then ten steps' losses.
 
 use gscream_vk::config::Settings;
-use gscream_vk::gpu::{Check, testing};
+use gscream_vk::gpu::{Check, Gpu, testing};
 use gscream_vk::losses::{DepthView, Quantity, Weights};
 use gscream_vk::model::files;
 use gscream_vk::scene::Camera;
@@ -25,7 +25,10 @@ fn camera(case: &Case, view: usize) -> Camera {
 
 #[test]
 fn step() {
-    let gpu = testing::gpu();
+    testing::gpu_in_both_forms().for_each(|gpu| step_in_one_form(&gpu));
+}
+
+fn step_in_one_form(gpu: &Gpu) {
     for case in cases("step") {
         let n = case.shape("anchor")[0];
         let offsets = case.shape("offset")[1];
@@ -58,7 +61,7 @@ fn step() {
         };
         let size = cameras[0].size;
         assert_eq!(size, cameras[1].size);
-        let step = Step::new(&gpu, plan, &settings, &anchors, &files::Weights { tensors }, 0.1).unwrap();
+        let step = Step::new(gpu, plan, &settings, &anchors, &files::Weights { tensors }, 0.1).unwrap();
         let priors = [0, 1].map(|v| gpu.upload("prior", &case.f32(&format!("view{v}.prior"))).unwrap());
         let count = case.shape("losses")[0];
         let mut losses = vec![];
