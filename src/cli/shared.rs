@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, bail};
 
 use crate::config::{Settings, SettingsArgs};
-use crate::gpu::{Gpu, Options};
+use crate::gpu::{Descriptors, Gpu, Options};
 use crate::scene::{self, Scene, synthetic};
 
 /// The word that stands for the built-in scene where a folder is expected.
@@ -24,6 +24,9 @@ pub struct DeviceArgs {
     /// Put a barrier after every pass instead of only where a hazard demands one
     #[arg(long)]
     pub serialize: bool,
+    /// How passes bind buffers: push, or sets, which every device has [default: auto, push where the device can]
+    #[arg(long, value_name = "HOW", default_value = "auto", hide_default_value = true, hide_possible_values = true)]
+    pub descriptors: Descriptors,
 }
 
 impl DeviceArgs {
@@ -33,6 +36,7 @@ impl DeviceArgs {
             device: self.device.clone(),
             validate: self.validate,
             serialize: self.serialize,
+            descriptors: self.descriptors,
             cache: self.cache(),
             ..Options::default()
         }

@@ -2,7 +2,10 @@
 
 use std::ops::Deref;
 
+use clap::ValueEnum as _;
+
 use super::check::Difference;
+use super::descriptors::Descriptors;
 use super::device::{Gpu, Options};
 use super::kernel::Reference;
 use super::recorder::Threads;
@@ -11,7 +14,7 @@ use super::recorder::Threads;
 pub struct TestGpu(Gpu);
 
 /// Opens the device that `GSCREAM_DEVICE` names (the first usable one otherwise) under the Khronos validation layer
-/// with synchronisation validation.
+/// with synchronisation validation. `GSCREAM_DESCRIPTORS` is as `--descriptors`.
 ///
 /// # Panics
 /// Without a device or without the layer: a test that skips the layer would look passed.
@@ -24,11 +27,23 @@ pub fn gpu() -> TestGpu {
 /// # Panics
 /// As [`gpu`].
 pub fn gpu_with(options: Options) -> TestGpu {
-    let device = std::env::var("GSCREAM_DEVICE").ok();
-    match Gpu::open(&Options { device, validate: true, ..options }) {
+    match Gpu::open(&Options { validate: true, ..from_environment(options) }) {
         Ok(gpu) => TestGpu(gpu),
         Err(error) => panic!("tests need a Vulkan device and the validation layer: {error}"),
     }
+}
+
+/// These options with the device and the descriptors that the environment names.
+///
+/// # Panics
+/// When `GSCREAM_DESCRIPTORS` is none of `auto`, `push` and `sets`.
+pub fn from_environment(options: Options) -> Options {
+    let device = std::env::var("GSCREAM_DEVICE").ok().or(options.device);
+    let descriptors = match std::env::var("GSCREAM_DESCRIPTORS") {
+        Ok(word) => Descriptors::from_str(&word, false).unwrap_or_else(|e| panic!("GSCREAM_DESCRIPTORS: {e}")),
+        Err(_) => options.descriptors,
+    };
+    Options { device, descriptors, ..options }
 }
 
 impl Deref for TestGpu {
