@@ -130,9 +130,7 @@ impl Gpu {
             Descriptors::Sets => false,
             Descriptors::Push if info.push_descriptors => true,
             Descriptors::Push => {
-                return Err(missing(
-                    "push descriptors (VK_KHR_push_descriptor); without --descriptors it has sets".into(),
-                ));
+                return Err(missing("push descriptors, which --descriptors sets does without".into()));
             }
         };
         let wanted = Wanted {

@@ -33,15 +33,17 @@ pub fn gpu_with(options: Options) -> TestGpu {
     }
 }
 
-/// These options with the device and the descriptors that the environment names.
+/// These options with the device and, where they say `auto`, the descriptors that the environment names.
 ///
 /// # Panics
 /// When `GSCREAM_DESCRIPTORS` is none of `auto`, `push` and `sets`.
 pub fn from_environment(options: Options) -> Options {
     let device = std::env::var("GSCREAM_DEVICE").ok().or(options.device);
     let descriptors = match std::env::var("GSCREAM_DESCRIPTORS") {
-        Ok(word) => Descriptors::from_str(&word, false).unwrap_or_else(|e| panic!("GSCREAM_DESCRIPTORS: {e}")),
-        Err(_) => options.descriptors,
+        Ok(word) if options.descriptors == Descriptors::Auto => {
+            Descriptors::from_str(&word, false).unwrap_or_else(|e| panic!("GSCREAM_DESCRIPTORS: {e}"))
+        }
+        _ => options.descriptors,
     };
     Options { device, descriptors, ..options }
 }
