@@ -369,7 +369,7 @@ impl<'g> Recorder<'g> {
             for ((binding, slot), want) in K::BINDINGS.iter().zip(&slots).zip(&words) {
                 if binding.access.writes() {
                     let got = self.gpu.read_words(*slot, slot.bytes)?;
-                    differences.push(Difference::of_words(K::NAME, binding, &got, want, K::check(binding.name)));
+                    differences.push(Difference::of_words::<K>(binding, &got, want));
                 }
             }
         }
@@ -841,5 +841,35 @@ impl Drop for Submission<'_> {
             lock(&inner.contexts).push(context);
             inner.ended();
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::testing;
+
+    /// Its fence was never given to the queue: waiting for it would not end.
+    #[test]
+    fn what_the_queue_refused_is_not_waited_for() {
+        let gpu = testing::gpu();
+        for _ in 0..3 {
+            let mut recorder = gpu.recorder().expect("a recorder");
+            let context = recorder.context.take().expect("a device that runs");
+            // SAFETY: in recording, never submitted.
+            unsafe { gpu.inner().device.end_command_buffer(context.commands) }.expect("nothing was recorded");
+            drop(Submission {
+                gpu: &gpu,
+                context: Some(context),
+                submitted: false,
+                rehearsal: None,
+                passes: vec![],
+                schedule: Schedule::default(),
+                differences: vec![],
+                trace: BTreeMap::new(),
+            });
+        }
+        let buffer = gpu.upload("words", &[1u32, 2, 3]).expect("the device goes on");
+        assert_eq!(gpu.read(&buffer).expect("readable"), [1, 2, 3]);
     }
 }

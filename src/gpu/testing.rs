@@ -135,7 +135,7 @@ pub fn assert_twin_with<'t, K: Reference>(
     K::reference(K::host(&mut want), push, constants);
     for ((binding, got), want) in K::BINDINGS.iter().zip(&got).zip(&want) {
         if binding.access.writes() {
-            let difference = Difference::of_words(K::NAME, binding, got, want, K::check(binding.name));
+            let difference = Difference::of_words::<K>(binding, got, want);
             assert!(difference.ok(), "{difference}\npush {push:?}");
         }
     }

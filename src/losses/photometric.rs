@@ -55,6 +55,9 @@ impl Reference for rows::Kernel {
     fn check(_binding: &'static str) -> Check {
         ROWS
     }
+    fn cancels(_binding: &'static str) -> bool {
+        true // variances of flat surroundings
+    }
 }
 
 impl Reference for rows_outside::Kernel {
@@ -64,6 +67,9 @@ impl Reference for rows_outside::Kernel {
     }
     fn check(_binding: &'static str) -> Check {
         ROWS
+    }
+    fn cancels(_binding: &'static str) -> bool {
+        true // variances of flat surroundings
     }
 }
 
