@@ -20,6 +20,7 @@ fn main() -> Result<()> {
     println!("cargo:rerun-if-changed=build.rs");
     let out = PathBuf::from(env::var("OUT_DIR")?);
     let mut tree = Tree::default();
+    let mut interfaces = vec![];
     let mut files: Vec<PathBuf> = walkdir::WalkDir::new("glsl")
         .into_iter()
         .map(|entry| entry.map(walkdir::DirEntry::into_path))
@@ -43,10 +44,34 @@ fn main() -> Result<()> {
             let interface = reflect(plain.as_binary(), &source).with_context(|| format!("in {}", path.display()))?;
             let folders: Vec<String> = folder.iter().map(|f| f.to_string_lossy().into_owned()).collect();
             tree.insert(&folders, stem, rust_module(&name, path, &interface, &spirv));
+            interfaces.push(interface);
         }
     }
-    fs::write(out.join("kernels.rs"), tree.print())?;
+    fs::write(out.join("kernels.rs"), format!("{}{}", extremes(&interfaces), tree.print()))?;
     Ok(())
+}
+
+/// Lanes of a CPU's vectors, and the workgroups of the kernels' forms for CPUs.
+const CPU_LANES: u32 = 8;
+
+/// What the most demanding kernels ask of a device.
+fn extremes(all: &[Interface]) -> String {
+    let most = |of: &dyn Fn(&Interface) -> u32| all.iter().map(of).max().unwrap_or(0);
+    let push = |i: &Interface| i.push.iter().map(|m| m.offset + m.value.size()).max().unwrap_or(0);
+    // Forms for CPUs have a workgroup of one subgroup, and run where it has that width alone.
+    let subgroups = all.iter().filter(|i| i.subgroups && i.group[0] > CPU_LANES).map(|i| i.group[0]);
+    let constant = |doc: &str, name: &str, value: u32| format!("/// {doc}\npub const {name}: u32 = {value};\n");
+    [
+        constant("Most storage buffers that a kernel binds.", "MOST_BUFFERS", most(&|i| i.bindings.len() as u32)),
+        constant("Most bytes of push constants.", "MOST_PUSH_BYTES", most(&push)),
+        constant("Most threads of a workgroup.", "MOST_THREADS", most(&|i| i.group.iter().product())),
+        constant(
+            "Threads in x of the smallest workgroup with subgroup operations: a full subgroup holds no more.",
+            "MOST_SUBGROUP_THREADS",
+            subgroups.min().unwrap_or(0),
+        ),
+    ]
+    .concat()
 }
 
 /// `glsl/` mirrors `src/` (checked when anything in `glsl/` changes): kernel `a/b_backward.comp` belongs to `src/a/b_backward.rs` or `src/a/b.rs`.

@@ -410,3 +410,18 @@ fn what_does_not_fit_is_said_with_what_would() {
     assert!(!hopeless.starts() && hopeless.remedies.is_empty());
     assert!(hopeless.describe().is_some_and(|text| text.contains("no smaller picture")));
 }
+
+/// The last steps that a number holds are no early ones.
+#[test]
+fn rounds_from_the_last_steps_on_never_come() {
+    let scene = common::tiny();
+    let mut settings = common::settings(15);
+    assert!(Plan::new(&scene, &settings).growth);
+    for (from, every) in [(u32::MAX, 100), (u32::MAX - 3, 7), (u32::MAX, 1)] {
+        let densify = &mut settings.densify;
+        (densify.from, densify.until, densify.every) = (from, u32::MAX, every);
+        settings.validate().expect("settings that make sense");
+        let plan = Plan::new(&scene, &settings);
+        assert!(!plan.growth && plan.rounds.is_none(), "from {from}, every {every}: {:?}", plan.rounds);
+    }
+}

@@ -959,6 +959,18 @@ fn names_match_across_folders_and_extensions() {
     assert_eq!(scene.train.iter().map(|v| v.mask.is_some()).collect::<Vec<_>>(), [true, true, false]);
 }
 
+/// Two cameras of a rig number their pictures alike.
+#[test]
+fn a_picture_takes_no_pose_of_another_folder() {
+    let dir = tempfile::tempdir().unwrap();
+    for name in ["cam0/0006", "cam0/0007", "cam1/0006", "cam1/0007"] {
+        save(dir.path().join(format!("images/{name}.png")), &picture(SIZE));
+    }
+    Colmap::new(&["cam0/0006.jpg", "cam0/0007.jpg", "cam1/0006.jpg"], SIZE).binary(&dir.path().join("sparse"));
+    let names: Vec<String> = load(&dir).train.into_iter().map(|view| view.name).collect();
+    assert_eq!(names, ["cam0/0006", "cam0/0007", "cam1/0006"], "cam1/0007 has no pose of its own");
+}
+
 #[test]
 fn smaller_pictures_stand_in_for_missing_ones() {
     let dir = plain();

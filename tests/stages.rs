@@ -172,8 +172,8 @@ fn what_is_absent_has_no_pass_and_no_buffer_in_one_form(gpu: &Gpu) {
 }
 
 fn open(options: Options) -> Gpu {
-    let device = std::env::var("GSCREAM_DEVICE").ok();
-    Gpu::open(&Options { device, validate: true, ..options }).expect("a device and the validation layer")
+    Gpu::open(&testing::from_environment(Options { validate: true, ..options }))
+        .expect("a device and the validation layer")
 }
 
 /// Only recorded, never run: what the layer reports, it reports while recording.

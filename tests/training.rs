@@ -7,7 +7,8 @@ use std::path::PathBuf;
 
 use common::Watch;
 use gscream_vk::config::Settings;
-use gscream_vk::gpu::{Gpu, testing};
+use gscream_vk::gpu::{Descriptors, Gpu, Options, testing};
+use gscream_vk::losses::config::Region;
 use gscream_vk::model::files;
 use gscream_vk::render::view::{Capacity, Renderer};
 use gscream_vk::scene::{self, Scene};
@@ -85,6 +86,20 @@ fn the_same_seed_gives_the_same_bytes_in_one_form(gpu: &Gpu) {
     settings.train.seed = 1;
     let other = train(gpu, &scene, &settings, None);
     assert!(other.model != first.model && other.figures() != first.figures(), "another seed");
+}
+
+#[test]
+fn pushed_or_as_sets_the_buffers_are_the_same() {
+    if !testing::gpu().info().push_descriptors {
+        println!("skipped: this device has sets alone");
+        return;
+    }
+    let (scene, settings) = (scene_without_tests(), common::settings(13));
+    let of = |descriptors| {
+        let gpu = testing::gpu_with(Options { descriptors, ..Options::default() });
+        train(&gpu, &scene, &settings, None)
+    };
+    of(Descriptors::Sets).assert_same(&of(Descriptors::Push), "sets in the place of pushing");
 }
 
 #[test]
@@ -283,6 +298,67 @@ fn what_is_inside_the_mask_counts_on_the_reference_alone() {
     assert_ne!(weighed[3], weighed_painted[3], "the reference is not compared inside its hole");
     // SSIM knows no weight between none and one: where colours weigh nothing, it weighs nothing either.
     assert_eq!(losses(&scene, 0.0)[3], losses(&painted, 0.0)[3], "a weight of 0 counts");
+}
+
+/// The weights of the depth losses, one by one: what is twice as large, to the bit, and what stays.
+#[test]
+fn depth_weighs_on_each_view_what_its_settings_say() {
+    type Change = fn(&mut gscream_vk::losses::config::Depth);
+    let gpu = testing::gpu();
+    let scene = scene_without_tests();
+    let reference = scene.references[0].view;
+    assert_eq!(reference, 3, "it is seen in step 4");
+    let losses = |scene: &Scene, change: Change| -> Vec<[f32; 2]> {
+        let mut settings = common::settings(4);
+        // Powers of two make doubling exact.
+        let depth = &mut settings.losses.depth;
+        (depth.reference_weight, depth.reference_inside_weight, depth.other_weight) = (1.0, 7.0, 0.125);
+        depth.reference_inside_region = Region::Mask;
+        let gradient = &mut depth.gradient;
+        (gradient.weight, gradient.reference_weight, gradient.other_weight) = (0.5, 1.0, 0.125);
+        change(depth);
+        let named = |p: &gscream_vk::train::run::Progress, wanted: &str| {
+            p.losses.iter().find(|(name, _)| *name == wanted).expect("a depth loss").1
+        };
+        let steps = train(&gpu, scene, &settings, None).watch.steps;
+        steps.iter().map(|p| ["depth_l1", "depth_gradient"].map(|name| named(p, name))).collect()
+    };
+    let plain = losses(&scene, |_| {});
+    assert!(plain.iter().flatten().all(|loss| *loss > 0.0), "{plain:?}");
+    // The first step, on another view, has the same model in all runs; so has the fourth where no other view's weight
+    // was changed.
+    let [first, fourth] = [plain[0], plain[3]];
+    let twice = losses(&scene, |d| d.other_weight *= 2.0);
+    assert_eq!(twice[0], [2.0 * first[0], first[1]], "the other views' L1");
+    let twice = losses(&scene, |d| d.gradient.other_weight *= 2.0);
+    assert_eq!(twice[0], [first[0], 2.0 * first[1]], "the other views' gradient");
+    let twice = losses(&scene, |d| (d.reference_weight, d.reference_inside_weight) = (2.0, 14.0));
+    assert_eq!((&twice[..3], twice[3]), (&plain[..3], [2.0 * fourth[0], fourth[1]]), "the reference's L1");
+    let twice = losses(&scene, |d| d.gradient.reference_weight *= 2.0);
+    assert_eq!((&twice[..3], twice[3]), (&plain[..3], [fourth[0], 2.0 * fourth[1]]), "the reference's gradient");
+    let inside = losses(&scene, |d| d.reference_inside_weight = 0.0);
+    assert_eq!(inside[..3], plain[..3]);
+    assert!(inside[3][0] < fourth[0] && inside[3][1] == fourth[1], "{inside:?}: less weight inside than {plain:?}");
+
+    // A prior whose values inside the mask have changed places has the same range.
+    let shuffled = |prior: &mut Option<scene::Prior>, mask: &image::GrayImage| {
+        let values = &mut prior.as_mut().expect("a prior").values;
+        let inside: Vec<usize> = (0..values.len()).filter(|&i| mask.as_raw()[i] != 0).collect();
+        let mut kept: Vec<f32> = inside.iter().map(|&i| values[i]).collect();
+        kept.rotate_left(inside.len() / 2);
+        inside.into_iter().zip(kept).for_each(|(i, value)| values[i] = value);
+    };
+    let mut others = scene.clone();
+    for (_, view) in others.train.iter_mut().enumerate().filter(|(i, _)| *i != reference) {
+        shuffled(&mut view.prior, view.mask.as_ref().expect("a mask"));
+    }
+    assert!(others.train[0].prior != scene.train[0].prior);
+    assert_eq!(losses(&others, |_| {}), plain, "other views' depth is compared inside their masks");
+    let mut hole = scene.clone();
+    shuffled(&mut hole.references[0].prior, scene.train[reference].mask.as_ref().expect("a mask"));
+    let changed = losses(&hole, |_| {});
+    assert_eq!(changed[..3], plain[..3]);
+    assert!(changed[3][0] != fourth[0] && changed[3][1] != fourth[1], "the reference's hole has no depth: {changed:?}");
 }
 
 /// PSNR of the test views, whole and masked, of a short run on the tiny scene with its lengths and its priors in other

@@ -7,12 +7,16 @@ layout(local_size_x = 64) in;
 layout(binding = 0, scalar) readonly buffer Count { uint count[]; };    // [1] items
 layout(binding = 1, scalar) readonly buffer Terms { uint terms[]; };    // [count / items, rounded up] terms
 layout(binding = 2, scalar) writeonly buffer Prefix { uint prefix[]; }; // [count / items, rounded up] sum of the terms before
-layout(binding = 3, scalar) writeonly buffer Total { uint total[]; };   // [1] sum of all terms
+layout(binding = 3, scalar) writeonly buffer Total { uint total[]; };   // [1] sum of all terms, 2^32 - 1 if it is more
 layout(push_constant, scalar) uniform Push {
   uint capacity; // the count is clamped to this
   uint items;    // items per term
 } push;
+// 1 once a sum does not fit: terms are not negative, so a sum that is less than the one before it has wrapped.
+shared uint wrapped;
 void main() {
+  if (scan_thread() == 0u) wrapped = 0u;
+  barrier();
   uint clamped = min(count[0], push.capacity);
   uint n = clamped / push.items + uint(clamped % push.items != 0u);
   uint carry = 0u;
@@ -28,10 +32,13 @@ void main() {
     uint before = carry + exclusive_sum(sum, all);
     for (uint i = 0u; i < 16u; ++i) {
       if (first + i < n) prefix[first + i] = before;
-      before += run[i];
+      uint after = before + run[i];
+      if (after < before) atomicOr(wrapped, 1u);
+      before = after;
     }
     carry += all;
     barrier(); // all have read the sums of this round
   }
-  if (scan_thread() == 0u) total[0] = carry;
+  barrier();
+  if (scan_thread() == 0u) total[0] = wrapped == 0u ? carry : 0xffffffffu;
 }

@@ -38,8 +38,9 @@ fn list(devices: &[DeviceInfo]) -> String {
     let mut text = String::new();
     for d in devices {
         let timestamps = if d.timestamp_period > 0.0 { "" } else { "; no timestamps: --profile measures nothing" };
+        let sets = if d.push_descriptors { "" } else { "; no push descriptors: descriptor sets in their place" };
         let usable = if d.lacks.is_empty() {
-            format!("usable{timestamps}")
+            format!("usable{sets}{timestamps}")
         } else {
             format!("cannot be used: lacks {}", d.lacks.join(", "))
         };
@@ -72,6 +73,7 @@ mod tests {
             driver: "vendor 1.2".into(),
             api: "1.2.170".into(),
             subgroup_size: 32,
+            push_descriptors: true,
             max_binding_bytes: 128 << 20,
             heap_bytes: 8 << 30,
             shared_bytes: 48 << 10,
@@ -80,6 +82,11 @@ mod tests {
             lacks: vec!["Vulkan 1.3".into(), "synchronization2".into()],
         };
         let modern = DeviceInfo { index: 0, lacks: vec![], timestamp_period: 0.0, ..device.clone() };
+        let plain = DeviceInfo { lacks: vec![], push_descriptors: false, ..device.clone() };
+        assert_eq!(
+            list(&[plain]).lines().last(),
+            Some("   usable; no push descriptors: descriptor sets in their place")
+        );
         assert_eq!(
             list(&[modern, device]),
             "\

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, bail};
 
 use crate::config::{Settings, SettingsArgs};
-use crate::gpu::{Form, Gpu, Options};
+use crate::gpu::{Descriptors, Form, Gpu, Options};
 use crate::scene::{self, Scene, synthetic};
 
 /// The word that stands for the built-in scene where a folder is expected.
@@ -27,6 +27,9 @@ pub struct DeviceArgs {
     /// Kernels for a GPU or for a CPU driver, for comparisons [default: the device's own kind]
     #[arg(long, value_name = "FORM", hide_possible_values = true)]
     pub form: Option<Form>,
+    /// How passes bind buffers: push, or sets, which every device has [default: auto, push where the device can]
+    #[arg(long, value_name = "HOW", default_value = "auto", hide_default_value = true, hide_possible_values = true)]
+    pub descriptors: Descriptors,
 }
 
 impl DeviceArgs {
@@ -36,6 +39,7 @@ impl DeviceArgs {
             device: self.device.clone(),
             validate: self.validate,
             serialize: self.serialize,
+            descriptors: self.descriptors,
             cache: self.cache(),
             form: self.form,
             ..Options::default()

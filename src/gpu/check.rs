@@ -10,6 +10,9 @@ use super::recorder::Threads;
 ///
 /// The defaults allow about a hundred float32 roundings relative to the element (`1e-5`) and sixteen relative to the
 /// largest element of the tensor (`1e-6`), for sums in which terms cancel. A kernel that sums more says so.
+///
+/// Small elements may hide below the largest one's rounding, and a boundary band takes any error. So a tensor as a whole
+/// must also be as long as its twin's and point the same way, and elements must not be zero where the twin's are not.
 #[derive(Clone, Copy, Debug)]
 pub struct Check {
     /// Times the element's magnitude.
@@ -26,6 +29,13 @@ impl Default for Check {
         Self { relative: 1e-5, absolute: 1e-6, band: 0.0 }
     }
 }
+
+/// How far a tensor's length may be from its twin's, whatever single elements may: a thousandth, where the largest ever
+/// seen is 3e-5, or the elements' own allowance where that is more. The cosine follows: two vectors whose difference is
+/// s times their length have a cosine of at least 1 - s^2.
+const WHOLE: f64 = 1e-3;
+/// Below, the twin's value may be zero on a device: it flushes to zero what is less than 1.2e-38, and factors may be.
+const TINY: f64 = 1e-30;
 
 /// How one output tensor of one pass differs from the twin's.
 #[derive(Clone, Debug, serde::Serialize)]
@@ -54,14 +64,20 @@ pub struct Difference {
     pub allowed: usize,
     /// Components that are a number on one side only: no boundary explains one.
     pub broken: usize,
+    /// Components that are zero where the reference is not. One, or one in a thousand, may be: a difference that cancels.
+    pub vanished: usize,
+    /// How far `norm_ratio` may be from 1; none for integers.
+    pub whole: Option<f64>,
     /// Where the worst of them is, and the two values.
     pub worst: Option<(usize, f64, f64)>,
 }
 
 impl Difference {
-    /// True when no more components disagree than the boundary band allows.
+    /// True when no more components disagree than the boundary band allows, and the whole agrees too.
     pub fn ok(&self) -> bool {
-        self.exceeded <= self.allowed && self.broken == 0
+        let whole = self.whole.is_none_or(|s| (self.norm_ratio - 1.0).abs() <= s && self.cosine >= 1.0 - s * s);
+        let vanished = self.vanished <= 1 + self.components / 1000;
+        self.exceeded <= self.allowed && self.broken == 0 && whole && vanished
     }
 
     /// Compares float64 values.
@@ -69,7 +85,7 @@ impl Difference {
         assert_eq!(got.len(), want.len(), "{pass}: {tensor} has another length than its reference");
         let scale = want.iter().filter(|w| w.is_finite()).fold(0.0, |m: f64, w| m.max(w.abs()));
         let (mut error, mut exceeded, mut worst, mut worst_excess): (f64, _, _, f64) = (0.0, 0, None, 0.0);
-        let mut broken = 0;
+        let (mut broken, mut vanished) = (0, 0);
         let (mut dot, mut gg, mut ww, mut dd) = (0.0, 0.0, 0.0, 0.0);
         for (i, (&g, &w)) in got.iter().zip(want).enumerate() {
             if g == w || (g.is_nan() && w.is_nan()) {
@@ -86,6 +102,7 @@ impl Difference {
             gg += g * g;
             ww += w * w;
             dd += distance * distance;
+            vanished += usize::from(g == 0.0 && w.abs() >= TINY);
             broken += usize::from(g.is_nan() != w.is_nan());
             error = if distance.is_nan() { f64::INFINITY } else { error.max(distance) };
             if distance.is_nan() || distance > limit {
@@ -111,12 +128,15 @@ impl Difference {
             exceeded,
             broken,
             allowed: (check.band * got.len() as f64).ceil() as usize,
+            vanished,
+            whole: Some(WHOLE.max(check.relative + check.absolute)),
             worst,
         }
     }
 
-    /// Compares the words of one binding.
-    pub(super) fn of_words(pass: &str, binding: &Binding, got: &[u32], want: &[u32], check: Check) -> Self {
+    /// Compares the words of one of the kernel's bindings with its twin's.
+    pub(super) fn of_words<K: Reference>(binding: &Binding, got: &[u32], want: &[u32]) -> Self {
+        let check = K::check(binding.name);
         debug_assert!(binding.access != Access::Read);
         let values = |words: &[u32]| -> Vec<f64> {
             match binding.scalar {
@@ -127,7 +147,10 @@ impl Difference {
         };
         let discrete = binding.scalar != Scalar::F32;
         let check = if discrete { Check { relative: 0.0, absolute: 0.0, ..check } } else { check };
-        Self { discrete, ..Self::of(pass, binding.name, &values(got), &values(want), check) }
+        let found = Self::of(K::NAME, binding.name, &values(got), &values(want), check);
+        // An integer is right or wrong by itself.
+        let vanished = if discrete || K::cancels(binding.name) { 0 } else { found.vanished };
+        Self { discrete, vanished, whole: found.whole.filter(|_| !discrete), ..found }
     }
 }
 
@@ -180,5 +203,31 @@ mod tests {
         assert!(Difference::of("p", "t", &[5.0, -2.0, 0.0], &want, band).ok());
         assert!(!Difference::of("p", "t", &[1.0, f64::NAN, 0.0], &want, band).ok(), "no band explains a NaN");
         assert!(!Difference::of("p", "t", &[1.0, 2.0, 0.0], &[1.0, f64::NAN, 0.0], band).ok());
+    }
+
+    #[test]
+    fn the_whole_counts_too() {
+        // A component of its own scale, as of a gradient by a length in another unit.
+        let want: Vec<f64> = (1..=3000).map(|i| f64::from(i) * if i % 3 == 0 { 1e-9 } else { 1.0 }).collect();
+        let check = Check::default();
+        let without = |every: usize| -> Vec<f64> {
+            want.iter().enumerate().map(|(i, &w)| if i % every == 2 { 0.0 } else { w }).collect()
+        };
+        let lost = Difference::of("p", "t", &without(3), &want, check);
+        assert_eq!((lost.exceeded, lost.vanished, lost.ok()), (0, 1000, false), "no element is off by itself");
+        assert!(Difference::of("p", "t", &without(1500), &want, check).ok(), "a few differences cancel");
+        let flushed: Vec<f64> = want.iter().map(|w| w * 1e-34).collect();
+        assert!(Difference::of("p", "t", &[1.0, 0.0, 0.0, 0.0], &[&[1.0], &flushed[..3]].concat(), check).ok());
+
+        // What a boundary band would take.
+        let want: Vec<f64> = (0..1000).map(|i| 1.0 + f64::from(i % 7)).collect();
+        let band = Check { band: 0.01, ..check };
+        let off = |factor: f64| -> Vec<f64> {
+            want.iter().enumerate().map(|(i, &w)| if i % 125 == 0 { factor * w } else { w }).collect()
+        };
+        let few = Difference::of("p", "t", &off(1.05), &want, band);
+        assert!(few.exceeded == 8 && few.ok(), "{few}");
+        assert!(!Difference::of("p", "t", &off(1.5), &want, band).ok(), "a norm that is 4 thousandths off");
+        assert!(!Difference::of("p", "t", &off(-1.0), &want, band).ok(), "another direction");
     }
 }

@@ -98,4 +98,10 @@ pub trait Reference: Kernel {
     fn check(_binding: &'static str) -> super::Check {
         super::Check::default()
     }
+
+    /// Whether many of a binding's elements are differences of which float32 may leave nothing where the twin has a
+    /// remainder. Elsewhere zeros are compared with the twin's.
+    fn cancels(_binding: &'static str) -> bool {
+        false
+    }
 }

@@ -283,8 +283,11 @@ impl Gpu {
             }
         };
         // SAFETY: fresh buffer, memory that meets its requirements.
-        unsafe { inner.device.bind_buffer_memory(raw, allocation.memory(), allocation.offset()) }
-            .named("binding a buffer's memory")?;
+        let bound = unsafe { inner.device.bind_buffer_memory(raw, allocation.memory(), allocation.offset()) };
+        if let Err(result) = bound {
+            inner.discard(raw, allocation);
+            return Err(result).named("binding a buffer's memory");
+        }
         inner.name_object(raw, name);
         inner.ledger.open(raw.as_raw(), name, padded);
         let backing = Backing::Real { allocation: Some(allocation), gpu: inner.clone() };

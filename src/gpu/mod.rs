@@ -4,27 +4,33 @@
 //! The recorder knows from the bindings what the pass reads and writes and records a barrier exactly where a hazard
 //! demands one. Every kernel has a CPU twin ([`Reference`]); [`Gpu::checked`] runs both and compares.
 
+mod cache;
 pub mod check;
+pub mod descriptors;
 pub mod device;
 pub mod error;
 pub mod form;
 pub mod hazards;
+mod instance;
 pub mod kernel;
 pub mod ledger;
 pub mod memory;
+mod physical;
 pub mod recorder;
 pub mod statistics;
 pub mod testing;
 pub mod timings;
 
 pub use check::{Check, Difference};
-pub use device::{DeviceInfo, Gpu, Options};
+pub use descriptors::Descriptors;
+pub use device::{Gpu, Options};
 pub use error::Error;
 pub use form::Form;
 pub use hazards::{Entry, Schedule};
 pub use kernel::{Access, Binding, Kernel, Reference, Slot};
 pub use ledger::Used;
 pub use memory::Buffer;
+pub use physical::DeviceInfo;
 pub use recorder::{Groups, NotFinite, Recorder, Submission, Threads};
 pub use statistics::{Compiled, Statistic};
 pub use timings::{Timing, Timings};

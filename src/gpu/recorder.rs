@@ -7,7 +7,8 @@ use ash::vk;
 use gpu_allocator::vulkan::Allocation;
 
 use super::check::Difference;
-use super::device::{Gpu, Inner, lock};
+use super::descriptors::{Sets, with_writes};
+use super::device::{Device, Gpu, Inner, lock};
 use super::error::{Error, Named};
 use super::hazards::{Entry, Hazards, Id, Schedule};
 use super::kernel::{Access, Reference, Scalar};
@@ -66,9 +67,12 @@ pub struct Groups {
     pub group: u32,
 }
 
-/// A command buffer with its queries and markers, used again and again.
+/// A command buffer with its pool, descriptor sets, queries and markers, used again and again. Each has a pool of its own,
+/// so that threads may record at the same time.
 pub(super) struct Context {
+    pool: vk::CommandPool,
     commands: vk::CommandBuffer,
+    sets: Sets,
     queries: vk::QueryPool,
     fence: vk::Fence,
     markers: (vk::Buffer, Allocation),
@@ -76,29 +80,50 @@ pub(super) struct Context {
 
 impl Context {
     fn new(gpu: &Gpu) -> Result<Self, Error> {
-        let inner = gpu.inner();
         // Without its Arc of the device: the device owns its contexts.
         let markers = gpu.stage(NO_STAGE, || gpu.readback::<u32>("markers", MAX_PASSES as usize))?.into_parts();
-        let allocate =
-            vk::CommandBufferAllocateInfo::default().command_pool(inner.command_pool).command_buffer_count(1);
+        let mut context = Self {
+            pool: vk::CommandPool::null(),
+            commands: vk::CommandBuffer::null(),
+            sets: Sets::default(),
+            queries: vk::QueryPool::null(),
+            fence: vk::Fence::null(),
+            markers,
+        };
+        match context.fill(&gpu.inner().device) {
+            Ok(()) => Ok(context),
+            Err(error) => {
+                // SAFETY: nothing has used it.
+                unsafe { context.destroy(gpu.inner()) };
+                Err(error)
+            }
+        }
+    }
+
+    fn fill(&mut self, device: &Device) -> Result<(), Error> {
+        let pool = vk::CommandPoolCreateInfo::default()
+            .queue_family_index(device.family)
+            .flags(vk::CommandPoolCreateFlags::RESET_COMMAND_BUFFER);
         let queries =
             vk::QueryPoolCreateInfo::default().query_type(vk::QueryType::TIMESTAMP).query_count(2 * MAX_PASSES);
         // SAFETY: live device; destroyed in `destroy`.
         unsafe {
-            Ok(Self {
-                commands: inner.device.allocate_command_buffers(&allocate).named("allocating a command buffer")?[0],
-                queries: inner.device.create_query_pool(&queries, None).named("creating a query pool")?,
-                fence: inner.device.create_fence(&vk::FenceCreateInfo::default(), None).named("creating a fence")?,
-                markers,
-            })
+            self.pool = device.create_command_pool(&pool, None).named("creating a command pool")?;
+            let allocate = vk::CommandBufferAllocateInfo::default().command_pool(self.pool).command_buffer_count(1);
+            self.commands = device.allocate_command_buffers(&allocate).named("allocating a command buffer")?[0];
+            self.queries = device.create_query_pool(&queries, None).named("creating a query pool")?;
+            self.fence = device.create_fence(&vk::FenceCreateInfo::default(), None).named("creating a fence")?;
         }
+        Ok(())
     }
 
     /// # Safety
     /// Nothing in flight uses it.
     pub(super) unsafe fn destroy(self, inner: &Inner) {
-        // SAFETY: by the caller's promise. The command buffer goes with its pool.
+        // SAFETY: by the caller's promise. The command buffer goes with its pool; what was never made is null.
         unsafe {
+            inner.device.destroy_command_pool(self.pool, None);
+            self.sets.destroy(&inner.device);
             inner.device.destroy_query_pool(self.queries, None);
             inner.device.destroy_fence(self.fence, None);
             inner.discard(self.markers.0, self.markers.1);
@@ -344,7 +369,7 @@ impl<'g> Recorder<'g> {
             for ((binding, slot), want) in K::BINDINGS.iter().zip(&slots).zip(&words) {
                 if binding.access.writes() {
                     let got = self.gpu.read_words(*slot, slot.bytes)?;
-                    differences.push(Difference::of_words(K::NAME, binding, &got, want, K::check(binding.name)));
+                    differences.push(Difference::of_words::<K>(binding, &got, want));
                 }
             }
         }
@@ -445,27 +470,27 @@ impl<'g> Recorder<'g> {
             return Ok(());
         }
         let pipeline = self.gpu.inner().pipeline::<K>(constants)?;
-        let infos: Vec<_> =
-            slots.iter().map(|s| [vk::DescriptorBufferInfo::default().buffer(s.raw).range(s.bytes)]).collect();
-        let writes: Vec<_> = infos
-            .iter()
-            .zip(K::BINDINGS)
-            .map(|(info, b)| {
-                vk::WriteDescriptorSet::default()
-                    .dst_binding(b.number)
-                    .descriptor_type(vk::DescriptorType::STORAGE_BUFFER)
-                    .buffer_info(info)
-            })
-            .collect();
         let push = bytemuck::bytes_of(push);
         let inner = self.gpu.inner().clone();
+        let set = match (&inner.push_descriptor, &mut self.context) {
+            (None, Some(context)) => {
+                let set = context.sets.get(&inner.device, pipeline.set, K::BINDINGS, slots);
+                set.named("making a descriptor set")?
+            }
+            _ => vk::DescriptorSet::null(),
+        };
         self.pass(K::NAME, &accesses, |commands| {
             let device = &inner.device;
             // SAFETY: live handles; the layout comes from the kernel's own reflection.
             unsafe {
                 device.cmd_bind_pipeline(commands, vk::PipelineBindPoint::COMPUTE, pipeline.raw);
                 let bind_point = vk::PipelineBindPoint::COMPUTE;
-                inner.push_descriptor.cmd_push_descriptor_set(commands, bind_point, pipeline.layout, 0, &writes);
+                match &inner.push_descriptor {
+                    Some(extension) => with_writes(K::BINDINGS, slots, set, |writes| {
+                        extension.cmd_push_descriptor_set(commands, bind_point, pipeline.layout, 0, writes);
+                    }),
+                    None => device.cmd_bind_descriptor_sets(commands, bind_point, pipeline.layout, 0, &[set], &[]),
+                }
                 if !push.is_empty() {
                     device.cmd_push_constants(commands, pipeline.layout, vk::ShaderStageFlags::COMPUTE, 0, push);
                 }
@@ -611,10 +636,11 @@ impl<'g> Recorder<'g> {
             return Ok(());
         }
         let inner = self.gpu.inner();
-        let context = self.context.as_ref().expect("begin comes before submit");
+        let context = self.context.as_mut().expect("begin comes before submit");
         let info = vk::CommandBufferBeginInfo::default().flags(vk::CommandBufferUsageFlags::ONE_TIME_SUBMIT);
         // SAFETY: the context is not in flight: it came from the free list or was waited for.
         unsafe {
+            context.sets.recycle(&inner.device).named("recycling descriptor sets")?;
             inner.device.begin_command_buffer(context.commands, &info).named("beginning a command buffer")?;
             if inner.options.timestamps {
                 inner.device.cmd_reset_query_pool(context.commands, context.queries, 0, 2 * MAX_PASSES);
@@ -671,8 +697,8 @@ impl<'g> Recorder<'g> {
         submission.start()?;
         submission.wait()?;
         let context = lock(&self.gpu.inner().contexts).pop();
-        self.gpu.inner().began();
         self.context = Some(context.map_or_else(|| Context::new(self.gpu), Ok)?);
+        self.gpu.inner().began();
         self.begin()
     }
 }
@@ -726,7 +752,7 @@ impl Submission<'_> {
         let result = unsafe {
             inner.device.cmd_pipeline_barrier2(context.commands, &vk::DependencyInfo::default().memory_barriers(&host));
             inner.device.end_command_buffer(context.commands).named("ending a command buffer")?;
-            inner.device.queue_submit2(inner.queue, &submit, context.fence)
+            inner.device.queue_submit2(*lock(&inner.queue), &submit, context.fence)
         };
         self.submitted = result.is_ok();
         self.lost(result)
@@ -815,5 +841,35 @@ impl Drop for Submission<'_> {
             lock(&inner.contexts).push(context);
             inner.ended();
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::testing;
+
+    /// Its fence was never given to the queue: waiting for it would not end.
+    #[test]
+    fn what_the_queue_refused_is_not_waited_for() {
+        let gpu = testing::gpu();
+        for _ in 0..3 {
+            let mut recorder = gpu.recorder().expect("a recorder");
+            let context = recorder.context.take().expect("a device that runs");
+            // SAFETY: in recording, never submitted.
+            unsafe { gpu.inner().device.end_command_buffer(context.commands) }.expect("nothing was recorded");
+            drop(Submission {
+                gpu: &gpu,
+                context: Some(context),
+                submitted: false,
+                rehearsal: None,
+                passes: vec![],
+                schedule: Schedule::default(),
+                differences: vec![],
+                trace: BTreeMap::new(),
+            });
+        }
+        let buffer = gpu.upload("words", &[1u32, 2, 3]).expect("the device goes on");
+        assert_eq!(gpu.read(&buffer).expect("readable"), [1, 2, 3]);
     }
 }

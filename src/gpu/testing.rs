@@ -2,7 +2,10 @@
 
 use std::ops::Deref;
 
+use clap::ValueEnum as _;
+
 use super::check::Difference;
+use super::descriptors::Descriptors;
 use super::device::{Gpu, Options};
 use super::form::Form;
 use super::kernel::Reference;
@@ -12,7 +15,7 @@ use super::recorder::Threads;
 pub struct TestGpu(Gpu);
 
 /// Opens the device that `GSCREAM_DEVICE` names (the first usable one otherwise) under the Khronos validation layer
-/// with synchronisation validation.
+/// with synchronisation validation. `GSCREAM_DESCRIPTORS` is as `--descriptors`.
 ///
 /// # Panics
 /// Without a device or without the layer: a test that skips the layer would look passed.
@@ -25,8 +28,7 @@ pub fn gpu() -> TestGpu {
 /// # Panics
 /// As [`gpu`].
 pub fn gpu_with(options: Options) -> TestGpu {
-    let device = std::env::var("GSCREAM_DEVICE").ok();
-    match Gpu::open(&Options { device, validate: true, ..options }) {
+    match Gpu::open(&Options { validate: true, ..from_environment(options) }) {
         Ok(gpu) => TestGpu(gpu),
         Err(error) => panic!("tests need a Vulkan device and the validation layer: {error}"),
     }
@@ -35,6 +37,21 @@ pub fn gpu_with(options: Options) -> TestGpu {
 /// As [`gpu`], opened once for each form of the work, one after the other.
 pub fn gpu_in_both_forms() -> impl Iterator<Item = TestGpu> {
     Form::ALL.into_iter().map(|form| gpu_with(Options { form: Some(form), ..Options::default() }))
+}
+
+/// These options with the device and, where they say `auto`, the descriptors that the environment names.
+///
+/// # Panics
+/// When `GSCREAM_DESCRIPTORS` is none of `auto`, `push` and `sets`.
+pub fn from_environment(options: Options) -> Options {
+    let device = std::env::var("GSCREAM_DEVICE").ok().or(options.device);
+    let descriptors = match std::env::var("GSCREAM_DESCRIPTORS") {
+        Ok(word) if options.descriptors == Descriptors::Auto => {
+            Descriptors::from_str(&word, false).unwrap_or_else(|e| panic!("GSCREAM_DESCRIPTORS: {e}"))
+        }
+        _ => options.descriptors,
+    };
+    Options { device, descriptors, ..options }
 }
 
 impl Deref for TestGpu {
@@ -124,7 +141,7 @@ pub fn assert_twin_with<'t, K: Reference>(
     K::reference(K::host(&mut want), push, constants);
     for ((binding, got), want) in K::BINDINGS.iter().zip(&got).zip(&want) {
         if binding.access.writes() {
-            let difference = Difference::of_words(K::NAME, binding, got, want, K::check(binding.name));
+            let difference = Difference::of_words::<K>(binding, got, want);
             assert!(difference.ok(), "{difference}\npush {push:?}");
         }
     }

@@ -125,6 +125,9 @@ impl Reference for align_moments::Kernel {
     fn check(_binding: &'static str) -> Check {
         MOMENTS
     }
+    fn cancels(_binding: &'static str) -> bool {
+        true // sums of distances from the mean
+    }
 }
 
 impl Reference for align_moments_masked::Kernel {
@@ -134,6 +137,9 @@ impl Reference for align_moments_masked::Kernel {
     }
     fn check(_binding: &'static str) -> Check {
         MOMENTS
+    }
+    fn cancels(_binding: &'static str) -> bool {
+        true // sums of distances from the mean
     }
 }
 

@@ -90,6 +90,9 @@ impl Reference for depth_gradient::Kernel {
     fn check(binding: &'static str) -> Check {
         check(binding)
     }
+    fn cancels(binding: &'static str) -> bool {
+        binding == "grad_aligned" // steps up and down beside each other
+    }
 }
 
 impl Reference for depth_gradient_masked::Kernel {
@@ -100,6 +103,9 @@ impl Reference for depth_gradient_masked::Kernel {
     }
     fn check(binding: &'static str) -> Check {
         check(binding)
+    }
+    fn cancels(binding: &'static str) -> bool {
+        binding == "grad_aligned" // steps up and down beside each other
     }
 }
 

@@ -62,6 +62,9 @@ macro_rules! rows_twin {
             fn check(_binding: &'static str) -> Check {
                 ROWS
             }
+            fn cancels(_binding: &'static str) -> bool {
+                true // variances of flat surroundings
+            }
         }
     };
 }

@@ -17,6 +17,10 @@ impl Reference for sum::Kernel {
         // 571,536 pixels. Where terms cancel, the largest sum is the measure.
         Check { relative: 4e-6, absolute: 4e-6, band: 0.0 }
     }
+
+    fn cancels(_binding: &'static str) -> bool {
+        true // few sums, of terms of either sign
+    }
 }
 
 /// Writes `sums[first + row]` = the sum of `partial[row * count ..][.. count]` for every row.

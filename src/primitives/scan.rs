@@ -1,4 +1,5 @@
-//! Exclusive prefix sums of unsigned integers, modulo 2^32.
+//! Exclusive prefix sums of unsigned integers, modulo 2^32. The sum of all terms stops at 2^32 - 1 instead, so that too
+//! large a sum is never taken for a small one. A block's sum has to fit, as it does for terms below 2^22.
 //!
 //! Sums of blocks, their scan by one workgroup, and a second walk over the terms: three passes, two reads and one write
 //! per term. Few terms are scanned by one workgroup alone.
@@ -37,12 +38,12 @@ impl Reference for scan_sums_nonzero::Kernel {
 impl Reference for scan_totals::Kernel {
     fn reference(host: scan_totals::Host<'_>, push: scan_totals::Push, (): ()) {
         let n = host.count[0].min(push.capacity).div_ceil(push.items) as usize;
-        let mut sum = 0u32;
+        let mut sum = 0u64;
         for (prefix, &term) in host.prefix.iter_mut().zip(&host.terms[..n]) {
-            *prefix = sum;
-            sum = sum.wrapping_add(term);
+            *prefix = sum as u32;
+            sum += u64::from(term);
         }
-        host.total[0] = sum;
+        host.total[0] = sum.min(u32::MAX.into()) as u32;
     }
 }
 
@@ -96,7 +97,8 @@ impl Scan {
         self.capacity
     }
 
-    /// `prefix[i] = terms[0] + ... + terms[i-1]` for every i below the count, and `total[0]` the sum of all.
+    /// `prefix[i] = terms[0] + ... + terms[i-1]` modulo 2^32 for every i below the count, and `total[0]` the sum of all,
+    /// or 2^32 - 1 if it is more. Terms are below 2^22.
     ///
     /// `terms` and `prefix` hold at least `count` elements; elements of `prefix` from the count on are left as they
     /// are. No two of the buffers may be the same, the count's included.
@@ -144,9 +146,15 @@ mod tests {
     const SIZES: [usize; 13] = [0, 1, 63, 64, 65, 1000, 1023, 1024, 1025, 2049, 4096, 4097, 100_003];
     const PATTERN: u32 = 0xdead_beef;
 
+    /// Of up to 32 bits each, so that any two may wrap.
     fn random(n: usize) -> Vec<u32> {
         let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(n as u64);
         (0..n).map(|_| if rng.random_bool(0.3) { 0 } else { rng.random() }).collect()
+    }
+
+    /// Of up to 22 bits each.
+    fn random_small(n: usize) -> Vec<u32> {
+        random(n).into_iter().map(|term| term >> 10).collect()
     }
 
     #[test]
@@ -199,20 +207,46 @@ mod tests {
     fn sums_what_is_before() {
         let gpu = testing::gpu();
         for n in SIZES.into_iter().chain([1_000_000]) {
-            let terms = random(n + 3);
+            let terms = random_small(n + 3);
             for capacity in [n as u32, n as u32 + 3, 1_100_000] {
                 let scan = Scan::new(&gpu, capacity).unwrap();
                 for on_device in [false, true] {
                     let (prefix, total) = scanned(&gpu, &scan, &terms, n as u32, on_device);
-                    let mut sum = 0u32;
+                    let mut sum = 0u64;
                     for i in 0..n {
-                        assert_eq!(prefix[i], sum, "prefix {i} of {n}, capacity {capacity}");
-                        sum = sum.wrapping_add(terms[i]);
+                        assert_eq!(prefix[i], sum as u32, "prefix {i} of {n}, capacity {capacity}");
+                        sum += u64::from(terms[i]);
                     }
-                    assert_eq!(total, sum, "total of {n}");
+                    assert_eq!(u64::from(total), sum.min(u32::MAX.into()), "total of {n}");
                     assert!(prefix[n..].iter().all(|&p| p == PATTERN), "beyond the count of {n}");
                 }
             }
+        }
+    }
+
+    /// So that no limit takes a sum beyond 2^32 for a small one.
+    #[test]
+    fn a_total_stops_at_what_32_bits_hold() {
+        let gpu = testing::gpu();
+        for (n, capacity) in [(1025, 4000), (1025, 5000), (5000, 5000)] {
+            let scan = Scan::new(&gpu, capacity).unwrap();
+            let most = u64::from(u32::MAX);
+            let mut terms = vec![(most / n) as u32; n as usize];
+            terms[n as usize / 2] += (most % n) as u32;
+            assert_eq!(terms.iter().map(|&t| u64::from(t)).sum::<u64>(), most);
+            let total = |terms: &[u32]| scanned(&gpu, &scan, terms, terms.len() as u32, true).1;
+            assert_eq!(total(&terms), u32::MAX, "just fits");
+            terms[0] -= 1;
+            assert_eq!(total(&terms), u32::MAX - 1);
+            for at in [0, n as usize - 1] {
+                let mut more = terms.clone();
+                more[at] += 3;
+                assert_eq!(total(&more), u32::MAX, "{n} terms, two too many at {at}");
+            }
+            let largest = (1 << 22) - 1;
+            terms.fill(largest);
+            assert_eq!(total(&terms), u32::MAX, "{n} terms of {largest}");
+            assert_eq!(total(&terms[..1024]), 1024 * largest);
         }
     }
 

@@ -122,7 +122,7 @@ impl Attend {
         let mut rng = random(self.seed, Stream::Patch, step);
         let side = (self.config.patch / photograph.reduction).max(1);
         let patch = patch_position(&mut rng, ([x0, y0], [x1, y1]), side, camera.size);
-        let draw = Draw { patch, seed: (self.seed ^ (self.seed >> 32)) as u32, step };
+        let draw = Draw { patch, seed: folded(self.seed), step };
         let Room { select, sort, blended } = self.room();
         let listed = (&visible.list, &visible.count, anchors.count);
         let candidates = select.candidates(rec, listed, &anchors.position, &photograph.picture, &view, draw);
@@ -164,6 +164,23 @@ impl Attend {
             self.blend.weights_backward(rec, inputs, grad_feature, &self.grad_weights);
         } else {
             self.blend.backward(rec, inputs, grad_feature, &self.grad_weights);
+        }
+    }
+}
+
+/// A seed's 64 bits in 32, each of which counts.
+fn folded(seed: u64) -> u32 {
+    (seed ^ seed >> 32) as u32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_bit_of_a_seed_counts() {
+        for bit in 0..64 {
+            assert_ne!(folded(7), folded(7 ^ 1 << bit), "bit {bit}");
         }
     }
 }

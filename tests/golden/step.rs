@@ -4,6 +4,7 @@ use gscream_vk::config::Settings;
 use gscream_vk::gpu::{Check, Gpu, testing};
 use gscream_vk::losses::{DepthView, Quantity, Weights};
 use gscream_vk::model::files;
+use gscream_vk::primitives::limit::Counter;
 use gscream_vk::scene::Camera;
 use gscream_vk::train::plan::Plan;
 use gscream_vk::train::step::{Rates, Step};
@@ -29,7 +30,9 @@ fn step() {
 }
 
 fn step_in_one_form(gpu: &Gpu) {
-    for case in cases("step") {
+    let all = cases("step");
+    // All anchors are in view: that each is looked at changes nothing.
+    for (case, cull) in all.iter().flat_map(|case| [(case, false), (case, true)]) {
         let n = case.shape("anchor")[0];
         let offsets = case.shape("offset")[1];
         let anchors = files::Anchors {
@@ -46,15 +49,16 @@ fn step_in_one_form(gpu: &Gpu) {
                 (name, files::Tensor { shape, data })
             })
             .collect();
-        let cameras = [camera(&case, 0), camera(&case, 1)];
+        let cameras = [camera(case, 0), camera(case, 1)];
         let mut settings = Settings::default();
         settings.train.iterations = 30_000;
-        settings.render.cull = false;
+        settings.render.cull = cull;
         settings.losses.ssim_across_masks = true;
         let plan = Plan {
             masks: true,
             depth: true,
             depth_gradient: true,
+            cull,
             references: vec![0],
             sizes: vec![cameras[0].size],
             ..Plan::default()
@@ -95,6 +99,8 @@ fn step_in_one_form(gpu: &Gpu) {
             if gpu.read(step.limits.overflow()).unwrap() != [0] {
                 panic!("the first guess of the capacity is too small for {n} anchors");
             }
+            let visible = gpu.read(step.limits.counters()).unwrap()[Counter::Visible as usize];
+            assert_eq!(visible as usize, n, "anchors in view");
             let terms = gpu.read(step.terms(size)).unwrap();
             losses.push(terms.iter().sum::<f32>());
             if number <= 2 {
