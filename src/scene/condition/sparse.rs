@@ -23,13 +23,14 @@ pub(super) struct Sample {
     pub depth: f64,
 }
 
-/// The points that a view sees: of those that fall into one block of pixels the nearest, for the others may lie behind
-/// it. Blocks are a 64th of the picture's width, at least 2 pixels wide. With `outside`, only those outside the mask.
+/// The points that a view sees: of those that fall into one block of pixels the one of median depth. The nearest would lie
+/// before the surface: by 3 % of the depth on spin-1. Blocks are a 64th of the picture's width, at least 2 pixels wide. With
+/// `outside`, only those outside the mask.
 pub(super) fn samples(camera: &Camera, points: &[Point], outside: Option<&image::GrayImage>) -> Vec<Sample> {
     let [w, h] = camera.size.map(|n| n as usize);
     let block = (w / 64).max(2);
     let columns = w.div_ceil(block);
-    let mut nearest: Vec<Option<Sample>> = vec![None; columns * h.div_ceil(block)];
+    let mut blocks: Vec<Vec<Sample>> = vec![vec![]; columns * h.div_ceil(block)];
     for point in points {
         let position = point.position.map(f64::from);
         let Some([u, v]) = camera.project(position) else { continue };
@@ -38,16 +39,17 @@ pub(super) fn samples(camera: &Camera, points: &[Point], outside: Option<&image:
         }
         let (x, y) = (u as usize, v as usize);
         let pixel = y * w + x;
-        if outside.is_some_and(|mask| mask.as_raw()[pixel] != 0) {
-            continue;
-        }
-        let found = Sample { pixel, depth: camera.to_camera(position)[2] };
-        let kept = &mut nearest[y / block * columns + x / block];
-        if kept.is_none_or(|kept| found.depth < kept.depth) {
-            *kept = Some(found);
+        if outside.is_none_or(|mask| mask.as_raw()[pixel] == 0) {
+            let found = Sample { pixel, depth: camera.to_camera(position)[2] };
+            blocks[y / block * columns + x / block].push(found);
         }
     }
-    nearest.into_iter().flatten().collect()
+    let median = |block: &mut Vec<Sample>| {
+        let middle = block.len().checked_sub(1)? / 2;
+        let order = |a: &Sample, b: &Sample| a.depth.total_cmp(&b.depth).then(a.pixel.cmp(&b.pixel));
+        Some(*block.select_nth_unstable_by(middle, order).1)
+    };
+    blocks.iter_mut().filter_map(median).collect()
 }
 
 /// `y ~ slope x + shift` with small influence of outliers: least absolute deviations by reweighting, then Tukey's biweight
@@ -193,6 +195,34 @@ pub(super) fn check_priors(scene: &mut Scene) {
 mod tests {
     use super::*;
     use crate::scene::{Config, load, synthetic};
+
+    /// A hedge: the points of a block lie at many depths, and a prior says where the middle is.
+    #[test]
+    fn samples_of_a_thick_surface_lie_in_its_middle() {
+        use rand::{RngExt as _, SeedableRng as _};
+
+        let camera = Camera {
+            rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            translation: [0.0; 3],
+            focal: [500.0; 2],
+            principal: [320.0, 240.0],
+            size: [640, 480],
+            distortion: [0.0; 4],
+        };
+        let mut rng = rand_pcg::Pcg64::seed_from_u64(4);
+        let point = |_| {
+            let pixel = rng.random_range(0..640 * 480);
+            let z = 10.0 * rng.random_range(0.95..1.05);
+            let position = super::super::points::lift(&camera, pixel, z).expect("ahead").map(|v| v as f32);
+            Point { position, color: [0; 3] }
+        };
+        let points: Vec<Point> = (0..60_000).map(point).collect();
+        let samples = samples(&camera, &points, None);
+        let mean = samples.iter().map(|s| s.depth).sum::<f64>() / samples.len() as f64;
+        // Some twenty points of a block are 5 % of the depth's range apart. Of an even number the nearer of the two in the
+        // middle is taken: half that is 2.5 % of a range of 1, for every second block.
+        assert!((mean / 10.0 - 1.0).abs() < 2e-3, "{mean} instead of 10");
+    }
 
     #[test]
     fn lines_withstand_outliers() {
