@@ -71,7 +71,7 @@ impl Instance {
             return Err(Error::NoDevice);
         }
         let raw = raw.named("creating a Vulkan instance")?;
-        let mut instance = Self { raw, messages: Arc::default(), debug_utils, messenger: None, entry: entry };
+        let mut instance = Self { raw, messages: Arc::default(), debug_utils, messenger: None, entry };
         if validate {
             instance.listen()?;
         }
