@@ -30,12 +30,18 @@ impl Default for Check {
     }
 }
 
-/// How far a tensor's length may be from its twin's, whatever single elements may: a thousandth, where the largest ever
-/// seen is 3e-5, or the elements' own allowance where that is more. The cosine follows: two vectors whose difference is
-/// s times their length have a cosine of at least 1 - s^2.
+/// How far a tensor may be from its twin, as a share of its length, whatever single elements may: a thousandth, where the
+/// largest ever seen is 3e-5. See [`whole`].
 const WHOLE: f64 = 1e-3;
 /// Below, the twin's value may be zero on a device: it flushes to zero what is less than 1.2e-38, and factors may be.
 const TINY: f64 = 1e-30;
+
+/// [`WHOLE`], or the elements' own allowance where that is more, and for every element of the boundary band the change
+/// of a usual element's sign, as at the kink of an absolute value. Two vectors whose difference is s times their length
+/// have a cosine of at least 1 - s^2.
+fn whole(check: Check, allowed: usize, components: usize) -> f64 {
+    WHOLE.max(check.relative + check.absolute) + 2.0 * (allowed as f64 / components.max(1) as f64).sqrt()
+}
 
 /// How one output tensor of one pass differs from the twin's.
 #[derive(Clone, Debug, serde::Serialize)]
@@ -66,7 +72,7 @@ pub struct Difference {
     pub broken: usize,
     /// Components that are zero where the reference is not. One, or one in a thousand, may be: a difference that cancels.
     pub vanished: usize,
-    /// How far `norm_ratio` may be from 1; none for integers.
+    /// How far `norm_ratio` may be from 1, and the square of that the cosine; none for integers.
     pub whole: Option<f64>,
     /// Where the worst of them is, and the two values.
     pub worst: Option<(usize, f64, f64)>,
@@ -115,6 +121,7 @@ impl Difference {
             }
         }
         let both_zero = gg == 0.0 && ww == 0.0;
+        let allowed = (check.band * got.len() as f64).ceil() as usize;
         Self {
             pass: pass.into(),
             tensor: tensor.into(),
@@ -127,9 +134,9 @@ impl Difference {
             discrete: false,
             exceeded,
             broken,
-            allowed: (check.band * got.len() as f64).ceil() as usize,
+            allowed,
             vanished,
-            whole: Some(WHOLE.max(check.relative + check.absolute)),
+            whole: Some(whole(check, allowed, got.len())),
             worst,
         }
     }
@@ -200,7 +207,7 @@ mod tests {
         assert!(Difference::of("p", "t", &[1.0, f64::NAN], &[1.0, f64::NAN], check).ok());
         assert!(!Difference::of("p", "t", &[0.0, 0.0, 0.0], &want, check).ok(), "a gradient that is wrongly zero");
         let band = Check { band: 0.3, ..check };
-        assert!(Difference::of("p", "t", &[5.0, -2.0, 0.0], &want, band).ok());
+        assert!(Difference::of("p", "t", &[-1.0, -2.0, 0.0], &want, band).ok());
         assert!(!Difference::of("p", "t", &[1.0, f64::NAN, 0.0], &want, band).ok(), "no band explains a NaN");
         assert!(!Difference::of("p", "t", &[1.0, 2.0, 0.0], &[1.0, f64::NAN, 0.0], band).ok());
     }
@@ -225,9 +232,14 @@ mod tests {
         let off = |factor: f64| -> Vec<f64> {
             want.iter().enumerate().map(|(i, &w)| if i % 125 == 0 { factor * w } else { w }).collect()
         };
-        let few = Difference::of("p", "t", &off(1.05), &want, band);
+        let few = Difference::of("p", "t", &off(-1.0), &want, band);
         assert!(few.exceeded == 8 && few.ok(), "{few}");
-        assert!(!Difference::of("p", "t", &off(1.5), &want, band).ok(), "a norm that is 4 thousandths off");
-        assert!(!Difference::of("p", "t", &off(-1.0), &want, band).ok(), "another direction");
+        let longer = Difference::of("p", "t", &off(10.0), &want, band);
+        assert!(longer.exceeded == 8 && !longer.ok(), "another length: {longer}");
+        let turned = Difference::of("p", "t", &off(-8.0), &want, band);
+        assert!(turned.exceeded == 8 && !turned.ok(), "another direction: {turned}");
+        let longer: Vec<f64> = want.iter().map(|w| 1.002 * w).collect();
+        let loose = Check { relative: 1e-5, absolute: 3e-3, band: 0.0 };
+        assert!(Difference::of("p", "t", &longer, &want, loose).ok(), "the elements' own allowance");
     }
 }
