@@ -349,7 +349,9 @@ fn train_writes_a_run_and_never_over_another() {
     assert_eq!(files_below(&folder.join("drawn")).len(), 4, "two pictures, two layers of depth");
     let drawn = image::open(folder.join("drawn/test_000.png")).expect("a picture").to_rgb8();
     let tested = image::open(folder.join("run/test/test_000.png")).expect("a picture").to_rgb8();
-    assert!(drawn == tested, "`render` draws what `train` compared");
+    // A model in a file is in the lengths of the scene's files, rounded to float32 once more: a level may flip.
+    let same = drawn.as_raw().iter().zip(tested.as_raw()).all(|(a, b)| a.abs_diff(*b) <= 1);
+    assert!(drawn.dimensions() == tested.dimensions() && same, "`render` draws what `train` compared");
 
     succeeds(folder, "train scene --out again --profile --config run/settings.toml");
     assert!(model("again") == before, "the settings that were written repeat the run");

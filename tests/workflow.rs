@@ -63,7 +63,9 @@ fn made(folder: &Path) -> BTreeMap<String, Vec<u8>> {
                 continue;
             }
             let name = path.strip_prefix(folder).expect("below it").to_string_lossy().into_owned();
-            let timed = ["run.json", "log.jsonl", "export.json", "prepare.json"].iter().any(|end| name.ends_with(end));
+            let timed = ["run.json", "log.jsonl", "export.json", "prepare.json", "index.html"]
+                .iter()
+                .any(|end| name.ends_with(end));
             if !timed && !name.starts_with("out/log/") {
                 files.insert(name, fs::read(&path).expect("readable"));
             }
