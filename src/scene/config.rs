@@ -47,7 +47,7 @@ pub struct Config {
     pub truth_reference: String,
     /// Depth prior of that view: a file, in the scene's folder unless the path is absolute. Empty for the one under the
     /// view's name among the scene's priors, or its true depth, if there is one; `none` for no prior; `stereo` for depth
-    /// measured over the other test views, by [`condition`].
+    /// measured over the other test views, by [`condition`](super::condition).
     pub truth_prior: String,
     /// Depth priors in place of the scene's own: a folder, in the scene's unless the path is absolute. Its name says
     /// `disparity`, or it is depth; `reference/` in it has the inpainted picture's. Empty for the scene's own.
