@@ -66,6 +66,11 @@ fn extremes(all: &[Interface]) -> String {
         constant("Most bytes of push constants.", "MOST_PUSH_BYTES", most(&push)),
         constant("Most threads of a workgroup.", "MOST_THREADS", most(&|i| i.group.iter().product())),
         constant(
+            "Most threads of a workgroup with subgroup operations: its subgroups are asked to be full and of one size.",
+            "MOST_FULL_THREADS",
+            most(&|i| if i.subgroups { i.group.iter().product() } else { 0 }),
+        ),
+        constant(
             "Threads in x of the smallest workgroup with subgroup operations: a full subgroup holds no more.",
             "MOST_SUBGROUP_THREADS",
             subgroups.min().unwrap_or(0),

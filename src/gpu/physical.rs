@@ -6,7 +6,7 @@ use ash::vk;
 
 use super::error::{Error, Named};
 use super::instance::has;
-use super::kernels::{MOST_BUFFERS, MOST_PUSH_BYTES, MOST_SUBGROUP_THREADS, MOST_THREADS};
+use super::kernels::{MOST_BUFFERS, MOST_FULL_THREADS, MOST_PUSH_BYTES, MOST_SUBGROUP_THREADS, MOST_THREADS};
 
 /// Fewest threads of a subgroup that the kernels are made for.
 const LEAST_SUBGROUP: u32 = 4;
@@ -270,7 +270,7 @@ impl Facts {
         need(size.is_some(), &wanted);
         // A limit for sizes that are asked for.
         let most = if subgroups.chosen { v13.max_compute_workgroup_subgroups } else { u32::MAX };
-        let full = size.map_or(0, |size| MOST_THREADS.div_ceil(size));
+        let full = size.map_or(0, |size| MOST_FULL_THREADS.div_ceil(size));
         need(most >= full, &format!("workgroups of {full} subgroups"));
         let buffers = limits.max_per_stage_descriptor_storage_buffers.min(limits.max_descriptor_set_storage_buffers);
         need(
@@ -351,7 +351,7 @@ mod tests {
         let v13 = vk::PhysicalDeviceVulkan13Properties::default()
             .min_subgroup_size(32)
             .max_subgroup_size(32)
-            .max_compute_workgroup_subgroups(MOST_THREADS / 32)
+            .max_compute_workgroup_subgroups(MOST_FULL_THREADS.div_ceil(32))
             .required_subgroup_size_stages(vk::ShaderStageFlags::COMPUTE);
         Facts {
             core,
@@ -384,7 +384,7 @@ mod tests {
         assert_eq!(lacks(&|f| f.core.limits.max_per_stage_resources -= 1), buffers);
         let threads = format!("workgroups of {MOST_THREADS} threads");
         assert_eq!(lacks(&|f| f.core.limits.max_compute_work_group_size[0] -= 1), threads);
-        let full = format!("workgroups of {} subgroups", MOST_THREADS / 32);
+        let full = format!("workgroups of {} subgroups", MOST_FULL_THREADS.div_ceil(32));
         assert_eq!(lacks(&|f| f.v13.max_compute_workgroup_subgroups -= 1), full);
         assert_eq!(lacks(&|f| f.compute = false), "a compute queue");
         let pushes = |pushed| Facts { pushed, ..plain() }.describe(0).push_descriptors;
