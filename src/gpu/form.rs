@@ -31,8 +31,13 @@ impl Gpu {
         self.options().form.unwrap_or_else(|| Form::of(self.info()))
     }
 
-    /// Whether kernels of lanes are taken: for CPU drivers, written for subgroups of 8.
+    /// Whether kernels of lanes are taken: for CPU drivers, and where they run.
     pub(crate) fn lanes(&self) -> bool {
-        self.form() == Form::Cpu && self.info().subgroup_size == 8
+        self.form() == Form::Cpu && self.runs_lanes()
+    }
+
+    /// Whether kernels of lanes run here, good or not: they are written for subgroups of 8.
+    pub(crate) fn runs_lanes(&self) -> bool {
+        self.info().subgroup_size == 8
     }
 }

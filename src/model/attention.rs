@@ -350,7 +350,7 @@ impl Sharing {
 
     /// Those that a device can run, whether they are good for it or not.
     pub(crate) fn all(gpu: &Gpu) -> &'static [Self] {
-        if gpu.info().subgroup_size == 8 { &[Self::Blocks, Self::Lanes, Self::Pairs] } else { &[Self::Blocks] }
+        if gpu.runs_lanes() { &[Self::Blocks, Self::Lanes, Self::Pairs] } else { &[Self::Blocks] }
     }
 
     /// What is taken.

@@ -1027,7 +1027,7 @@ mod tests {
             let [center, center_low] = split(m.center);
             let push = decode_input::Push { center, center_low };
             let inputs = twin(decode_input::Kernel, &gpu, (), case, push, count).inputs;
-            let shared = gpu.info().subgroup_size == LANES;
+            let shared = gpu.runs_lanes();
             let groups_of = |parts: usize| 8 * parts * count.div_ceil(64);
             macro_rules! hidden {
                 ($module:ident) => {

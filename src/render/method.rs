@@ -26,7 +26,7 @@ impl Method {
         let tiling = match config.tiles {
             Tiles::Auto => Tiling::of(gpu),
             Tiles::Wide => Tiling::Wide,
-            Tiles::Narrow if gpu.info().subgroup_size == Tiling::Narrow.threads() => Tiling::Narrow,
+            Tiles::Narrow if gpu.runs_lanes() => Tiling::Narrow,
             Tiles::Narrow => {
                 return Err(Error::Missing {
                     device: gpu.info().name.clone(),

@@ -791,7 +791,7 @@ mod tests {
                 check!(rasterize, Tiling::Wide, [], depth, transmittance);
                 check!(rasterize_depth, Tiling::Wide, [], depth);
                 check!(rasterize_color, Tiling::Wide, []);
-                if gpu.info().subgroup_size == 8 {
+                if gpu.runs_lanes() {
                     check!(rasterize_narrow, Tiling::Narrow, [blended, blended_count], depth, transmittance);
                     check!(rasterize_narrow_depth, Tiling::Narrow, [blended, blended_count], depth);
                     check!(rasterize_narrow_color, Tiling::Narrow, [blended, blended_count]);

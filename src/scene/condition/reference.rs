@@ -4,7 +4,7 @@ use image::{GrayImage, Luma};
 use rayon::prelude::*;
 
 use super::points::{lift, pixel_of};
-use super::sparse::{fit, samples};
+use super::sparse::{Sample, fit, samples};
 use crate::scene::{Prior, PriorKind, Reference, Scene, resample};
 
 /// Of each reference, the depth z of its hole \[pixel\], NaN outside it: its prior brought to the scene's depth by the points
@@ -18,19 +18,27 @@ impl Scene {
     /// disparity): `z = slope prior + shift`, robustly through the points around its hole. `None` without a prior, without
     /// enough points, or if the prior runs against them.
     pub fn depth_line(&self, reference: &Reference) -> Option<[f64; 2]> {
-        let view = &self.train[reference.view];
-        let samples = samples(&view.camera, &self.points, view.mask.as_ref());
-        fit(reference.prior.as_ref()?, &samples).filter(|line| line[0] > 0.0)
+        depth_line(reference.prior.as_ref()?, &around(self, reference))
     }
+}
+
+/// The points around a reference's hole, as its view sees them.
+fn around(scene: &Scene, reference: &Reference) -> Vec<Sample> {
+    let view = &scene.train[reference.view];
+    samples(&view.camera, &scene.points, view.mask.as_ref())
+}
+
+fn depth_line(prior: &Prior, around: &[Sample]) -> Option<[f64; 2]> {
+    fit(prior, around).filter(|line| line[0] > 0.0)
 }
 
 fn hole_depth(scene: &Scene, reference: &Reference) -> Option<Vec<f32>> {
     let prior = reference.prior.as_ref()?;
     let view = &scene.train[reference.view];
     let mask = view.mask.as_ref()?;
-    let samples = samples(&view.camera, &scene.points, Some(mask));
-    let [slope, shift] = scene.depth_line(reference)?;
-    let (near, far) = samples.iter().fold((f64::INFINITY, 0.0_f64), |(a, b), s| (a.min(s.depth), b.max(s.depth)));
+    let around = around(scene, reference);
+    let [slope, shift] = depth_line(prior, &around)?;
+    let (near, far) = around.iter().fold((f64::INFINITY, 0.0_f64), |(a, b), s| (a.min(s.depth), b.max(s.depth)));
     let depth = |(m, p): (&u8, &f32)| {
         let value = slope * f64::from(*p) + shift;
         let z = if prior.kind == PriorKind::Disparity { 1.0 / value } else { value };
