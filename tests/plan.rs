@@ -6,7 +6,7 @@ mod common;
 use std::collections::{BTreeMap, BTreeSet};
 
 use gscream_vk::config::{Settings, Source};
-use gscream_vk::gpu::{Entry, Gpu, Schedule, testing};
+use gscream_vk::gpu::{Entry, Gpu, Options, Schedule, testing};
 use gscream_vk::scene::{self, Scene};
 use gscream_vk::stage;
 use gscream_vk::train::forecast::{self, Forecast, Question, Survey};
@@ -83,7 +83,7 @@ const MARKS: [(&str, &str); 13] = [
 
 #[test]
 fn every_combination_has_what_it_needs_and_nothing_else() {
-    let gpu = testing::gpu();
+    let gpu = testing::fresh_gpu(Options::default());
     let folder = common::folder();
     let mut ever: BTreeSet<&str> = BTreeSet::new();
     for wanted in Wanted::all() {
@@ -156,7 +156,7 @@ fn record(run: &mut Run<'_>, gpu: &Gpu, step: u32) -> Schedule {
 /// What is rehearsed is what a device gets: the same passes, barriers and buffers, for all combinations.
 #[test]
 fn a_rehearsal_makes_what_a_device_makes() {
-    let gpu = testing::gpu();
+    let gpu = testing::fresh_gpu(Options::default());
     let folder = common::folder();
     for wanted in Wanted::all() {
         let (scene, settings) = (wanted.scene(&folder), wanted.settings());
@@ -174,7 +174,7 @@ fn a_rehearsal_makes_what_a_device_makes() {
 
 #[test]
 fn stages_end_with_their_time() {
-    let gpu = testing::gpu();
+    let gpu = testing::fresh_gpu(Options::default());
     let (scene, settings) = (common::tiny(), Wanted::EVERYTHING.settings());
     let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
     let plan = run.step().plan.clone();
@@ -210,7 +210,7 @@ fn kernels(schedule: &Schedule) -> BTreeSet<&'static str> {
 /// Only what a view's losses look at is drawn, compared and kept.
 #[test]
 fn depth_is_for_views_that_have_losses_of_it() {
-    let gpu = testing::gpu();
+    let gpu = testing::fresh_gpu(Options::default());
     let scene = common::tiny();
     let mut settings = Wanted::EVERYTHING.settings();
     settings.losses.depth.other_weight = 0.0;
@@ -239,7 +239,7 @@ fn depth_is_for_views_that_have_losses_of_it() {
 /// A learning rate of zero leaves the gradient out, and changes nothing about the others.
 #[test]
 fn gradients_of_what_is_not_trained_are_not_computed() {
-    let gpu = testing::gpu();
+    let gpu = testing::fresh_gpu(Options::default());
     let scene = common::tiny();
     let mut settings = common::settings(1);
     settings.model.attention.enabled = false;
@@ -297,7 +297,7 @@ fn gradients_of_what_is_not_trained_are_not_computed() {
 
 #[test]
 fn without_ssim_nothing_is_made_for_it() {
-    let gpu = testing::gpu();
+    let gpu = testing::fresh_gpu(Options::default());
     for wanted in [Wanted::NOTHING, Wanted::EVERYTHING] {
         let scene = wanted.scene(&common::folder());
         let mut settings = wanted.settings();
@@ -318,7 +318,7 @@ fn a_run_compiles_the_kernels_of_its_plan() {
     let folder = common::folder();
     let mut compiled = vec![];
     for wanted in [Wanted::NOTHING, Wanted::EVERYTHING] {
-        let gpu = testing::gpu();
+        let gpu = testing::fresh_gpu(Options::default());
         let (scene, settings) = (wanted.scene(&folder), wanted.settings());
         let forecast = rehearsed(&gpu, &scene, &settings);
         let planned: BTreeSet<&str> = forecast.pipelines.into_iter().collect();
@@ -346,13 +346,13 @@ fn a_run_compiles_the_kernels_of_its_plan() {
 /// The bytes that a run takes are those that were foretold for its anchors.
 #[test]
 fn memory_is_as_predicted() {
-    let gpu = testing::gpu();
+    let gpu = testing::fresh_gpu(Options::default());
     let folder = common::folder();
     for wanted in [Wanted::NOTHING, Wanted { growth: true, ..Wanted::NOTHING }, Wanted::EVERYTHING] {
         let (scene, settings) = (wanted.scene(&folder), wanted.settings());
         let verdict = forecast::forecast(&gpu, &scene, &settings, Question::default()).expect("a forecast");
         let capacity = verdict.forecast.expect("it fits").capacity;
-        let own = testing::gpu();
+        let own = testing::fresh_gpu(Options::default());
         let mut run = Run::new(&own, &scene, &settings).expect("the device has room");
         run.resize(capacity).expect("the device has room");
         let start = own.memory().0;
@@ -372,7 +372,7 @@ fn memory_is_as_predicted() {
 
 #[test]
 fn what_does_not_fit_is_said_with_what_would() {
-    let gpu = testing::gpu();
+    let gpu = testing::fresh_gpu(Options::default());
     let folder = common::folder();
     let (scene, settings) = (Wanted::EVERYTHING.scene(&folder), Wanted::EVERYTHING.settings());
     let ask = |scene: &Scene, settings: &Settings, available: u64| {

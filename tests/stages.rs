@@ -171,17 +171,12 @@ fn what_is_absent_has_no_pass_and_no_buffer_in_one_form(gpu: &Gpu) {
     }
 }
 
-fn open(options: Options) -> Gpu {
-    Gpu::open(&testing::from_environment(Options { validate: true, ..options }))
-        .expect("a device and the validation layer")
-}
-
 /// Only recorded, never run: what the layer reports, it reports while recording.
 #[test]
 fn validation_notices_lost_barriers() {
     let (scene, settings) = (common::tiny(), common::settings(20));
     let hazards = |omit_barriers| {
-        let gpu = open(Options { omit_barriers, ..Options::default() });
+        let gpu = testing::fresh_gpu(Options { omit_barriers, ..Options::default() });
         let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
         gpu.take_messages();
         let mut rec = gpu.recorder().expect("a recorder");

@@ -334,7 +334,7 @@ mod tests {
 
     #[test]
     fn ceilings_are_numbers() {
-        let gpu = testing::gpu_with(Options { timestamps: true, ..Options::default() });
+        let gpu = testing::fresh_gpu(Options { timestamps: true, ..Options::default() });
         if gpu.info().timestamp_period <= 0.0 {
             println!("skipped: {} has no timestamps", gpu.info().name);
             return;

@@ -565,7 +565,7 @@ mod tests {
     /// A small load has the anchors in view, the Gaussians and about the pairs that it was made for.
     #[test]
     fn loads_are_what_they_say() {
-        let gpu = testing::gpu_with(Options { timestamps: true, ..Options::default() });
+        let gpu = testing::fresh_gpu(Options { timestamps: true, ..Options::default() });
         if gpu.info().timestamp_period <= 0.0 {
             println!("skipped: {} has no timestamps", gpu.info().name);
             return;

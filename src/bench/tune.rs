@@ -244,7 +244,7 @@ mod tests {
     /// All options give the same result on a validated device: sorted keys.
     #[test]
     fn the_choices_run() {
-        let gpu = testing::gpu_with(Options { timestamps: true, ..Options::default() });
+        let gpu = testing::fresh_gpu(Options { timestamps: true, ..Options::default() });
         if gpu.info().timestamp_period <= 0.0 {
             println!("skipped: {} has no timestamps", gpu.info().name);
             return;

@@ -26,7 +26,7 @@ const HOST_BLOCK: u64 = 16 << 20;
 pub const SPARE_BYTES: u64 = 2 * DEVICE_BLOCK + HOST_BLOCK;
 
 /// How to open a device.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Options {
     /// Index in `devices`' list, or a part of the name; the first usable device otherwise.
     pub device: Option<String>,

@@ -1,21 +1,33 @@
 //! For tests: a validated device, and a kernel against its twin.
 
 use std::ops::Deref;
+use std::sync::{Condvar, Mutex};
+use std::thread::ThreadId;
 
 use clap::ValueEnum as _;
 
 use super::check::Difference;
 use super::descriptors::Descriptors;
-use super::device::{Gpu, Options};
+use super::device::{Gpu, Options, lock};
 use super::form::Form;
 use super::kernel::Reference;
 use super::recorder::Threads;
 
 /// A device under the validation layer. Dropping it fails the test if the layer said anything.
-pub struct TestGpu(Gpu);
+///
+/// One thread at a time has such devices: the layer keeps what belongs to a device in a table without a lock
+/// (Vulkan-ValidationLayers issue 4391), and a program that opens one while another works may crash.
+pub struct TestGpu {
+    // Before the turn: what is destroyed is destroyed while no other thread calls the layer.
+    gpu: Gpu,
+    _turn: Turn,
+}
 
 /// Opens the device that `GSCREAM_DEVICE` names (the first usable one otherwise) under the Khronos validation layer
 /// with synchronisation validation. `GSCREAM_DESCRIPTORS` is as `--descriptors`.
+///
+/// The device stays open for the process's next tests, with its compiled kernels and its account of memory:
+/// [`fresh_gpu`] has neither.
 ///
 /// # Panics
 /// Without a device or without the layer: a test that skips the layer would look passed.
@@ -28,9 +40,59 @@ pub fn gpu() -> TestGpu {
 /// # Panics
 /// As [`gpu`].
 pub fn gpu_with(options: Options) -> TestGpu {
-    match Gpu::open(&Options { validate: true, ..from_environment(options) }) {
-        Ok(gpu) => TestGpu(gpu),
-        Err(error) => panic!("tests need a Vulkan device and the validation layer: {error}"),
+    static KEPT: Mutex<Vec<Gpu>> = Mutex::new(vec![]);
+    let _turn = Turn::wait();
+    let options = validated(options);
+    let mut kept = lock(&KEPT);
+    let gpu = kept.iter().find(|gpu| *gpu.options() == options).cloned().unwrap_or_else(|| {
+        let gpu = open(&options);
+        kept.push(gpu.clone());
+        gpu
+    });
+    TestGpu { gpu, _turn }
+}
+
+/// As [`gpu_with`], on a device that nothing ran on.
+///
+/// # Panics
+/// As [`gpu`].
+pub fn fresh_gpu(options: Options) -> TestGpu {
+    let _turn = Turn::wait();
+    TestGpu { gpu: open(&validated(options)), _turn }
+}
+
+fn validated(options: Options) -> Options {
+    Options { validate: true, ..from_environment(options) }
+}
+
+fn open(options: &Options) -> Gpu {
+    Gpu::open(options).unwrap_or_else(|error| panic!("tests need a Vulkan device and the validation layer: {error}"))
+}
+
+/// A thread's turn to have validated devices, as many as it likes.
+struct Turn;
+
+/// Whose turn it is, and how many devices it has.
+static TURN: (Mutex<Option<(ThreadId, usize)>>, Condvar) = (Mutex::new(None), Condvar::new());
+
+impl Turn {
+    fn wait() -> Self {
+        let own = std::thread::current().id();
+        let (turn, freed) = &TURN;
+        let mut turn = freed
+            .wait_while(lock(turn), |turn| turn.is_some_and(|(thread, _)| thread != own))
+            .unwrap_or_else(std::sync::PoisonError::into_inner);
+        *turn = Some((own, turn.map_or(0, |(_, devices)| devices) + 1));
+        Self
+    }
+}
+
+impl Drop for Turn {
+    fn drop(&mut self) {
+        let (turn, freed) = &TURN;
+        let mut turn = lock(turn);
+        *turn = turn.filter(|&(_, devices)| devices > 1).map(|(thread, devices)| (thread, devices - 1));
+        freed.notify_one();
     }
 }
 
@@ -57,13 +119,13 @@ pub fn from_environment(options: Options) -> Options {
 impl Deref for TestGpu {
     type Target = Gpu;
     fn deref(&self) -> &Gpu {
-        &self.0
+        &self.gpu
     }
 }
 
 impl Drop for TestGpu {
     fn drop(&mut self) {
-        let messages = self.0.take_messages();
+        let messages = self.gpu.take_messages();
         if !messages.is_empty() && !std::thread::panicking() {
             panic!("{} validation messages, the first: {}", messages.len(), messages[0]);
         }
