@@ -6,6 +6,8 @@ use clap::Parser as _;
 use gscream_vk::cli;
 
 fn main() -> ExitCode {
+    // `| head` ends the program as it ends any other.
+    sigpipe::reset();
     let arguments = cli::Arguments::parse();
     env_logger::Builder::from_env(env_logger::Env::default().default_filter_or("warn")).format_target(false).init();
     match cli::run(arguments) {
