@@ -122,6 +122,25 @@ fn a_step_is_measured_and_compared() {
     let compared = stdout.split("against the older record").nth(1).expect("a comparison");
     assert!(compared.contains("render/rasterize_backward") && compared.contains("\ntotal "), "{compared}");
 
+    // On paper for the GPUs that are published: the same passes, and all of them.
+    let stdout =
+        succeeds(folder, "scene --warm-up 5 --views 2 --repetitions 1 --form gpu --predict published --out paper");
+    let record = json(&folder.join("paper/bench.json"));
+    let predictions = record["predictions"].as_array().expect("predictions");
+    assert_eq!(predictions.len(), 3);
+    for prediction in predictions {
+        assert_eq!(prediction["unknown"], Value::Array(vec![]), "{prediction}");
+        let passes = prediction["passes"].as_array().expect("passes");
+        assert_eq!(Some(passes.len()), record["step"]["passes"].as_array().map(Vec::len));
+        let sum: f64 = passes.iter().map(|pass| number(&pass[1])).sum();
+        let step = number(&prediction["step"]);
+        assert!((sum + number(&prediction["barriers"]) - step).abs() < 1e-9 * step);
+        assert!((number(&prediction["minutes"]) - step * 20.0 / 60e3).abs() < 1e-9 * step);
+        assert!(stdout.contains(prediction["peak"]["name"].as_str().expect("a name")), "{stdout}");
+    }
+    let error = fails(folder, &format!("{measured} --predict scene/none.toml"));
+    assert!(error.starts_with("error: scene/none.toml: cannot be read: "), "{error}");
+
     let error = fails(folder, &format!("{measured} --out first"));
     assert_eq!(error, "error: first: holds a record already: choose another --out, or --overwrite");
     let error = fails(folder, &format!("{measured} --against first/bench.json --set render.near=0.1"));

@@ -6,6 +6,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::step::Rates;
 use crate::gpu::kernels::bench::{ceilings_copy, ceilings_copy_vec4, ceilings_empty, ceilings_exp, ceilings_fma};
 use crate::gpu::{Buffer, Check, Error, Gpu, Reference, Timing};
 use crate::report::statistics::Spread;
@@ -91,20 +92,14 @@ pub struct Ceilings {
 }
 
 impl Ceilings {
-    /// The best of the copies, 1e9 bytes per second: what a pass finds in a cache is a floor too.
-    pub fn bandwidth(&self) -> f64 {
-        self.copy_f32.max.max(self.copy_vec4.max).max(self.copy_cached.max)
-    }
-
-    /// Milliseconds that so many bytes, operations and exponentials take, each at its ceiling.
-    pub fn milliseconds(&self, bytes: f64, operations: f64, exponentials: f64) -> [f64; 3] {
-        // 1e9 per second are 1e6 per millisecond.
-        [bytes / self.bandwidth(), operations / self.fma.max, exponentials / self.exp.max].map(|time| time * 1e-6)
-    }
-
-    /// Milliseconds of an empty dispatch between its timestamps.
-    pub fn dispatching(&self) -> f64 {
-        self.dispatch.min * 1e-3
+    /// What floors are taken at: the best of every round, and of the copies, as what a pass finds in a cache is a floor too.
+    pub fn rates(&self) -> Rates {
+        Rates {
+            bandwidth: self.copy_f32.max.max(self.copy_vec4.max).max(self.copy_cached.max),
+            operations: self.fma.max,
+            exponentials: self.exp.max,
+            dispatch: self.dispatch.min * 1e-3,
+        }
     }
 
     /// Milliseconds of a barrier. Its rounds are differences, whose smallest is the noise's: the lower quartile.
@@ -346,7 +341,7 @@ mod tests {
             assert!(spread.median.is_finite() && spread.repetitions == 2, "{name}: {spread:?} {unit}");
             assert!(spread.min > 0.0 || name.starts_with("barrier"), "{name}: {spread:?} {unit}");
         }
-        assert!(ceilings.bandwidth() >= ceilings.copy_f32.max);
+        assert!(ceilings.rates().bandwidth >= ceilings.copy_f32.max);
         assert_eq!(gpu.stages()[STAGE].0, 4 + DISPATCHES);
     }
 }

@@ -313,7 +313,7 @@ pub fn fit(points: &[(f64, f64)]) -> Option<(f64, f64)> {
 /// What is left of a pass's time beyond that of as many empty dispatches; nothing where that is less than them: there the
 /// clock measures dispatching.
 fn beyond_dispatching(pass: &PassFigures, ceilings: &Ceilings) -> Option<f64> {
-    let empty = pass.dispatches * ceilings.dispatching();
+    let empty = pass.dispatches * ceilings.rates().dispatch;
     let rest = pass.milliseconds.median - empty;
     (rest >= empty).then_some(rest)
 }

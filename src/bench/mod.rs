@@ -2,7 +2,7 @@
 //!
 //! [`ceilings`] measures what the device gives at most; [`cost`] says what every pass has to do, from the numbers that
 //! [`counts`] reads back from a traced step; [`step`] times the step beside it. [`loads`] generates scenes of chosen sizes
-//! and fits how every pass grows; [`tune()`] runs the choices that exist as data. [`compare`] sets one record against
+//! and fits how every pass grows; [`tune()`] runs the choices that exist as data. [`predict`] says what the step would take by a GPU's published peaks. [`compare`] sets one record against
 //! another, [`text`], [`tables`] and [`figures`] write them down.
 //!
 #![doc = include_str!("README.md")]
@@ -13,6 +13,7 @@ pub mod cost;
 pub mod counts;
 pub mod figures;
 pub mod loads;
+pub mod predict;
 pub mod step;
 pub mod tables;
 pub mod text;
@@ -85,6 +86,9 @@ pub struct Record {
     /// Choices of shapes.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tune: Option<Vec<tune::ChoiceFigures>>,
+    /// The step on devices that are not at hand.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub predictions: Vec<predict::Prediction>,
 }
 
 impl Record {

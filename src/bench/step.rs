@@ -40,12 +40,29 @@ impl Bound {
     }
 }
 
-/// Milliseconds that work takes at the ceilings, in so many dispatches, and what holds it back.
-pub fn floor(work: &Work, dispatches: f64, ceilings: &Ceilings) -> (f64, Bound) {
-    let [memory, operations, exponentials] = ceilings.milliseconds(work.bytes, work.operations, work.exponentials);
-    let times = [(memory, Bound::Memory), (operations, Bound::Operations), (exponentials, Bound::Exponentials)];
+/// The rates that floors are taken at.
+#[derive(Clone, Copy, Debug)]
+pub struct Rates {
+    /// 1e9 bytes per second.
+    pub bandwidth: f64,
+    /// 1e9 operations per second.
+    pub operations: f64,
+    /// 1e9 exponentials per second.
+    pub exponentials: f64,
+    /// Milliseconds of a dispatch.
+    pub dispatch: f64,
+}
+
+/// Milliseconds that work takes at these rates, in so many dispatches, and what holds it back.
+pub fn floor(work: &Work, dispatches: f64, rates: &Rates) -> (f64, Bound) {
+    // 1e9 per second are 1e6 per millisecond.
+    let times = [
+        (1e-6 * work.bytes / rates.bandwidth, Bound::Memory),
+        (1e-6 * work.operations / rates.operations, Bound::Operations),
+        (1e-6 * work.exponentials / rates.exponentials, Bound::Exponentials),
+    ];
     let (most, bound) = times.into_iter().fold((0.0, Bound::Dispatch), |a, b| if b.0 > a.0 { b } else { a });
-    let dispatching = dispatches * ceilings.dispatching();
+    let dispatching = dispatches * rates.dispatch;
     (most + dispatching, if dispatching > most { Bound::Dispatch } else { bound })
 }
 
@@ -239,7 +256,7 @@ pub(crate) fn measure(
         .into_iter()
         .map(|(name, (dispatches, work))| {
             let milliseconds = spread(&|round| round.passes.get(name).copied().unwrap_or(0.0));
-            let floor = work.map(|work| floor(&work, dispatches, ceilings));
+            let floor = work.map(|work| floor(&work, dispatches, &ceilings.rates()));
             PassFigures {
                 pass: name.to_owned(),
                 dispatches,

@@ -68,7 +68,7 @@ pub(super) fn record() -> Record {
         barrier: spread(1.0),
     };
     let work = cost::Work { bytes: 8e6, operations: 1e6, exponentials: 0.0 };
-    let (floor, bound) = floor(&work, 1.0, &ceilings);
+    let (floor, bound) = floor(&work, 1.0, &ceilings.rates());
     let pass = |name: &str, ms: f64| PassFigures {
         pass: name.into(),
         dispatches: 1.0,
@@ -123,13 +123,16 @@ pub(super) fn record() -> Record {
         step: Some(step),
         loads: None,
         tune: None,
+        predictions: vec![],
     }
 }
 
 #[test]
 fn floors_are_the_longest_of_three() {
     let ceilings = record().ceilings;
-    let of = |bytes, operations, exponentials| floor(&cost::Work { bytes, operations, exponentials }, 2.0, &ceilings);
+    let of = |bytes, operations, exponentials| {
+        floor(&cost::Work { bytes, operations, exponentials }, 2.0, &ceilings.rates())
+    };
     // The best: 4.8 GB/s, 12 G/s, 3 G/s; two dispatches of 9 us.
     let close =
         |(ms, by): (f64, Bound), want: f64, bound| assert!((ms - want).abs() < 1e-9 && by == bound, "{ms} {by:?}");

@@ -5,6 +5,7 @@ use std::fmt::Write as _;
 use super::Record;
 use super::ceilings::Ceilings;
 use super::loads::{Loads, Sweep};
+use super::predict;
 use super::step::StepFigures;
 use super::tune::ChoiceFigures;
 use crate::report::statistics::Spread;
@@ -144,6 +145,9 @@ pub fn record(record: &Record) -> String {
     }
     if let Some(choices) = &record.tune {
         text += &format!("\n{}", tune(choices, record));
+    }
+    if !record.predictions.is_empty() {
+        text += &format!("\n{}", predict::text(&record.predictions));
     }
     text
 }

@@ -9,7 +9,7 @@ use super::report::{command_line, last_part};
 use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, load_scene, with_gpu};
 use crate::bench::ceilings::Prober;
 use crate::bench::compare::{self, Subject};
-use crate::bench::{self, Device, Record, Trained, figures, loads, tables, text};
+use crate::bench::{self, Device, Record, Trained, figures, loads, predict, tables, text};
 use crate::config::SettingsArgs;
 use crate::gpu::Options;
 use crate::report::tables::write;
@@ -27,6 +27,10 @@ use crate::train::plan::Plan;
 /// instead, and how every pass grows with them. With --tune the choices of tile and group shapes are run in turn, on
 /// the scene or on a generated load, and the best printed as a table for the source.
 ///
+/// With --predict what the step has to do is set against the published peaks of GPUs that are not at hand: the time of
+/// every pass, of the step and of train.iterations steps like it, on paper. --form gpu measures the kernels that a GPU
+/// would run.
+///
 /// With --out writes bench.json, the tables as CSV and the plots as SVG.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
@@ -34,7 +38,8 @@ use crate::train::plan::Plan;
   gscream-vk bench garden --preset lavapipe --warm-up 200 --repetitions 15 --out before
   gscream-vk bench garden --preset lavapipe --warm-up 200 --repetitions 15 --against before/bench.json
   gscream-vk bench --loads --seconds 600 --preset lavapipe --out loads
-  gscream-vk bench --tune --preset lavapipe")]
+  gscream-vk bench --tune --preset lavapipe
+  gscream-vk bench garden --preset paper --form gpu --warm-up 20 --repetitions 1 --predict published")]
 pub(super) struct Args {
     /// Folder of the scene, or the word `synthetic` for the built-in one
     #[arg(value_name = "SCENE", required_unless_present_any = ["loads", "tune"])]
@@ -50,6 +55,9 @@ pub(super) struct Args {
     /// Run the choices of tile and group shapes
     #[arg(long)]
     tune: bool,
+    /// TOML file with the peaks of GPUs to predict the step for, or the word `published` for the list that comes along
+    #[arg(long, value_name = "PEAKS", conflicts_with_all = ["loads", "tune"])]
+    predict: Option<PathBuf>,
     /// Folder for bench.json and the tables; must not hold a record already
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
@@ -75,6 +83,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         bail!("{}: holds a record already: choose another --out, or --overwrite", out.display());
     }
     let old = args.against.as_deref().map(|path| Ok::<_, compare::Error>((path, compare::read(path)?))).transpose()?;
+    let peaks = args.predict.as_deref().map(predict::read).transpose()?.unwrap_or_default();
     let settings = args.settings.resolve()?;
     let loaded = args
         .scene
@@ -128,6 +137,10 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             true => Some(bench::tune(gpu, trained.as_ref(), &settings, repetitions, &mut say)?),
             false => None,
         };
+        let steps = settings.train.iterations;
+        let predictions = figures
+            .as_ref()
+            .map_or_else(Vec::new, |step| peaks.iter().map(|peak| predict::predict(step, steps, peak)).collect());
         let record = Record {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             command: command_line(),
@@ -139,6 +152,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             step: figures,
             loads,
             tune,
+            predictions,
         };
         Ok((record, notes))
     })?;
