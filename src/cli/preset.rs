@@ -125,11 +125,11 @@ mod tests {
         args.scene.settings.preset = Some("lavapipe".into());
         args.scene.settings.set.splice(0..0, Some("scene.downscale=7".to_owned()));
         let settings = args.scene.settings.resolve().expect("settings that make sense");
-        assert_eq!((settings.scene.downscale, settings.train.iterations, settings.train.seed), (2, 3000, 3));
+        assert_eq!((settings.scene.downscale, settings.train.iterations, settings.train.seed), (2, 4500, 3));
         let choice = Choice { preset: "lavapipe", downscale: Some(7) };
         assert_eq!(
             describe(&choice, &device("cpu"), &settings),
-            "preset: lavapipe, for Device is a CPU: 3000 steps at 1/2 of the pictures' size; --preset gscream has the \
+            "preset: lavapipe, for Device is a CPU: 4500 steps at 1/2 of the pictures' size; --preset gscream has the \
              defaults, made for a GPU"
         );
     }

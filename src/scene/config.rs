@@ -34,6 +34,9 @@ pub struct Config {
     pub guess_reference_prior: bool,
     /// Add points in the hole, at the depth of the reference's prior.
     pub seed_hole: bool,
+    /// Add points behind the depth edges of the hole, where other train cameras see what neither the reference nor any
+    /// photograph shows.
+    pub seed_behind_edges: bool,
     /// Let the train masks fall off over so many pixels around the object, at the training size: its antialiased edge and
     /// shadow reach beyond the mask. 0: masks are hard (GScream).
     pub rim: u32,
@@ -99,6 +102,7 @@ impl Default for Config {
             check_priors: true,
             guess_reference_prior: true,
             seed_hole: true,
+            seed_behind_edges: true,
             rim: 1,
             whole_reference: false,
             outrank_guess: 5,

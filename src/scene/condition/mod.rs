@@ -4,7 +4,8 @@
 //! - [`unit`]: lengths are counted in a unit that the scene itself gives, so that the user's unit changes nothing.
 //! - [`sparse`]: each prior is held against the points of the sparse model. One that does not follow them is not used, and
 //!   disparity becomes depth.
-//! - [`points`]: points on the object are left out, and the hole gets points from the reference view's prior.
+//! - [`points`]: points on the object are left out, and the hole gets points from the reference view's prior, behind its
+//!   depth edges too.
 //! - [`stereo`]: a reference that shows the truth gets the depth that the test views measure, where that is asked for.
 //! - [`reference`](mod@reference): an inpainted picture counts in its hole alone, and less where other views see past the
 //!   object.
@@ -37,6 +38,9 @@ pub fn condition(scene: &mut Scene, config: &Config) {
     let depths = reference::hole_depths(scene);
     if config.seed_hole {
         points::seed_holes(scene, &depths);
+    }
+    if config.seed_behind_edges {
+        points::seed_behind_edges(scene, &depths);
     }
     reference::soften_masks(scene, config.rim);
     if !config.whole_reference {

@@ -88,6 +88,59 @@ pub(super) fn seed_holes(scene: &mut Scene, depths: &[Option<Vec<f32>>]) {
     }
 }
 
+/// How far behind a depth edge is filled at most, as a share of the picture's width.
+const EDGE_REACH: f64 = 0.05;
+/// Depths this much apart, as a ratio, are the two sides of an edge.
+const EDGE_RATIO: f64 = 1.02;
+
+/// Adds points behind the depth edges of the references' holes (`depths` as in [`seed_holes`]). From beside the reference's
+/// place something appears there that neither the reference nor, past the object, any photograph has seen: what is nearest
+/// beyond the edge goes on behind it, its colours mirrored at the edge, as far as the other train cameras can see.
+pub(super) fn seed_behind_edges(scene: &mut Scene, depths: &[Option<Vec<f32>>]) {
+    let before = scene.points.len();
+    for (reference, depth) in scene.references.iter().zip(depths) {
+        let Some(depth) = depth else { continue };
+        let camera = &scene.train[reference.view].camera;
+        let [w, h] = camera.size.map(|n| n as i32);
+        let reach = (EDGE_REACH * f64::from(w)).round() as i32;
+        let mut disc: Vec<[i32; 2]> = (-reach..=reach).flat_map(|y| (-reach..=reach).map(move |x| [x, y])).collect();
+        let length = |[x, y]: [i32; 2]| x * x + y * y;
+        disc.retain(|step| (1..=reach * reach).contains(&length(*step)));
+        disc.sort_by_key(|step| length(*step));
+        let at = |x: i32, y: i32| {
+            let inside = (0..w).contains(&x) && (0..h).contains(&y);
+            inside.then(|| (y * w + x) as usize).filter(|&pixel| depth[pixel].is_finite())
+        };
+        // The point behind this pixel that some camera sees beside it.
+        let behind = |pixel: usize| {
+            let (x, y, near) = (pixel as i32 % w, pixel as i32 / w, f64::from(depth[pixel]));
+            let beyond = |pixel: usize| f64::from(depth[pixel]) > EDGE_RATIO * near;
+            let (step, edge) = disc.iter().find_map(|step| {
+                let edge = at(x + step[0], y + step[1]).filter(|&pixel| beyond(pixel))?;
+                Some((*step, edge))
+            })?;
+            let (front, back) = (lift(camera, pixel, near)?, lift(camera, pixel, f64::from(depth[edge]))?);
+            let uncovered = scene.train.iter().any(|view| {
+                let (Some(a), Some(b)) = (view.camera.project(front), view.camera.project(back)) else { return false };
+                let scale = f64::from(w) / f64::from(view.camera.size[0]);
+                (a[0] - b[0]).hypot(a[1] - b[1]) * scale >= f64::from(length(step)).sqrt()
+            });
+            let mirrored = at(x + 2 * step[0], y + 2 * step[1]).filter(|&pixel| beyond(pixel)).unwrap_or(edge) as i32;
+            let color = reference.image.get_pixel((mirrored % w) as u32, (mirrored / w) as u32).0;
+            uncovered.then(|| Point { position: back.map(|v| v as f32), color })
+        };
+        let hole: Vec<usize> = (0..depth.len()).filter(|&pixel| depth[pixel].is_finite()).collect();
+        let points: Vec<Point> = hole.into_par_iter().filter_map(behind).collect();
+        scene.points.extend(points);
+    }
+    let added = scene.points.len() - before;
+    if added > 0 {
+        scene.notes.push(format!(
+            "{added} points are added behind depth edges in the hole, where nothing is seen (scene.seed_behind_edges)"
+        ));
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::reference;
@@ -134,6 +187,58 @@ mod tests {
         drop_object(&mut full, 0.9);
         assert_eq!(full.points.len(), read.points.len());
         assert!(full.notes.last().expect("a note").contains("inverted"));
+    }
+
+    /// A step in depth: the far side goes on behind the near one, no further than another camera looks behind it.
+    #[test]
+    fn the_far_side_of_an_edge_goes_on_behind_it() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let dir = folder.path().join("scene");
+        synthetic::write(&dir, &synthetic::Options::default()).expect("a scene");
+        let mut scene = load(&dir, &Config::default()).expect("it loads");
+        let reference = &mut scene.references[0];
+        let [w, h] = scene.train[reference.view].camera.size;
+        // Columns 70 to 79 are near, 80 to 89 are far, of one colour each.
+        let hole = |x: u32, y: u32| (70..90).contains(&x) && (50..60).contains(&y);
+        let (near, far) = (2.0f32, 3.0f32);
+        let depth: Vec<f32> = (0..h)
+            .flat_map(|y| (0..w).map(move |x| (x, y)))
+            .map(|(x, y)| {
+                if !hole(x, y) {
+                    f32::NAN
+                } else if x < 80 {
+                    near
+                } else {
+                    far
+                }
+            })
+            .collect();
+        for (x, y, pixel) in reference.image.enumerate_pixels_mut() {
+            pixel.0 = if x < 80 { [200, 0, 0] } else { [0, 0, (y % 200) as u8] };
+        }
+        let camera = scene.train[reference.view].camera.clone();
+        let before = scene.points.len();
+        seed_behind_edges(&mut scene, &[Some(depth.clone())]);
+        let added = &scene.points[before..];
+        // A camera moves the two sides apart by much more than the reach of 8 pixels.
+        assert_eq!(added.len(), 8 * 10);
+        for point in added {
+            let position = point.position.map(f64::from);
+            let pixel = pixel_of(&camera, position).expect("in the picture");
+            assert!((72..80).contains(&(pixel % w as usize)) && (camera.to_camera(position)[2] - 3.0).abs() < 1e-4);
+            assert_eq!(point.color, [0, 0, (pixel / w as usize % 200) as u8], "of the far side, in the same row");
+        }
+        // From the reference's place alone nothing is uncovered, nor by a step that no camera tells.
+        let view = scene.references[0].view;
+        let mut alone = scene.clone();
+        alone.train.iter_mut().for_each(|v| v.camera = camera.clone());
+        alone.references[0].view = view;
+        let left = alone.points.len();
+        seed_behind_edges(&mut alone, &[Some(depth.clone())]);
+        assert_eq!(alone.points.len(), left);
+        let flat: Vec<f32> = depth.iter().map(|z| if *z == far { 1.01 * near } else { *z }).collect();
+        seed_behind_edges(&mut scene, &[Some(flat)]);
+        assert_eq!(scene.points.len(), left);
     }
 
     #[test]
