@@ -225,7 +225,7 @@ fn json(path: &Path) -> Value {
 fn a_run_becomes_files_of_the_same_scene() {
     let folder = with_run(80, 60);
     let folder = folder.path();
-    let text = succeeds(folder, "export run --views 12 --steps 60 --validate");
+    let text = succeeds(folder, "export run --views 12 --steps 200 --validate");
     assert!(text.ends_with("wrote scene.ply, scene.spz, scene.glb, export.json in run/export\n"), "{text}");
     let out = folder.join("run/export");
     let read = |name: &str| fs::read(out.join(name)).expect(name);
@@ -248,7 +248,7 @@ fn a_run_becomes_files_of_the_same_scene() {
         assert!(down > 0.5, "{camera}");
     }
     // The scene's own axes on request, and the same Gaussians: the same bytes for the same seed.
-    succeeds(folder, "export run --views 12 --steps 60 --formats ply --out again");
+    succeeds(folder, "export run --views 12 --steps 200 --formats ply --out again");
     assert!(fs::read(folder.join("again/scene.ply")).expect("a file") == read("scene.ply"), "not the same bytes");
     succeeds(folder, "export run --views 2 --steps 0 --up keep --degree 1 --formats ply --out kept");
     assert_eq!(json(&folder.join("kept/export.json"))["rotation"][0], serde_json::json!([1.0, 0.0, 0.0]));
