@@ -207,7 +207,7 @@ fn with_model(folder: &Path) {
         offsets_per_anchor: 10,
         log_scaling: vec![[-2.0; 6]; 2],
     };
-    let weights = model::init::weights(1, 10, false);
+    let weights = model::init::weights(1, 10, false, 0.0);
     model::files::save(&folder.join("model"), &anchors, &weights).expect("a writable folder");
 }
 

@@ -72,7 +72,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 32, failure_persistence: None, ..ProptestConfig::default() })]
     #[test]
     fn a_model_comes_back_bit_for_bit(count in 0usize..40, k in 1usize..13, attention: bool, seed: u64) {
-        let before = (anchors(count, k, seed), init::weights(seed, k, attention));
+        let before = (anchors(count, k, seed), init::weights(seed, k, attention, 0.0));
         let folder = saved(&before.0, &before.1);
         let after = files::load(folder.path()).unwrap();
         prop_assert_eq!(bits(&after.0), bits(&before.0));
@@ -84,7 +84,7 @@ proptest! {
 #[test]
 fn the_ply_has_the_published_names_order_and_layout() {
     let anchors = anchors(3, 10, 7);
-    let folder = saved(&anchors, &init::weights(0, 10, false));
+    let folder = saved(&anchors, &init::weights(0, 10, false, 0.0));
     let (header, payload) = split(&std::fs::read(folder.path().join(POINT_CLOUD)).unwrap());
     assert_eq!(header[..3], ["ply", "format binary_little_endian 1.0", "element vertex 3"]);
     let (names, rows) = rows(&header, &payload);
@@ -115,7 +115,7 @@ fn the_ply_has_the_published_names_order_and_layout() {
 
 #[test]
 fn weights_have_pytorch_names_and_shapes() {
-    let folder = saved(&anchors(1, 10, 0), &init::weights(0, 10, true));
+    let folder = saved(&anchors(1, 10, 0), &init::weights(0, 10, true, 0.0));
     let bytes = std::fs::read(folder.path().join(WEIGHTS)).unwrap();
     let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
     let mut found: Vec<(String, Vec<usize>)> =
@@ -139,7 +139,7 @@ fn weights_have_pytorch_names_and_shapes() {
 #[test]
 fn permuted_extra_and_double_attributes_load_the_same() {
     let anchors = anchors(5, 4, 3);
-    let folder = saved(&anchors, &init::weights(0, 4, false));
+    let folder = saved(&anchors, &init::weights(0, 4, false, 0.0));
     let path = folder.path().join(POINT_CLOUD);
     let (header, payload) = split(&std::fs::read(&path).unwrap());
     let (names, rows) = rows(&header, &payload);
@@ -190,7 +190,7 @@ fn permuted_extra_and_double_attributes_load_the_same() {
 
 #[test]
 fn damaged_and_foreign_point_clouds_are_refused() {
-    let folder = saved(&anchors(6, 2, 1), &init::weights(0, 2, false));
+    let folder = saved(&anchors(6, 2, 1), &init::weights(0, 2, false, 0.0));
     let path = folder.path().join(POINT_CLOUD);
     let shown = path.display().to_string();
     let good = std::fs::read(&path).unwrap();
@@ -229,7 +229,7 @@ fn damaged_and_foreign_point_clouds_are_refused() {
 #[test]
 fn damaged_and_foreign_weights_are_refused() {
     let anchors = anchors(1, 3, 1);
-    let folder = saved(&anchors, &init::weights(0, 3, false));
+    let folder = saved(&anchors, &init::weights(0, 3, false, 0.0));
     let path = folder.path().join(WEIGHTS);
     let shown = path.display().to_string();
     let good = std::fs::read(&path).unwrap();
@@ -244,7 +244,7 @@ fn damaged_and_foreign_weights_are_refused() {
     assert!(message.starts_with(&format!("{shown}: value ")) && message.contains(" is NaN"), "{message}");
 
     // Weights of a model with another number of Gaussians per anchor.
-    let other = saved(&self::anchors(1, 5, 1), &init::weights(0, 5, false));
+    let other = saved(&self::anchors(1, 5, 1), &init::weights(0, 5, false, 0.0));
     std::fs::copy(other.path().join(WEIGHTS), &path).unwrap();
     assert_eq!(
         refusal(folder.path()),
@@ -258,16 +258,16 @@ fn damaged_and_foreign_weights_are_refused() {
 
 #[test]
 fn an_inconsistent_model_is_refused_and_leaves_the_old_one() {
-    let (anchors, weights) = (anchors(4, 2, 1), init::weights(0, 2, false));
+    let (anchors, weights) = (anchors(4, 2, 1), init::weights(0, 2, false, 0.0));
     let folder = saved(&anchors, &weights);
     let mut short = anchors.clone();
     short.offset.pop();
-    let mut partial = init::weights(0, 2, true);
+    let mut partial = init::weights(0, 2, true, 0.0);
     partial.tensors.remove("to_out.bias");
     let mut foreign = weights.clone();
     foreign.tensors.insert("discriminator".into(), weights.tensors["mlp_cov.2.bias"].clone());
     for (anchors, weights) in
-        [(&short, &weights), (&anchors, &partial), (&anchors, &foreign), (&anchors, &init::weights(0, 3, false))]
+        [(&short, &weights), (&anchors, &partial), (&anchors, &foreign), (&anchors, &init::weights(0, 3, false, 0.0))]
     {
         assert!(matches!(files::save(folder.path(), anchors, weights), Err(Error::Inconsistent(_))));
     }
@@ -282,7 +282,7 @@ fn saving_where_a_file_stands_names_it() {
     let folder = folder();
     let path = folder.path().join("model");
     std::fs::write(&path, b"").unwrap();
-    let refused = files::save(&path, &anchors(1, 1, 0), &init::weights(0, 1, false));
+    let refused = files::save(&path, &anchors(1, 1, 0), &init::weights(0, 1, false, 0.0));
     assert!(matches!(refused, Err(Error::Io { path: named, .. }) if named == path));
 }
 
@@ -291,7 +291,7 @@ fn saving_where_a_file_stands_names_it() {
 #[test]
 fn half_a_million_anchors_are_saved_and_loaded_in_seconds() {
     let anchors = anchors(500_000, 10, 9);
-    let weights = init::weights(0, 10, false);
+    let weights = init::weights(0, 10, false, 0.0);
     let start = std::time::Instant::now();
     let folder = saved(&anchors, &weights);
     let written = start.elapsed();
@@ -305,7 +305,7 @@ fn half_a_million_anchors_are_saved_and_loaded_in_seconds() {
 #[test]
 fn the_device_order_round_trips() {
     for attention in [false, true] {
-        let weights = init::weights(3, 7, attention);
+        let weights = init::weights(3, 7, attention, 0.0);
         let flat = weights.decoders();
         assert_eq!(flat.len(), gscream_vk::math::decoder::Layout { offsets: 7 }.weights());
         let attention = attention.then(|| weights.attention());

@@ -205,7 +205,7 @@ impl Load {
         let method = Method::new(gpu, &settings.render)?;
         let offsets = settings.model.offsets;
         let anchors = self.anchors(method.tiling.side().into(), offsets, method.alpha_min.into());
-        let mut weights = init::weights(settings.train.seed, offsets as usize, attention);
+        let mut weights = init::weights(settings.train.seed, offsets as usize, attention, settings.model.opacity);
         let mut set = |name: &str, value: &dyn Fn(usize) -> f64| {
             let tensor = weights.tensors.get_mut(name).expect("the decoders have this tensor");
             tensor.data.iter_mut().enumerate().for_each(|(i, v)| *v = value(i) as f32);
@@ -354,7 +354,7 @@ fn bytes(gpu: &Gpu, settings: &Settings, load: &Load, capacity: Capacity) -> Res
         offsets_per_anchor: offsets,
         log_scaling: vec![[0.0; 6]; anchors],
     };
-    let weights = init::weights(0, offsets, plan.attention);
+    let weights = init::weights(0, offsets, plan.attention, settings.model.opacity);
     let number = super::usual_step(&plan, settings, 0);
     let mut step = Step::new(&rehearsal, plan, settings, &anchors, &weights, 1.0)?;
     step.resize(capacity)?;

@@ -23,6 +23,9 @@ pub struct Config {
     pub color_features: f64,
     /// Offsets begin uniformly in +- this, in units of the anchor's scaling; 0: all begin as 0 (Scaffold-GS).
     pub spread: f64,
+    /// Opacity that the decoder's last bias gives all Gaussians to begin with; 0: that bias is random as PyTorch's, and
+    /// about half of an anchor's Gaussians never exist (Scaffold-GS).
+    pub opacity: f64,
     /// Bidirectional cross-attention between anchors inside and around the mask.
     pub attention: Attention,
 }
@@ -57,6 +60,7 @@ impl Default for Config {
             offsets: 10,
             color_features: 0.0,
             spread: 0.0,
+            opacity: 0.0,
             attention: Attention::default(),
         }
     }
@@ -80,6 +84,7 @@ impl Config {
         let gain = self.color_features;
         ensure((0.0..=100.0).contains(&gain), "color_features", gain, "must be between 0 and 100")?;
         ensure((0.0..=10.0).contains(&self.spread), "spread", self.spread, "must be between 0 and 10")?;
+        ensure((0.0..=0.9).contains(&self.opacity), "opacity", self.opacity, "must be between 0 and 0.9")?;
         let attention = &self.attention;
         ensure(attention.patch > 0, "attention.patch", attention.patch, "must be at least 1 pixel")?;
         ensure(

@@ -192,17 +192,25 @@ const OFFSETS_STREAM: u128 = 0x6f66_6673_6574_7300;
 
 /// Networks in PyTorch's default initialisation of `Linear`: weights and biases uniform in
 /// +-1/sqrt(fan in). Decoders first, so that they are the same with and without attention.
-pub fn weights(seed: u64, offsets_per_anchor: usize, attention: bool) -> Weights {
+///
+/// Where `opacity` is above 0 the opacity decoder's last bias is what gives that opacity (tanh) by itself. Drawn at random,
+/// an output that is negative for all anchors exists for none, has no gradient, and its Gaussians are never born.
+pub fn weights(seed: u64, offsets_per_anchor: usize, attention: bool, opacity: f64) -> Weights {
     let mut generator = Pcg64::new(u128::from(seed), WEIGHTS_STREAM);
     let mut tensors = BTreeMap::new();
     for (name, shape) in weight_shapes(offsets_per_anchor, attention) {
         let bound = 1.0 / (fan_in(&name, &shape) as f32).sqrt();
         let uniform = Uniform::new_inclusive(-bound, bound).expect("the bound is positive and finite");
-        let data = (0..shape.iter().product()).map(|_| uniform.sample(&mut generator)).collect();
+        let mut data: Vec<f32> = (0..shape.iter().product()).map(|_| uniform.sample(&mut generator)).collect();
+        if opacity > 0.0 && name == OPACITY_BIAS {
+            data.fill(opacity.atanh() as f32);
+        }
         tensors.insert(name, Tensor { shape, data });
     }
     Weights { tensors }
 }
+
+const OPACITY_BIAS: &str = "mlp_opacity.2.bias";
 
 /// Inputs of the layer that the tensor belongs to. A bias has as many as the weight beside it.
 fn fan_in(name: &str, shape: &[usize]) -> usize {
@@ -361,10 +369,10 @@ mod tests {
 
     #[test]
     fn weights_are_uniform_in_the_bound_of_their_fan_in_and_repeat_with_the_seed() {
-        let drawn = weights(5, 10, true);
-        assert_eq!(drawn, weights(5, 10, true));
-        assert_ne!(drawn, weights(6, 10, true));
-        let decoders = weights(5, 10, false);
+        let drawn = weights(5, 10, true, 0.0);
+        assert_eq!(drawn, weights(5, 10, true, 0.0));
+        assert_ne!(drawn, weights(6, 10, true, 0.0));
+        let decoders = weights(5, 10, false, 0.0);
         assert!(decoders.tensors.iter().all(|(name, tensor)| drawn.tensors[name] == *tensor));
         assert_eq!((decoders.tensors.len(), drawn.tensors.len()), (12, 20));
         for (name, tensor) in &drawn.tensors {
@@ -382,6 +390,19 @@ mod tests {
             // deviation is bound / sqrt(3 n), and 6 of them are exceeded once in 5e8.
             assert!(largest >= bound * (1.0 - 20.0 / n), "{name}");
             assert!(mean.abs() <= 6.0 * bound / (3.0 * n).sqrt(), "{name}");
+        }
+        // With an opacity to begin with, one bias alone is another.
+        let opaque = weights(5, 10, true, 0.5);
+        for (name, tensor) in &drawn.tensors {
+            let other = &opaque.tensors[name];
+            if name == OPACITY_BIAS {
+                assert!(
+                    other.data.len() == 10 && other.data.iter().all(|v| (v.tanh() - 0.5).abs() < 1e-6),
+                    "{other:?}"
+                );
+            } else {
+                assert_eq!(tensor, other, "{name}");
+            }
         }
     }
 }

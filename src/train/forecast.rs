@@ -81,7 +81,7 @@ pub fn survey<'c>(
 ) -> Result<Survey, gpu::Error> {
     let cameras: Vec<&Camera> = cameras.into_iter().collect();
     let offsets = initial.anchors.offsets_per_anchor as u32;
-    let flat = init::weights(settings.train.seed, offsets as usize, false).decoders();
+    let flat = init::weights(settings.train.seed, offsets as usize, false, settings.model.opacity).decoders();
     let weights = gpu.upload("weights", &flat)?;
     let anchors = Anchors::upload(gpu, &initial.anchors, 0)?;
     let size = cameras.iter().fold([1, 1], |a, c| [a[0].max(c.size[0]), a[1].max(c.size[1])]);
@@ -215,7 +215,7 @@ pub fn rehearse(
     let gpu = gpu.rehearsal();
     let plan = Plan::new(scene, settings);
     let offsets = settings.model.offsets as usize;
-    let weights = init::weights(settings.train.seed, offsets, plan.attention);
+    let weights = init::weights(settings.train.seed, offsets, plan.attention, settings.model.opacity);
     let coarse = settings.train.coarse;
     let mut photographs = photographs::upload(&gpu, scene, &plan, coarse.reduction(1))?;
     let mut step = Step::new(&gpu, plan.clone(), settings, &initial.anchors, &weights, initial.voxel)?;

@@ -169,7 +169,7 @@ fn model_files(_: &Gpu) {
         offsets_per_anchor: 2,
         log_scaling: vec![[-1.0; 6]; 3],
     };
-    let weights = init::weights(1, 2, true);
+    let weights = init::weights(1, 2, true, 0.0);
     let refused = |file: &str, what: &str| {
         let text = match files::load(folder.path()) {
             Ok(_) => panic!("{what} was read"),

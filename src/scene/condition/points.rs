@@ -216,7 +216,7 @@ mod tests {
         for (x, y, pixel) in reference.image.enumerate_pixels_mut() {
             pixel.0 = if x < 80 { [200, 0, 0] } else { [0, 0, (y % 200) as u8] };
         }
-        let camera = scene.train[reference.view].camera.clone();
+        let camera = scene.train[reference.view].camera;
         let before = scene.points.len();
         seed_behind_edges(&mut scene, &[Some(depth.clone())]);
         let added = &scene.points[before..];
@@ -231,7 +231,7 @@ mod tests {
         // From the reference's place alone nothing is uncovered, nor by a step that no camera tells.
         let view = scene.references[0].view;
         let mut alone = scene.clone();
-        alone.train.iter_mut().for_each(|v| v.camera = camera.clone());
+        alone.train.iter_mut().for_each(|v| v.camera = camera);
         alone.references[0].view = view;
         let left = alone.points.len();
         seed_behind_edges(&mut alone, &[Some(depth.clone())]);
