@@ -2,8 +2,9 @@
 //!
 //! [`ceilings`] measures what the device gives at most; [`cost`] says what every pass has to do, from the numbers that
 //! [`counts`] reads back from a traced step; [`step`] times the step beside it. [`loads`] generates scenes of chosen sizes
-//! and fits how every pass grows; [`tune()`] runs the choices that exist as data. [`predict`] says what the step would take by a GPU's published peaks. [`compare`] sets one record against
-//! another, [`text`], [`tables`] and [`figures`] write them down.
+//! and fits how every pass grows; [`tune()`] runs the choices that exist as data. [`predict`] says what the step would take
+//! by a GPU's published peaks. [`compare`] sets one record against another, [`text`],
+//! [`tables`] and [`figures`] write them down.
 //!
 #![doc = include_str!("README.md")]
 

@@ -24,7 +24,7 @@ pub struct Config {
     /// Offsets begin uniformly in +- this, in units of the anchor's scaling; 0: all begin as 0 (Scaffold-GS).
     pub spread: f64,
     /// Opacity that the decoder's last bias gives all Gaussians to begin with; 0: that bias is random as PyTorch's, and
-    /// about half of an anchor's Gaussians never exist (Scaffold-GS).
+    /// many Gaussians never exist (Scaffold-GS).
     pub opacity: f64,
     /// Bidirectional cross-attention between anchors inside and around the mask.
     pub attention: Attention,

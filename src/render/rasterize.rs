@@ -873,7 +873,7 @@ mod tests {
                     pair_depth
                 );
                 check!(rasterize, rasterize_backward_color[subgroups], Tiling::Wide, [], sorted, pair_slot);
-                if gpu.info().subgroup_size == 8 {
+                if gpu.runs_lanes() {
                     check!(
                         rasterize_narrow,
                         rasterize_backward_narrow,
@@ -915,7 +915,7 @@ mod tests {
     #[test]
     fn lists_hold_what_is_blended() {
         let gpu = testing::gpu();
-        if gpu.info().subgroup_size != 8 {
+        if !gpu.runs_lanes() {
             println!("skipped: narrow tiles need subgroups of 8 threads");
             return;
         }
