@@ -79,14 +79,17 @@ fn extremes(all: &[Interface]) -> String {
     .concat()
 }
 
-/// `glsl/` mirrors `src/` (checked when anything in `glsl/` changes): kernel `a/b_backward.comp` belongs to `src/a/b_backward.rs` or `src/a/b.rs`.
+/// `glsl/` mirrors `src/` (checked when anything in `glsl/` changes): kernel `a/b_backward.comp` and its form for CPU
+/// drivers, `a/cpu/b_backward.comp`, belong to `src/a/b_backward.rs` or `src/a/b.rs` or the room `src/a/b/`.
 fn check_mirror(path: &Path) -> Result<()> {
     let relative = path.strip_prefix("glsl")?;
-    let folder = Path::new("src").join(relative.parent().unwrap_or(Path::new("")));
+    let room = relative.parent().unwrap_or(Path::new(""));
+    let room = if room.ends_with("cpu") { room.parent().unwrap_or(room) } else { room };
+    let folder = Path::new("src").join(room);
     let stem = relative.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let mut owner = stem.as_str();
     loop {
-        if folder.join(format!("{owner}.rs")).exists() {
+        if folder.join(format!("{owner}.rs")).exists() || folder.join(owner).join("mod.rs").exists() {
             return Ok(());
         }
         match owner.rfind('_') {
@@ -349,7 +352,7 @@ fn rust_module(name: &str, path: &Path, interface: &Interface, spirv: &Path) -> 
         format!("{}pub {}: &'a {mutable}[{}],", doc(&b.doc), b.name, b.element.rust())
     }));
     line("}".into());
-    line("/// The same bindings, owned: one test case.\n#[derive(Clone, Debug, Default)]\npub struct Arrays {".into());
+    line("/// The same bindings, owned: one test case.\n#[derive(Clone, Default)]\npub struct Arrays {".into());
     line(each(&|b| format!("{}pub {}: Vec<{}>,", doc(&b.doc), b.name, b.element.rust())));
     line("}".into());
     if push.is_empty() {
@@ -407,22 +410,22 @@ fn rust_module(name: &str, path: &Path, interface: &Interface, spirv: &Path) -> 
     ));
     let pattern = bindings.iter().map(|b| b.name.clone()).collect::<Vec<_>>().join(", ");
     line(format!(
-        "fn host(words: &mut [Vec<u32>]) -> Host<'_> {{ let [{pattern}] = words else {{ panic!(\"{{}} binds {} buffers\", Self::NAME) }}; Host {{ {} }} }}",
+        "fn host(words: &mut [Vec<u32>]) -> Host<'_> {{ let [{pattern}] = words else {{ wrong_bindings(Self::NAME, {}) }}; Host {{ {} }} }}",
         bindings.len(),
         each(&|b| if b.access == "Read" {
-            format!("{0}: bytemuck::cast_slice({0}),", b.name)
+            format!("{0}: elements({0}),", b.name)
         } else {
-            format!("{0}: bytemuck::cast_slice_mut({0}),", b.name)
+            format!("{0}: elements_mut({0}),", b.name)
         })
     ));
     line(format!(
         "fn words(arrays: Arrays) -> Vec<Vec<u32>> {{ vec![{}] }}",
-        each(&|b| format!("bytemuck::cast_slice(&arrays.{}).to_vec(),", b.name))
+        each(&|b| format!("words_of(&arrays.{}),", b.name))
     ));
     line(format!(
-        "fn arrays(words: &[Vec<u32>]) -> Arrays {{ let [{pattern}] = words else {{ panic!(\"{{}} binds {} buffers\", Self::NAME) }}; Arrays {{ {} }} }}",
+        "fn arrays(words: &[Vec<u32>]) -> Arrays {{ let [{pattern}] = words else {{ wrong_bindings(Self::NAME, {}) }}; Arrays {{ {} }} }}",
         bindings.len(),
-        each(&|b| format!("{0}: bytemuck::cast_slice({0}).to_vec(),", b.name))
+        each(&|b| format!("{0}: elements_of({0}),", b.name))
     ));
     line("}\n}".into());
     w

@@ -68,7 +68,9 @@ fn a_step_is_measured_and_compared() {
         // A pass of one view in two is half a dispatch.
         assert!(number(&pass["dispatches"]) >= 0.5 && stdout.contains(name), "{name}");
     }
-    let has = |name: &str| passes.iter().any(|pass| pass["pass"].as_str().is_some_and(|p| p.starts_with(name)));
+    let has = |name: &str| {
+        passes.iter().any(|pass| pass["pass"].as_str().is_some_and(|p| p.replace("/cpu/", "/").starts_with(name)))
+    };
     for name in [
         "fill",
         "render/cull",
@@ -120,7 +122,7 @@ fn a_step_is_measured_and_compared() {
 
     let stdout = succeeds(folder, &format!("{measured} --against first/bench.json"));
     let compared = stdout.split("against the older record").nth(1).expect("a comparison");
-    assert!(compared.contains("render/rasterize_backward") && compared.contains("\ntotal "), "{compared}");
+    assert!(compared.contains("rasterize_backward") && compared.contains("\ntotal "), "{compared}");
 
     // On paper for the GPUs that are published: the same passes, and all of them.
     let stdout =
@@ -155,6 +157,7 @@ fn a_step_is_measured_and_compared() {
 }
 
 #[test]
+#[ignore = "long; .ci/run has it"]
 fn loads_are_generated_and_what_does_not_fit_is_named() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let folder = folder.path();
@@ -179,6 +182,7 @@ fn loads_are_generated_and_what_does_not_fit_is_named() {
 }
 
 #[test]
+#[ignore = "long; .ci/run has it"]
 fn shapes_are_tuned() {
     let scene = common::folder();
     let folder = scene.path();

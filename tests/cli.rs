@@ -512,6 +512,7 @@ fn the_ten_most_likely_mistakes() {
 /// full disk does.
 #[cfg(unix)]
 #[test]
+#[ignore = "long; .ci/run has it"]
 fn without_room_on_the_disk_it_is_said_which_file_and_how_to_go_on() {
     use std::os::unix::process::ExitStatusExt as _;
     let folder = with_scene();
@@ -572,6 +573,7 @@ fn train_of_what_makes_no_sense_writes_nothing() {
 }
 
 #[test]
+#[ignore = "long; .ci/run has it"]
 fn plan_and_verify_of_a_scene() {
     let folder = with_scene();
     let folder = folder.path();
@@ -601,6 +603,7 @@ fn plan_and_verify_of_a_scene() {
 
 /// A clean test view as the reference, and what its run is judged by, now and later.
 #[test]
+#[ignore = "long; .ci/run has it"]
 fn a_run_with_the_truth_as_reference_is_judged_and_judged_again() {
     let folder = with_scene();
     let folder = folder.path();
@@ -652,6 +655,7 @@ fn a_run_with_the_truth_as_reference_is_judged_and_judged_again() {
 }
 
 #[test]
+#[ignore = "long; .ci/run has it"]
 fn ablate_compares_over_seeds_and_scenes() {
     let folder = with_scene();
     let folder = folder.path();

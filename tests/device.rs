@@ -108,6 +108,7 @@ fn drivers_on_top_of_something_else_are_listed() {
 }
 
 #[test]
+#[ignore = "long; .ci/run has it"]
 fn a_device_without_push_descriptors_has_sets() {
     if !Path::new(SWIFTSHADER).is_file() {
         println!("skipped: no {SWIFTSHADER} (Debian: chromium)");

@@ -257,6 +257,7 @@ fn a_run_becomes_files_of_the_same_scene() {
 /// A file system that takes no more looks like a limit on the size of files.
 #[cfg(unix)]
 #[test]
+#[ignore = "long; .ci/run has it"]
 fn a_disk_that_fills_up_leaves_nothing() {
     let folder = with_run(32, 4);
     let folder = folder.path();

@@ -111,7 +111,7 @@ fn every_combination_has_what_it_needs_and_nothing_else() {
         let buffers: BTreeSet<&str> = forecast.used.values().flat_map(|u| u.buffers.keys().copied()).collect();
         for (mark, owner) in MARKS {
             let names = || passes.iter().chain(&buffers).chain(&forecast.pipelines);
-            let found = names().find(|name| name.starts_with(mark));
+            let found = names().find(|name| name.replace("/cpu/", "/").starts_with(mark));
             // Test views are drawn with their depth.
             let drawn = mark == "depth_map" && wanted.tests;
             assert_eq!(found.is_some(), present(owner) || drawn, "{wanted:?}: {mark}*: {found:?}");
@@ -121,7 +121,7 @@ fn every_combination_has_what_it_needs_and_nothing_else() {
             assert!(wanted.masks || !(name.starts_with("losses/") && masked), "{wanted:?}: {name} needs a mask");
         }
         if !wanted.tests {
-            let forms = ["render/rasterize", "render/project_backward"];
+            let forms = ["render/rasterize", "render/cpu/rasterize", "render/project_backward"];
             for name in passes.iter().filter(|n| forms.iter().any(|f| n.starts_with(f))) {
                 assert!(wanted.priors || name.ends_with("_color"), "{wanted:?}: {name} draws depth");
             }
@@ -289,7 +289,7 @@ fn gradients_of_what_is_not_trained_are_not_computed() {
             ("render/decode_backward_fixed", !offset && !log_scaling),
             ("optimizer/adam", bits != 0),
         ] {
-            let found = kernels.contains(kernel) || kernels.contains(format!("{kernel}_lanes").as_str());
+            let found = kernels.contains(kernel) || kernels.contains(kernel.replacen('/', "/cpu/", 1).as_str());
             assert_eq!(found, needed, "{bits:04b}: {kernel}");
         }
     }

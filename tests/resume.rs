@@ -461,6 +461,7 @@ fn copy(from: &Path, to: &Path) {
 }
 
 #[test]
+#[ignore = "long; .ci/run has it"]
 fn checkpoints_that_are_not_the_runs_own_are_refused() {
     let place = Place::new(&settings());
     half(&place, "half");

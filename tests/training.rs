@@ -69,6 +69,7 @@ fn scene_without_tests() -> Scene {
 }
 
 #[test]
+#[ignore = "long; .ci/run has it"]
 fn the_same_seed_gives_the_same_bytes() {
     testing::gpu_in_both_forms().for_each(|gpu| the_same_seed_gives_the_same_bytes_in_one_form(&gpu));
 }
@@ -103,6 +104,7 @@ fn pushed_or_as_sets_the_buffers_are_the_same() {
 }
 
 #[test]
+#[ignore = "long; .ci/run has it"]
 fn steps_that_overflow_are_taken_again() {
     testing::gpu_in_both_forms().for_each(|gpu| steps_that_overflow_are_taken_again_in_one_form(&gpu));
 }
@@ -197,7 +199,7 @@ fn every_pass_agrees_with_its_reference_in_one_form(gpu: &Gpu) {
         let submission = rec.submit().expect("the device runs it");
         let differences = submission.differences.clone();
         submission.wait().expect("the device runs it");
-        let compared = |pass: &str| differences.iter().any(|d| d.pass.starts_with(pass));
+        let compared = |pass: &str| differences.iter().any(|d| d.pass.replace("/cpu/", "/").starts_with(pass));
         assert!(differences.len() > 50, "{} tensors", differences.len());
         for pass in ["render/cull", "render/decode", "render/rasterize", "losses/depth_gradient", "optimizer/adam"] {
             assert!(compared(pass), "step {step}: {pass} was not compared");

@@ -7,11 +7,25 @@
 // variant color: COLOR_ONLY
 // variant depth: NO_TRANSMITTANCE
 //
-// Gradients of the blending, per (Gaussian, tile) pair. Front to back, as the forward pass, with what remains behind:
-// with v_i = c_i . g_rgb + z_i g_z, S = sum of w_i v_i + T_end (background . g_rgb + g_T) and A_i the sum's first i
-// terms, dL/dalpha_i = T_i v_i - (S - A_i) / (1 - alpha_i). As alpha <= 0.99 the divisor is at least 0.01; no chain of
-// divisions. The pair's gradients are summed over the tile's pixels in a fixed order and written to the pair's own
-// number, so nothing is added atomically. Every pair of the list is written, also behind the last one blended.
+// Gradients of the blending, per (Gaussian, tile) pair.
+//
+// A pixel is sum_i w_i c_i + T_end background with w_i = alpha_i T_i and T_{i+1} = T_i (1 - alpha_i). With v_i = dL/dw_i =
+// c_i . g_rgb + z_i g_z, alpha_i acts through its own weight and through the transmittance of all that lies behind:
+//   dL/dalpha_i = T_i v_i - (sum_{j > i} w_j v_j + T_end (background . g_rgb + g_T)) / (1 - alpha_i).
+// The bracket is S - A_i: S = rgb . g_rgb + depth g_z + T_end g_T is known from the picture, and A_i = sum_{j <= i} w_j v_j
+// grows front to back, as the forward pass goes. As alpha <= 0.99 the divisor is at least 0.01; no chain of divisions.
+//
+// alpha = min(0.99, o e), e = exp(power), power = -(a^2 / N + dy^2 / V) / 2, a = dx - k dy, (dx, dy) = pixel - mean. With
+// gp = dL/dpower = o e dL/dalpha, 0 where the clamp holds:
+//   dL/do = e dL/dalpha; dL/dmean = (gp a / N, gp dy / V - k gp a / N); dL/d(1/N) = -gp a^2 / 2; dL/dk = gp a dy / N;
+//   dL/d(1/V) = -gp dy^2 / 2.
+// The factors before gp a, gp dy and their squares are the Gaussian's own: `Sums` are over pixels, `write` applies them.
+//
+// Threads: thread t of 64 has column t % 16 of the tile's 16 x 16 pixels, and rows 4 (t / 16) to 4 (t / 16) + 3. 32 Gaussians
+// at a time lie in shared memory, 4 are gone through together: `meet` twice leaves lane k of every four with the k-th's
+// sums over the four, further bits add the subgroup's other fours, and lanes 0 to 3 put them down. Then thread t adds what
+// the subgroups put down of Gaussian t, in their order, and writes it to the pair's own number: nothing is added
+// atomically. Every pair of the list is written, also behind the last one blended.
 // `depth` is for losses on colour and depth, `color` for losses on colour alone.
 #ifdef COLOR_ONLY
 #define NO_TRANSMITTANCE
@@ -51,7 +65,7 @@ layout(push_constant, scalar) uniform Push {
   uint tiles_x; // tiles in x
 } push;
 
-float T[ROWS];
+float T[ROWS]; // T_i
 float remaining[ROWS]; // S - A_i
 vec3 g_rgb[ROWS];
 float g_z[ROWS];

@@ -259,7 +259,7 @@ pub const TABLE: &[Formula] = &[
     },
     Formula {
         pass: "render/decode_hidden",
-        variants: &["lanes"],
+        variants: &[],
         derivation: "the first layer; per visible anchor input 160, hidden units 384 and their signs 24 B; 96 units of 37 multiply-adds and a maximum",
         work: |c, _| work(c.first_bytes() + 568.0 * c.visible, 96.0 * 38.0 * c.visible, 0.0),
     },
@@ -327,19 +327,19 @@ pub const TABLE: &[Formula] = &[
         work: |c, _| work(4.0 * c.pairs + 8.0 * c.tiles, 4.0 * c.pairs, 0.0),
     },
     Formula {
-        pass: "render/bin_tally",
+        pass: "render/cpu/bin_tally",
         variants: &[],
         derivation: "per pair its tile 4 B and 2 operations; a counter per tile and each of 64 runs read and written: 8 B",
         work: |c, _| work(4.0 * c.pairs + 512.0 * c.tiles, 2.0 * c.pairs, 0.0),
     },
     Formula {
-        pass: "render/bin_tally_ranges",
+        pass: "render/cpu/bin_tally_ranges",
         variants: &[],
         derivation: "per tile where its first run begins 4, a range 8 B",
         work: |c, _| work(12.0 * c.tiles, 0.0, 0.0),
     },
     Formula {
-        pass: "render/bin_place",
+        pass: "render/cpu/bin_place",
         variants: &[],
         derivation: "per pair its tile 4 and its number 4 B, 2 operations; a counter per tile and each of 64 runs read and written: 8 B",
         work: |c, _| work(8.0 * c.pairs + 512.0 * c.tiles, 2.0 * c.pairs, 0.0),
@@ -364,7 +364,7 @@ pub const TABLE: &[Formula] = &[
         },
     },
     Formula {
-        pass: "render/rasterize_narrow",
+        pass: "render/cpu/rasterize",
         variants: &["color", "depth"],
         derivation: "per tile a range 8 and a count 4, per pair up to the tile's end 8, per pair seen 8, per Gaussian drawn 36, \
                      per pixel rgb 12 B; with depth 4 more per Gaussian and 8 per pixel. Per sample (pixel and pair up to the \
@@ -383,7 +383,7 @@ pub const TABLE: &[Formula] = &[
         },
     },
     Formula {
-        pass: "render/rasterize_backward_narrow",
+        pass: "render/cpu/rasterize_backward",
         variants: &["color", "depth"],
         derivation: "per tile a range 8 and a count 4, per pair seen 8, per Gaussian drawn 36, per pixel rgb 12 and its gradient \
                      12, per pair seen 36 B of gradients, per pair a bit; with depth 4 more per Gaussian and pair seen and 8 \
@@ -489,7 +489,7 @@ pub const TABLE: &[Formula] = &[
     },
     Formula {
         pass: "render/decode_backward_hidden",
-        variants: &["lanes"],
+        variants: &[],
         derivation: "the second layer; per visible anchor 4 B per padded output, signs of the hidden units 24, their gradient 384 B; 11 K outputs times 32 multiply-adds, 192 for the ReLU",
         work: |c, _| {
             work(
@@ -501,20 +501,20 @@ pub const TABLE: &[Formula] = &[
     },
     Formula {
         pass: "render/decode_backward_feature",
-        variants: &["lanes"],
+        variants: &[],
         derivation: "the first layer; per visible anchor its number 4, gradients of hidden units 384 and feature 128 B; 96 units \
                      times 32 multiply-adds",
         work: |c, _| work(c.first_bytes() + 516.0 * c.visible, 96.0 * 32.0 * c.visible, 0.0),
     },
     Formula {
         pass: "render/decode_backward_first",
-        variants: &["lanes"],
+        variants: &[],
         derivation: "per visible anchor input 160 and gradients of hidden units 384 B; 96 units times 37 multiply-adds; per chunk \
                      of anchors a first layer written",
         work: |c, _| work(544.0 * c.visible + c.chunks() * c.first_bytes(), 96.0 * 37.0 * c.visible, 0.0),
     },
     Formula {
-        pass: "render/decode_backward_second",
+        pass: "render/cpu/decode_backward_second",
         variants: &[],
         derivation: "one of the three heads, a third of them all; per visible anchor hidden units 384 B; per Gaussian that exists its place in the list 4 B and 44 B of gradients of 11 outputs, times 33; per chunk of 64 a second layer's share of 1452 B written",
         work: |c, _| {
@@ -523,7 +523,7 @@ pub const TABLE: &[Formula] = &[
         },
     },
     Formula {
-        pass: "render/decode_backward_second_wide",
+        pass: "render/decode_backward_second",
         variants: &[],
         derivation: "per visible anchor hidden units 384 B; per Gaussian that exists its place in the list 4 B and 44 B of gradients of 11 outputs, times 33; per chunk of 64 a second layer's share of 1452 B written",
         work: |c, _| {
@@ -674,39 +674,39 @@ pub const TABLE: &[Formula] = &[
     },
     Formula {
         pass: "model/attention_project",
-        variants: &["lanes"],
+        variants: &[],
         derivation: "both matrices 131072 B; per token features 128, queries and values 4096 B; 2 x 512 x 32 multiply-adds",
         work: |c, _| work(131_072.0 + 4224.0 * c.tokens, 32_768.0 * c.tokens, 0.0),
     },
     Formula {
         pass: "model/attention_forward",
-        variants: &["lanes"],
+        variants: &[],
         derivation: "per token queries 2048, keys 2048, values 2048, result 2048, softmax 64 B; per similarity (8 heads, own and \
                      other token) 64 + 64 multiply-adds, scale, maximum, difference and sum 4, and an exponential",
         work: |c, _| work(8256.0 * c.tokens, 132.0 * c.similarities(), c.similarities()),
     },
     Formula {
         pass: "model/attention_output",
-        variants: &["lanes"],
+        variants: &[],
         derivation: "the matrix and bias 65664 B; per token attended values 2048, result 128 B; 512 x 32 multiply-adds",
         work: |c, _| work(65_664.0 + 2176.0 * c.tokens, 16_384.0 * c.tokens, 0.0),
     },
     Formula {
         pass: "model/attention_output_backward",
-        variants: &["lanes"],
+        variants: &[],
         derivation: "the matrix 65536 B; per token gradient 128, attended values 2048, softmax 64, result 2048, rows 96 B; 512 x 33 \
                      multiply-adds",
         work: |c, _| work(65_536.0 + 4384.0 * c.tokens, 16_896.0 * c.tokens, 0.0),
     },
     Formula {
         pass: "model/attention_backward",
-        variants: &["lanes"],
+        variants: &[],
         derivation: "per token of both sides queries, values and gradients 6144, rows 96 B, of the own one two results 4096 B; per \
                      similarity three products and two sums of 64 multiply-adds, 10 operations and two exponentials",
         work: |c, _| work(16_576.0 * c.tokens, 330.0 * c.similarities(), 2.0 * c.similarities()),
     },
     Formula {
-        pass: "model/attention_pairs_backward",
+        pass: "model/cpu/attention_pairs_backward",
         variants: &[],
         derivation: "per token of both sides queries, values and gradients 6144, rows 96 B; per similarity three products of 64 multiply-adds, 10 operations, two exponentials and 12 B",
         work: |c, _| {
@@ -714,23 +714,23 @@ pub const TABLE: &[Formula] = &[
         },
     },
     Formula {
-        pass: "model/attention_pairs_apply",
+        pass: "model/cpu/attention_pairs_apply",
         variants: &["inside"],
         derivation: "per token of both sides 2048 B; per similarity 4 B and 64 multiply-adds",
         work: |c, _| work(4096.0 * c.tokens + 4.0 * c.similarities(), 64.0 * c.similarities(), 0.0),
     },
     Formula {
         pass: "model/attention_project_backward",
-        variants: &["lanes"],
+        variants: &[],
         derivation: "both matrices 131072 B; per token two gradients 4096, result 128 B; 2 x 512 x 32 multiply-adds",
         work: |c, _| work(131_072.0 + 4224.0 * c.tokens, 32_768.0 * c.tokens, 0.0),
     },
     Formula {
         pass: "model/attention_weight_backward",
-        variants: &["lanes"],
+        variants: &[],
         derivation: "per token both factors (512 + 32) x 4 B and 512 x 32 multiply-adds; the matrix written, in 8 slices unless summed at once",
         work: |c, d| {
-            let slices = if d.is("lanes") { 1.0 } else { 8.0 };
+            let slices = if d.name.contains("/cpu/") { 1.0 } else { 8.0 };
             work(2176.0 * c.tokens + slices * 65_536.0, 16_384.0 * c.tokens, 0.0)
         },
     },
@@ -774,14 +774,16 @@ pub fn of(counts: &Counts, dispatch: &Dispatch<'_>) -> Option<Work> {
     [work.bytes, work.operations, work.exponentials].iter().all(|v| v.is_finite()).then_some(work)
 }
 
-/// The line of the table for a pass.
+/// The line of the table for a pass. A form for CPU drivers without a line of its own has the other form's.
 pub fn formula(name: &str) -> Option<&'static Formula> {
-    let matches = |f: &&Formula| {
-        name == f.pass
-            || name
-                .strip_prefix(f.pass)
-                .and_then(|rest| rest.strip_prefix('_'))
-                .is_some_and(|variant| f.variants.contains(&variant))
+    let line = |name: &str| {
+        TABLE.iter().find(|f| {
+            name == f.pass
+                || name
+                    .strip_prefix(f.pass)
+                    .and_then(|rest| rest.strip_prefix('_'))
+                    .is_some_and(|variant| f.variants.contains(&variant))
+        })
     };
-    TABLE.iter().find(matches)
+    line(name).or_else(|| line(&name.replacen("/cpu/", "/", 1)))
 }

@@ -167,7 +167,9 @@ pub fn count(words: &BTreeMap<&'static str, Vec<u32>>, schedule: &Schedule, meth
 /// The buffer that the rasteriser takes the tiles' lists from: its second binding.
 fn sorted_list(schedule: &Schedule) -> Option<&'static str> {
     schedule.entries.iter().find_map(|entry| match entry {
-        Entry::Pass { name, accesses, .. } if name.starts_with("render/rasterize") => Some(accesses.get(1)?.0),
+        Entry::Pass { name, accesses, .. } if name.replacen("/cpu/", "/", 1).starts_with("render/rasterize") => {
+            Some(accesses.get(1)?.0)
+        }
         _ => None,
     })
 }

@@ -11,27 +11,22 @@ use crate::report::statistics::Spread;
 
 /// Kernels that are no part of a step: growing and pruning, and what measures.
 const NO_STEP: [&str; 4] = ["densify/grow", "densify/prune", "export/", "bench/"];
-/// Primitives that only those use.
-const UNUSED: [&str; 1] = ["primitives/reduce"];
 
 /// Every kernel with its variants, from the sources.
 fn kernels() -> BTreeSet<String> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("glsl");
     let mut names = BTreeSet::new();
-    for folder in std::fs::read_dir(&root).expect("the sources are there") {
-        let folder = folder.expect("readable").path();
-        for file in std::fs::read_dir(&folder).expect("a folder") {
-            let path = file.expect("readable").path();
-            if path.extension().is_none_or(|e| e != "comp") {
-                continue;
-            }
-            let part = |p: &Path| p.file_stem().expect("a name").to_string_lossy().into_owned();
-            let name = format!("{}/{}", part(&folder), part(&path));
-            let source = std::fs::read_to_string(&path).expect("readable");
-            let variants = source.lines().filter_map(|line| line.strip_prefix("// variant ")?.split_once(':'));
-            names.extend(variants.map(|(variant, _)| format!("{name}_{}", variant.trim())));
-            names.insert(name);
+    for entry in walkdir::WalkDir::new(&root) {
+        let path = entry.expect("readable").into_path();
+        if path.extension().is_none_or(|e| e != "comp") {
+            continue;
         }
+        let name = path.strip_prefix(&root).expect("inside").with_extension("");
+        let name = name.to_string_lossy().replace('\\', "/");
+        let source = std::fs::read_to_string(&path).expect("readable");
+        let variants = source.lines().filter_map(|line| line.strip_prefix("// variant ")?.split_once(':'));
+        names.extend(variants.map(|(variant, _)| format!("{name}_{}", variant.trim())));
+        names.insert(name);
     }
     names
 }
@@ -40,7 +35,7 @@ fn kernels() -> BTreeSet<String> {
 fn every_kernel_of_a_step_has_a_formula() {
     let all = kernels();
     assert!(all.len() > 80, "{} kernels: is this the right folder?", all.len());
-    let of_a_step = |name: &&String| !NO_STEP.iter().any(|p| name.starts_with(p)) && !UNUSED.contains(&name.as_str());
+    let of_a_step = |name: &&String| !NO_STEP.iter().any(|p| name.starts_with(p));
     let without: Vec<&String> = all.iter().filter(of_a_step).filter(|name| cost::formula(name).is_none()).collect();
     assert!(without.is_empty(), "no formula in src/bench/cost.rs for {without:?}");
     // And no formula for what there is not.
@@ -85,7 +80,7 @@ pub(super) fn record() -> Record {
         repetitions: 3,
         counts: Counts { pairs: 1e4, samples: 64e4, blended: 16e4, ..Counts::default() },
         passes: vec![
-            pass("render/rasterize_backward_narrow", 8.0),
+            pass("render/cpu/rasterize_backward", 8.0),
             pass("optimizer/adam", 4.0),
             PassFigures { work: None, floor: None, bound: None, ratio: None, ..pass("render/unheard_of", 1.0) },
         ],
@@ -218,7 +213,7 @@ fn changes_and_their_ranges() {
     step.passes[2].pass = "render/fused".into();
     let comparison = compare::compare(&old, &new, vec!["so".into()]);
     let change = |name: &str| comparison.passes.iter().find(|c| c.name == name).expect("compared").clone();
-    let raster = change("render/rasterize_backward_narrow");
+    let raster = change("render/cpu/rasterize_backward");
     assert_eq!((raster.old, raster.new, raster.ratio), (Some(8.0), Some(4.0), Some(0.5)));
     // Quartiles of 7.2, 8, 9.6: 7.6 and 8.8; of 3.9, 4, 4.4: 3.95 and 4.2.
     let [low, high] = raster.range.expect("a range");

@@ -2,8 +2,8 @@
 
 use super::device::Gpu;
 use super::error::Error;
-use super::kernel::{Access, Binding, Reference, Scalar, Slot};
-use super::recorder::Threads;
+use super::kernel::{Access, Binding, Interface, Scalar, Slot, Twin};
+use super::recorder::{Call, Threads};
 
 /// The allowed distance of a kernel's output from its twin's: `|got - want| <= relative |want| + absolute max |want|`,
 /// element by element. Integers must be equal.
@@ -142,8 +142,8 @@ impl Difference {
     }
 
     /// Compares the words of one of the kernel's bindings with its twin's.
-    pub(super) fn of_words<K: Reference>(binding: &Binding, got: &[u32], want: &[u32]) -> Self {
-        let check = K::check(binding.name);
+    pub(super) fn of_words(kernel: &str, twin: Twin<'_>, binding: &Binding, got: &[u32], want: &[u32]) -> Self {
+        let check = (twin.check)(binding.name);
         debug_assert!(binding.access != Access::Read);
         let values = |words: &[u32]| -> Vec<f64> {
             match binding.scalar {
@@ -154,26 +154,27 @@ impl Difference {
         };
         let discrete = binding.scalar != Scalar::F32;
         let check = if discrete { Check { relative: 0.0, absolute: 0.0, ..check } } else { check };
-        let found = Self::of(K::NAME, binding.name, &values(got), &values(want), check);
+        let found = Self::of(kernel, binding.name, &values(got), &values(want), check);
         // An integer is right or wrong by itself.
-        let vanished = if discrete || K::cancels(binding.name) { 0 } else { found.vanished };
+        let vanished = if discrete || (twin.cancels)(binding.name) { 0 } else { found.vanished };
         Self { discrete, vanished, whole: found.whole.filter(|_| !discrete), ..found }
     }
 }
 
 /// Uploads one buffer per binding, runs the kernel once and returns the buffers.
-pub(super) fn run_words<K: Reference>(
+pub(super) fn run_words(
     gpu: &Gpu,
+    kernel: &'static Interface,
     words: &[Vec<u32>],
-    push: K::Push,
-    constants: K::Constants,
+    push: &[u8],
+    constants: &[u8],
     threads: Threads<'_>,
 ) -> Result<Vec<Vec<u32>>, Error> {
     let buffers: Vec<_> =
-        K::BINDINGS.iter().zip(words).map(|(b, w)| gpu.upload(b.name, w)).collect::<Result<_, Error>>()?;
+        kernel.bindings.iter().zip(words).map(|(b, w)| gpu.upload(b.name, w)).collect::<Result<_, Error>>()?;
     let slots: Vec<Slot> = buffers.iter().map(super::Buffer::slot).collect();
     let mut recorder = gpu.recorder()?;
-    recorder.dispatch::<K>(&constants, &slots, &push, threads)?;
+    recorder.dispatch(Call { kernel, constants, push, slots: &slots }, threads)?;
     recorder.submit()?.wait()?;
     buffers.iter().map(|b| gpu.read(b)).collect()
 }

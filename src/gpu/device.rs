@@ -1,6 +1,5 @@
 //! Opening a device; pipelines.
 
-use std::any::TypeId;
 use std::collections::HashMap;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -13,7 +12,7 @@ use super::descriptors::Descriptors;
 use super::error::{Error, Named};
 use super::form::Form;
 use super::instance::{Instance, has};
-use super::kernel::Kernel;
+use super::kernel::Interface;
 use super::ledger::{Ledger, Rehearsal};
 use super::physical::{self, DeviceInfo, Found};
 use super::recorder::Context;
@@ -67,7 +66,7 @@ pub(super) struct Pipeline {
     compiled: Option<Compiled>,
 }
 
-type PipelineKey = (TypeId, Vec<u8>);
+type PipelineKey = (&'static str, Vec<u8>);
 
 pub(super) struct Inner {
     /// The only queue, which one thread at a time may use.
@@ -402,32 +401,33 @@ impl Inner {
     }
 
     /// The pipeline of a kernel with these constants, made at first use.
-    pub(super) fn pipeline<K: Kernel>(&self, constants: &K::Constants) -> Result<Arc<Pipeline>, Error> {
-        let key = (TypeId::of::<K>(), bytemuck::bytes_of(constants).to_vec());
+    pub(super) fn pipeline(&self, kernel: &'static Interface, constants: &[u8]) -> Result<Arc<Pipeline>, Error> {
+        let key = (kernel.name, constants.to_vec());
         // Held while the driver compiles: another thread that wants the same kernel waits for it.
         let mut pipelines = lock(&self.pipelines);
         if let Some(found) = pipelines.get(&key) {
             return Ok(found.clone());
         }
         let mut pipeline = Pipeline {
-            name: K::NAME,
+            name: kernel.name,
             raw: vk::Pipeline::null(),
             layout: vk::PipelineLayout::null(),
             set: vk::DescriptorSetLayout::null(),
             compiled: None,
         };
-        if let Err(result) = self.compile::<K>(&mut pipeline, constants) {
+        if let Err(result) = self.compile(kernel, &mut pipeline, constants) {
             self.destroy(&pipeline);
-            return Err(Error::Pipeline { kernel: K::NAME, device: self.info.name.clone(), result });
+            return Err(Error::Pipeline { kernel: kernel.name, device: self.info.name.clone(), result });
         }
-        self.name_object(pipeline.raw, K::NAME);
+        self.name_object(pipeline.raw, kernel.name);
         let pipeline = Arc::new(pipeline);
         pipelines.insert(key, pipeline.clone());
         Ok(pipeline)
     }
 
-    fn compile<K: Kernel>(&self, pipeline: &mut Pipeline, constants: &K::Constants) -> Result<(), vk::Result> {
-        let bindings: Vec<_> = K::BINDINGS
+    fn compile(&self, kernel: &Interface, pipeline: &mut Pipeline, constants: &[u8]) -> Result<(), vk::Result> {
+        let bindings: Vec<_> = kernel
+            .bindings
             .iter()
             .map(|b| {
                 vk::DescriptorSetLayoutBinding::default()
@@ -441,16 +441,16 @@ impl Inner {
             Some(_) => vk::DescriptorSetLayoutCreateFlags::PUSH_DESCRIPTOR_KHR,
             None => vk::DescriptorSetLayoutCreateFlags::empty(),
         };
-        let push_size = size_of::<K::Push>() as u32;
+        let push_size = kernel.push_bytes;
         let ranges = [vk::PushConstantRange::default().stage_flags(vk::ShaderStageFlags::COMPUTE).size(push_size)];
-        let entries: Vec<_> = K::CONSTANTS
+        let entries: Vec<_> = kernel
+            .constants
             .iter()
             .enumerate()
             .map(|(i, &id)| vk::SpecializationMapEntry { constant_id: id, offset: 4 * i as u32, size: 4 })
             .collect();
-        let specialization =
-            vk::SpecializationInfo::default().map_entries(&entries).data(bytemuck::bytes_of(constants));
-        let words = ash::util::read_spv(&mut std::io::Cursor::new(K::SPIRV)).expect("build.rs wrote whole words");
+        let specialization = vk::SpecializationInfo::default().map_entries(&entries).data(constants);
+        let words = ash::util::read_spv(&mut std::io::Cursor::new(kernel.spirv)).expect("build.rs wrote whole words");
         // SAFETY: the SPIR-V comes from shaderc, the layout from its reflection; all handles are live.
         unsafe {
             let set_info = vk::DescriptorSetLayoutCreateInfo::default().flags(set_flags).bindings(&bindings);
@@ -470,7 +470,7 @@ impl Inner {
                 .module(module)
                 .name(c"main")
                 .specialization_info(&specialization);
-            if K::SUBGROUPS {
+            if kernel.subgroups {
                 stage = stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS);
                 if self.require_subgroups {
                     stage = stage.push_next(&mut size);
@@ -491,8 +491,8 @@ impl Inner {
             if self.options.statistics {
                 let said: Vec<Statistic> =
                     self.executables.as_ref().map_or_else(Vec::new, |e| statistics::of(e, pipeline));
-                let words = bytemuck::pod_collect_to_vec(bytemuck::bytes_of(constants));
-                pipeline.compiled = Some(Compiled::new(K::NAME, words, milliseconds, said));
+                let words = bytemuck::pod_collect_to_vec(constants);
+                pipeline.compiled = Some(Compiled::new(kernel.name, words, milliseconds, said));
             }
         }
         Ok(())

@@ -54,6 +54,77 @@ pub struct Binding {
     pub components: u32,
 }
 
+/// All of a kernel that does not depend on its types: what the device needs, compiled once for all kernels.
+#[derive(Debug)]
+pub struct Interface {
+    /// As [`Kernel::NAME`].
+    pub name: &'static str,
+    /// As [`Kernel::GROUP`].
+    pub group: [u32; 3],
+    /// As [`Kernel::SUBGROUPS`].
+    pub subgroups: bool,
+    /// As [`Kernel::BINDINGS`].
+    pub bindings: &'static [Binding],
+    /// As [`Kernel::CONSTANTS`].
+    pub constants: &'static [u32],
+    /// Bytes of the push constants.
+    pub push_bytes: u32,
+    /// As [`Kernel::SPIRV`].
+    pub spirv: &'static [u8],
+}
+
+/// A kernel's twin without its types.
+#[derive(Clone, Copy)]
+pub(super) struct Twin<'c> {
+    /// [`Reference::reference`] on one vector of words per binding, with the call's constants.
+    pub reference: &'c dyn Fn(&mut [Vec<u32>]),
+    /// [`Reference::check`].
+    pub check: fn(&'static str) -> super::Check,
+    /// [`Reference::cancels`].
+    pub cancels: fn(&'static str) -> bool,
+}
+
+/// Calls `then` with the kernel's twin for these constants.
+pub(super) fn with_twin<K: Reference, R>(
+    push: K::Push,
+    constants: K::Constants,
+    then: impl FnOnce(Twin<'_>) -> R,
+) -> R {
+    let reference = |words: &mut [Vec<u32>]| K::reference(K::host(words), push, constants);
+    then(Twin { reference: &reference, check: K::check, cancels: K::cancels })
+}
+
+/// A binding's words as its elements.
+#[inline(never)]
+pub fn elements<T: bytemuck::Pod>(words: &[u32]) -> &[T] {
+    bytemuck::cast_slice(words)
+}
+
+/// As [`elements`], to write.
+#[inline(never)]
+pub fn elements_mut<T: bytemuck::Pod>(words: &mut [u32]) -> &mut [T] {
+    bytemuck::cast_slice_mut(words)
+}
+
+/// Elements as words, copied.
+#[inline(never)]
+pub fn words_of<T: bytemuck::Pod>(elements: &[T]) -> Vec<u32> {
+    bytemuck::cast_slice(elements).to_vec()
+}
+
+/// Words as elements, copied.
+#[inline(never)]
+pub fn elements_of<T: bytemuck::Pod>(words: &[u32]) -> Vec<T> {
+    elements(words).to_vec()
+}
+
+/// Stops where a kernel is given another number of arrays than it binds.
+#[cold]
+#[inline(never)]
+pub fn wrong_bindings(kernel: &str, bindings: usize) -> ! {
+    panic!("{kernel} binds {bindings} buffers")
+}
+
 /// A compute kernel's interface. Implemented by `build.rs` from the GLSL source, never by hand.
 pub trait Kernel: 'static {
     /// Named, typed bindings.
@@ -61,7 +132,7 @@ pub trait Kernel: 'static {
     /// The same as host slices.
     type Host<'a>;
     /// The same as owned arrays.
-    type Arrays: Clone + Debug + Default;
+    type Arrays: Clone + Default;
     /// Push constants.
     type Push: bytemuck::Pod + Debug + Default;
     /// Specialisation constants.
@@ -78,6 +149,16 @@ pub trait Kernel: 'static {
     const CONSTANTS: &'static [u32];
     /// Optimised SPIR-V.
     const SPIRV: &'static [u8];
+    /// The above without the types.
+    const INTERFACE: &'static Interface = &Interface {
+        name: Self::NAME,
+        group: Self::GROUP,
+        subgroups: Self::SUBGROUPS,
+        bindings: Self::BINDINGS,
+        constants: Self::CONSTANTS,
+        push_bytes: size_of::<Self::Push>() as u32,
+        spirv: Self::SPIRV,
+    };
     /// The bound buffers in the order of `BINDINGS`.
     fn slots(buffers: &Self::Buffers<'_>) -> Vec<MemorySlot>;
     /// Host slices over one vector of words per binding.

@@ -11,13 +11,25 @@ use super::descriptors::{Sets, with_writes};
 use super::device::{Device, Gpu, Inner, lock};
 use super::error::{Error, Named};
 use super::hazards::{Entry, Hazards, Id, Schedule};
-use super::kernel::{Access, Reference, Scalar};
+use super::kernel::{Access, Interface, Reference, Scalar, Twin, with_twin};
 use super::ledger::{NO_STAGE, Rehearsal};
 use super::memory::{Buffer, Slot};
 use super::timings::Timing;
 
 /// Passes of one recording that can carry a timestamp and a crash marker; later ones run without.
 const MAX_PASSES: u32 = 1024;
+
+/// A kernel with what one dispatch gives it, without its types.
+#[derive(Clone, Copy)]
+pub(super) struct Call<'c> {
+    pub kernel: &'static Interface,
+    /// Specialisation constants.
+    pub constants: &'c [u8],
+    /// Push constants.
+    pub push: &'c [u8],
+    /// The buffers, by binding.
+    pub slots: &'c [Slot],
+}
 
 /// How many threads a pass has. Dispatch takes threads, never groups.
 #[derive(Clone, Copy)]
@@ -307,7 +319,14 @@ impl<'g> Recorder<'g> {
         if self.error.is_some() {
             return;
         }
-        let result = self.try_run::<K>(constants, &buffers, push, threads.into());
+        let (slots, threads) = (K::slots(&buffers), threads.into());
+        let call = Call {
+            kernel: K::INTERFACE,
+            constants: bytemuck::bytes_of(&constants),
+            push: bytemuck::bytes_of(&push),
+            slots: &slots,
+        };
+        let result = with_twin::<K, _>(push, constants, |twin| self.try_run(call, twin, threads));
         self.keep(result);
     }
 
@@ -317,34 +336,28 @@ impl<'g> Recorder<'g> {
         }
     }
 
-    fn try_run<K: Reference>(
-        &mut self,
-        constants: K::Constants,
-        buffers: &K::Buffers<'_>,
-        push: K::Push,
-        threads: Threads<'_>,
-    ) -> Result<(), Error> {
-        let slots = K::slots(buffers);
+    fn try_run(&mut self, call: Call<'_>, twin: Twin<'_>, threads: Threads<'_>) -> Result<(), Error> {
+        let Call { kernel: Interface { name, bindings, .. }, slots, .. } = call;
         for (i, a) in slots.iter().enumerate() {
             for (j, b) in slots.iter().enumerate().skip(i + 1) {
-                let written = K::BINDINGS[i].access.writes() || K::BINDINGS[j].access.writes();
-                assert!(a.raw != b.raw || !written, "{}: {} is bound twice, once for writing", K::NAME, a.name);
+                let written = bindings[i].access.writes() || bindings[j].access.writes();
+                assert!(a.raw != b.raw || !written, "{name}: {} is bound twice, once for writing", a.name);
             }
         }
         match self.inspection {
             None => {}
-            Some(None) => return self.inspect::<K>(&constants, &slots, &push, threads),
+            Some(None) => return self.inspect(call, threads),
             // Nothing behind it is worth running.
             Some(Some(_)) => return Ok(()),
         }
         if self.differences.is_none() && self.trace.is_none() {
-            return self.dispatch::<K>(&constants, &slots, &push, threads);
+            return self.dispatch(call, threads);
         }
         self.flush()?;
-        let wanted = |trace: &Trace, i: usize| K::BINDINGS[i].access.writes() && trace.wanted.contains(&slots[i].name);
+        let wanted = |trace: &Trace, i: usize| bindings[i].access.writes() && trace.wanted.contains(&slots[i].name);
         if let Some(trace) = &self.trace {
             let fresh = |i: &usize| {
-                let only_written = K::BINDINGS[*i].access == Access::Write;
+                let only_written = bindings[*i].access == Access::Write;
                 only_written && wanted(trace, *i) && !trace.found.contains_key(slots[*i].name)
             };
             let fresh: Vec<usize> = (0..slots.len()).filter(fresh).collect();
@@ -352,24 +365,24 @@ impl<'g> Recorder<'g> {
             self.flush()?;
         }
         let twins = self.trace.as_ref().is_some_and(|trace| trace.twins);
-        let mut words = if twins || self.differences.is_some() { self.download(&slots)? } else { vec![] };
+        let mut words = if twins || self.differences.is_some() { self.download(slots)? } else { vec![] };
         if twins {
-            K::reference(K::host(&mut words), push, constants);
-            for ((slot, words), binding) in slots.iter().zip(&words).zip(K::BINDINGS) {
+            (twin.reference)(&mut words);
+            for ((slot, words), binding) in slots.iter().zip(&words).zip(bindings.iter()) {
                 if binding.access.writes() {
                     self.gpu.write_words(*slot, words)?;
                 }
             }
         } else {
-            self.dispatch::<K>(&constants, &slots, &push, threads)?;
+            self.dispatch(call, threads)?;
             self.flush()?;
         }
         if let Some(differences) = &mut self.differences {
-            K::reference(K::host(&mut words), push, constants);
-            for ((binding, slot), want) in K::BINDINGS.iter().zip(&slots).zip(&words) {
+            (twin.reference)(&mut words);
+            for ((binding, slot), want) in bindings.iter().zip(slots).zip(&words) {
                 if binding.access.writes() {
                     let got = self.gpu.read_words(*slot, slot.bytes)?;
-                    differences.push(Difference::of_words::<K>(binding, &got, want));
+                    differences.push(Difference::of_words(name, twin, binding, &got, want));
                 }
             }
         }
@@ -389,24 +402,19 @@ impl<'g> Recorder<'g> {
 
     /// Runs one pass and searches what it wrote. Arrays that it only writes hold a pattern meanwhile, so that what it left
     /// alone is told from what it wrote; in the others that is what has changed.
-    fn inspect<K: Reference>(
-        &mut self,
-        constants: &K::Constants,
-        slots: &[Slot],
-        push: &K::Push,
-        threads: Threads<'_>,
-    ) -> Result<(), Error> {
+    fn inspect(&mut self, call: Call<'_>, threads: Threads<'_>) -> Result<(), Error> {
         const PATTERN: u32 = 0x7fa5_a5a5; // a NaN that no arithmetic makes
+        let Call { kernel: Interface { name, bindings, .. }, slots, .. } = call;
         let written: Vec<(usize, &'static str, Access)> = (0..slots.len())
-            .filter(|&i| K::BINDINGS[i].access.writes() && K::BINDINGS[i].scalar == Scalar::F32)
-            .map(|i| (i, K::BINDINGS[i].name, K::BINDINGS[i].access))
+            .filter(|&i| bindings[i].access.writes() && bindings[i].scalar == Scalar::F32)
+            .map(|i| (i, bindings[i].name, bindings[i].access))
             .collect();
         self.flush()?;
         let before = written.iter().map(|(i, ..)| self.words(slots[*i])).collect::<Result<Vec<_>, _>>()?;
         for ((i, ..), before) in written.iter().zip(&before).filter(|((.., access), _)| *access == Access::Write) {
             self.gpu.write_words(slots[*i], &vec![PATTERN; before.len()])?;
         }
-        self.dispatch::<K>(constants, slots, push, threads)?;
+        self.dispatch(call, threads)?;
         self.flush()?;
         for ((i, tensor, access), before) in written.into_iter().zip(before) {
             let mut after = self.words(slots[i])?;
@@ -415,7 +423,7 @@ impl<'g> Recorder<'g> {
                 |(after, before): (&u32, &u32)| !f32::from_bits(*after).is_finite() && !left_alone(*after, *before);
             if let Some(index) = after.iter().zip(&before).position(broken) {
                 let value = f32::from_bits(after[index]);
-                let found = NotFinite { pass: K::NAME, tensor, index, value };
+                let found = NotFinite { pass: name, tensor, index, value };
                 self.inspection.as_mut().expect("an inspected recording").get_or_insert(found);
             }
             if access == Access::Write {
@@ -434,22 +442,18 @@ impl<'g> Recorder<'g> {
         slots.iter().map(|slot| self.words(*slot)).collect()
     }
 
-    pub(super) fn dispatch<K: Reference>(
-        &mut self,
-        constants: &K::Constants,
-        slots: &[Slot],
-        push: &K::Push,
-        threads: Threads<'_>,
-    ) -> Result<(), Error> {
+    pub(super) fn dispatch(&mut self, call: Call<'_>, threads: Threads<'_>) -> Result<(), Error> {
+        let Call { kernel, constants, push, slots } = call;
+        let Interface { name, group, bindings, .. } = *kernel;
         let groups = match threads {
             Threads::Line(n) => {
-                let groups = n.div_ceil(K::GROUP[0].into());
+                let groups = n.div_ceil(group[0].into());
                 let limit = u64::from(self.gpu.info().max_groups.min(65535));
                 if groups <= limit { [groups as u32, 1, 1] } else { [limit as u32, groups.div_ceil(limit) as u32, 1] }
             }
-            Threads::Grid(grid) => std::array::from_fn(|i| grid[i].div_ceil(K::GROUP[i])),
+            Threads::Grid(grid) => std::array::from_fn(|i| grid[i].div_ceil(group[i])),
             Threads::Counted(counted) => {
-                assert_eq!(K::GROUP, [counted.group, 1, 1], "{}: counted for groups of {}", K::NAME, counted.group);
+                assert_eq!(group, [counted.group, 1, 1], "{}: counted for groups of {}", name, counted.group);
                 [1, 1, 1]
             }
         };
@@ -457,36 +461,35 @@ impl<'g> Recorder<'g> {
             return Ok(());
         }
         let mut accesses: Vec<(Id, &'static str, Access)> =
-            slots.iter().zip(K::BINDINGS).map(|(s, b)| (s.id(), s.name, b.access)).collect();
+            slots.iter().zip(bindings).map(|(s, b)| (s.id(), s.name, b.access)).collect();
         if let Threads::Counted(counted) = threads {
             accesses.push((counted.buffer.slot().id(), counted.buffer.name(), Access::Read));
         }
         if let Some(rehearsal) = &self.rehearsal {
-            rehearsal.pipeline(K::NAME);
+            rehearsal.pipeline(name);
             if self.gpu.options().statistics {
-                self.gpu.inner().pipeline::<K>(constants)?;
+                self.gpu.inner().pipeline(kernel, constants)?;
             }
-            self.pass(K::NAME, &accesses, |_| {});
+            self.pass(name, &accesses, |_| {});
             return Ok(());
         }
-        let pipeline = self.gpu.inner().pipeline::<K>(constants)?;
-        let push = bytemuck::bytes_of(push);
+        let pipeline = self.gpu.inner().pipeline(kernel, constants)?;
         let inner = self.gpu.inner().clone();
         let set = match (&inner.push_descriptor, &mut self.context) {
             (None, Some(context)) => {
-                let set = context.sets.get(&inner.device, pipeline.set, K::BINDINGS, slots);
+                let set = context.sets.get(&inner.device, pipeline.set, bindings, slots);
                 set.named("making a descriptor set")?
             }
             _ => vk::DescriptorSet::null(),
         };
-        self.pass(K::NAME, &accesses, |commands| {
+        self.pass(name, &accesses, |commands| {
             let device = &inner.device;
             // SAFETY: live handles; the layout comes from the kernel's own reflection.
             unsafe {
                 device.cmd_bind_pipeline(commands, vk::PipelineBindPoint::COMPUTE, pipeline.raw);
                 let bind_point = vk::PipelineBindPoint::COMPUTE;
                 match &inner.push_descriptor {
-                    Some(extension) => with_writes(K::BINDINGS, slots, set, |writes| {
+                    Some(extension) => with_writes(bindings, slots, set, |writes| {
                         extension.cmd_push_descriptor_set(commands, bind_point, pipeline.layout, 0, writes);
                     }),
                     None => device.cmd_bind_descriptor_sets(commands, bind_point, pipeline.layout, 0, &[set], &[]),

@@ -10,7 +10,7 @@ use super::check::Difference;
 use super::descriptors::Descriptors;
 use super::device::{Gpu, Options, lock};
 use super::form::Form;
-use super::kernel::Reference;
+use super::kernel::{Reference, with_twin};
 use super::recorder::Threads;
 
 /// A device under the validation layer. Dropping it fails the test if the layer said anything.
@@ -159,17 +159,19 @@ pub fn run_once_with<'t, K: Reference>(
     constants: K::Constants,
     threads: impl Into<Threads<'t>>,
 ) -> K::Arrays {
-    K::arrays(&run_words::<K>(gpu, K::words(case.clone()), push, constants, threads.into()))
+    K::arrays(&run_words::<K>(gpu, &K::words(case.clone()), push, constants, threads.into()))
 }
 
 fn run_words<K: Reference>(
     gpu: &Gpu,
-    words: Vec<Vec<u32>>,
+    words: &[Vec<u32>],
     push: K::Push,
     constants: K::Constants,
     threads: Threads<'_>,
 ) -> Vec<Vec<u32>> {
-    super::check::run_words::<K>(gpu, &words, push, constants, threads).unwrap_or_else(|e| panic!("{}: {e}", K::NAME))
+    let (push, constants) = (bytemuck::bytes_of(&push), bytemuck::bytes_of(&constants));
+    super::check::run_words(gpu, K::INTERFACE, words, push, constants, threads)
+        .unwrap_or_else(|e| panic!("{}: {e}", K::NAME))
 }
 
 /// Runs kernel and twin on the same case and compares every output within [`Reference::check`].
@@ -199,12 +201,14 @@ pub fn assert_twin_with<'t, K: Reference>(
     threads: impl Into<Threads<'t>>,
 ) {
     let mut want = K::words(case);
-    let got = run_words::<K>(gpu, want.clone(), push, constants, threads.into());
-    K::reference(K::host(&mut want), push, constants);
-    for ((binding, got), want) in K::BINDINGS.iter().zip(&got).zip(&want) {
-        if binding.access.writes() {
-            let difference = Difference::of_words::<K>(binding, got, want);
-            assert!(difference.ok(), "{difference}\npush {push:?}");
+    let got = run_words::<K>(gpu, &want, push, constants, threads.into());
+    with_twin::<K, _>(push, constants, |twin| {
+        (twin.reference)(&mut want);
+        for ((binding, got), want) in K::BINDINGS.iter().zip(&got).zip(&want) {
+            if binding.access.writes() {
+                let difference = Difference::of_words(K::NAME, twin, binding, got, want);
+                assert!(difference.ok(), "{difference}\npush {push:?}");
+            }
         }
-    }
+    });
 }

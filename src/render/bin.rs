@@ -9,9 +9,7 @@ use super::method::Method;
 use super::project::listed;
 use super::rasterize::Projected;
 use super::slots::Slots;
-use crate::gpu::kernels::render::{
-    bin_count, bin_depth_keys, bin_expand, bin_place, bin_ranges, bin_rank, bin_tally, bin_tally_ranges,
-};
+use crate::gpu::kernels::render::{bin_count, bin_depth_keys, bin_expand, bin_ranges, bin_rank, cpu};
 use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
 use crate::math::tiles::Support;
 use crate::primitives::compact::Compact;
@@ -105,8 +103,8 @@ fn run_length(pairs: u32, runs: u32) -> usize {
     pairs.div_ceil(runs).max(1) as usize
 }
 
-impl Reference for bin_tally::Kernel {
-    fn reference(host: bin_tally::Host<'_>, push: bin_tally::Push, (): ()) {
+impl Reference for cpu::bin_tally::Kernel {
+    fn reference(host: cpu::bin_tally::Host<'_>, push: cpu::bin_tally::Push, (): ()) {
         let n = host.pair_count[0];
         for (run, pairs) in host.pair_tile[..n as usize].chunks(run_length(n, push.runs)).enumerate() {
             pairs.iter().for_each(|tile| host.run_pairs[(tile * push.runs) as usize + run] += 1);
@@ -114,8 +112,8 @@ impl Reference for bin_tally::Kernel {
     }
 }
 
-impl Reference for bin_place::Kernel {
-    fn reference(host: bin_place::Host<'_>, push: bin_place::Push, (): ()) {
+impl Reference for cpu::bin_place::Kernel {
+    fn reference(host: cpu::bin_place::Host<'_>, push: cpu::bin_place::Push, (): ()) {
         let n = host.pair_count[0];
         let length = run_length(n, push.runs);
         for (p, tile) in host.pair_tile[..n as usize].iter().enumerate() {
@@ -126,8 +124,8 @@ impl Reference for bin_place::Kernel {
     }
 }
 
-impl Reference for bin_tally_ranges::Kernel {
-    fn reference(host: bin_tally_ranges::Host<'_>, push: bin_tally_ranges::Push, (): ()) {
+impl Reference for cpu::bin_tally_ranges::Kernel {
+    fn reference(host: cpu::bin_tally_ranges::Host<'_>, push: cpu::bin_tally_ranges::Push, (): ()) {
         let first = |tile: u32| match tile {
             _ if tile < push.tiles => host.run_first[(tile * push.runs) as usize],
             _ => host.pair_count[0],
@@ -387,13 +385,13 @@ impl Bin {
             ByTile::Tally(Tally { runs, run_pairs, run_first, placed, scan, blended, blended_count }) => {
                 let (runs, tiles) = (*runs, last + 1);
                 rec.zero(run_pairs);
-                let buffers = bin_tally::Buffers { pair_count, pair_tile, run_pairs };
-                rec.run(bin_tally::Kernel, buffers, bin_tally::Push { runs }, runs);
+                let buffers = cpu::bin_tally::Buffers { pair_count, pair_tile, run_pairs };
+                rec.run(cpu::bin_tally::Kernel, buffers, cpu::bin_tally::Push { runs }, runs);
                 scan.record(rec, run_pairs, run_first, placed, Count::Host(tiles * runs));
-                let buffers = bin_tally_ranges::Buffers { pair_count, run_first, ranges };
-                rec.run(bin_tally_ranges::Kernel, buffers, bin_tally_ranges::Push { tiles, runs }, tiles);
-                let buffers = bin_place::Buffers { pair_count, pair_tile, run_first, sorted };
-                rec.run(bin_place::Kernel, buffers, bin_place::Push { runs }, runs);
+                let buffers = cpu::bin_tally_ranges::Buffers { pair_count, run_first, ranges };
+                rec.run(cpu::bin_tally_ranges::Kernel, buffers, cpu::bin_tally_ranges::Push { tiles, runs }, tiles);
+                let buffers = cpu::bin_place::Buffers { pair_count, pair_tile, run_first, sorted };
+                rec.run(cpu::bin_place::Kernel, buffers, cpu::bin_place::Push { runs }, runs);
                 (sorted, Some(Blended { pairs: blended, count: blended_count }))
             }
         };

@@ -1,4 +1,4 @@
-//! Cull, decode, project, bin, rasterize: forward and backward of a stage in one file.
+//! Cull, decode, project, bin, rasterize: forward and backward of a stage in one room.
 
 pub mod bin;
 pub mod config;

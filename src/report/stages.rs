@@ -84,6 +84,7 @@ pub fn of_passes<'a>(passes: impl IntoIterator<Item = &'a str>) -> Vec<Stage> {
     let mut stages = vec![];
     for pass in passes {
         let (folder, stem) = pass.split_once('/').unwrap_or(("", pass));
+        let stem = stem.strip_prefix("cpu/").unwrap_or(stem);
         stage = match folder {
             "losses" => Stage::Losses,
             "densify" => Stage::Statistics,
@@ -189,9 +190,9 @@ mod tests {
             ("render/project", Stage::Project),
             ("render/bin_count", Stage::Bin),
             ("primitives/sort_count", Stage::Bin),
-            ("render/rasterize_narrow", Stage::Rasterize),
+            ("render/cpu/rasterize", Stage::Rasterize),
             ("losses/sum", Stage::Losses),
-            ("render/rasterize_backward_narrow_depth", Stage::RasterizeBackward),
+            ("render/cpu/rasterize_backward_depth", Stage::RasterizeBackward),
             ("render/rasterize_gather", Stage::RasterizeBackward),
             ("render/project_backward_color", Stage::ProjectBackward),
             ("render/decode_backward_weights", Stage::DecodeBackward),

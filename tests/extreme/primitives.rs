@@ -1,7 +1,7 @@
-//! Scan, sort, compact and reduce at nothing, at equal keys and at the largest ones.
+//! Scan, sort and compact at nothing, at equal keys and at the largest ones.
 
 use gscream_vk::gpu::{Buffer, Gpu};
-use gscream_vk::primitives::{Compact, Count, Pairs, Reduce, Scan, Sort};
+use gscream_vk::primitives::{Compact, Count, Pairs, Scan, Sort};
 
 use super::Case;
 
@@ -27,12 +27,6 @@ pub const CASES: &[Case] = &[
         case: "0 to 100,003 flags: none set, all set, all 2^32 - 1",
         guarantee: "indices in order and their number; nothing behind them is written",
         run: compacts,
-    },
-    Case {
-        stage: "primitives: reduce",
-        case: "0 to 100,003 floats: all 0, all 1, +-1e30 in turn, one not a number",
-        guarantee: "0 of nothing; exact sums where float32 holds them; cancellation to 100 roundings of the terms' magnitudes; NaN stays NaN",
-        run: reduces,
     },
 ];
 
@@ -98,32 +92,6 @@ fn compacts(gpu: &Gpu) {
             assert_eq!(gpu.read(&found).expect("read"), [set as u32]);
             let indices = gpu.read(&indices).expect("read");
             assert!((0..set).all(|i| indices[i] == i as u32) && indices[set..].iter().all(|&i| i == PATTERN));
-        }
-    }
-}
-
-fn reduces(gpu: &Gpu) {
-    for n in SIZES {
-        let reduce = Reduce::new(gpu, n as u32 + 7, 1).expect("buffers");
-        let sum = |values: Vec<f32>| {
-            let values = gpu.upload("values", &values).expect("upload");
-            let sums = gpu.upload("sums", &[f32::NAN]).expect("upload");
-            let mut rec = gpu.recorder().expect("recorder");
-            reduce.record(&mut rec, &values, &sums, Count::Host(n as u32));
-            rec.submit().and_then(|s| s.wait()).expect("the device runs it");
-            gpu.read(&sums).expect("read")[0]
-        };
-        let all = |value: f32| vec![value; n + 70];
-        assert_eq!(sum(all(0.0)), 0.0);
-        assert_eq!(sum(all(1.0)), n as f32, "integers below 2^24 are exact in every order");
-        let alternating = sum((0..n + 70).map(|i| if i % 2 == 0 { 1e30 } else { -1e30 }).collect());
-        let exact = if n % 2 == 1 { 1e30 } else { 0.0 };
-        let bound = 100.0 * 2f64.powi(-24) * 1e30 * n as f64;
-        assert!((f64::from(alternating) - exact).abs() <= bound, "{n}: {alternating:e}");
-        if n > 0 {
-            let mut one = all(1.0);
-            one[n / 2] = f32::NAN;
-            assert!(sum(one).is_nan());
         }
     }
 }

@@ -7,8 +7,13 @@
 // variant color: COLOR_ONLY
 // variant depth: NO_TRANSMITTANCE
 //
-// `rasterize_backward` for subgroups of 8, as `rasterize_narrow`: only the pairs that it lists are looked at, written and
-// marked.
+// `rasterize_backward` for subgroups of 8, as `rasterize` here: only the pairs that it lists are looked at, written and
+// marked. The derivation is there, with alpha dL/dalpha = w v - (S - A) alpha / (1 - alpha) in place of dL/dalpha: that is
+// gp where the clamp does not hold, and gp / o is dL/do.
+//
+// Threads: lane t has column t of the tile's 8 x 8 pixels, its 8 rows in registers. Each lane loads one of 8 Gaussians; all
+// take them in turn by shuffles. `meet` with bits 1, 2 and 4 leaves lane k with the sums of Gaussian k over the tile,
+// which lane k had loaded: it writes them.
 #ifdef COLOR_ONLY
 #define NO_TRANSMITTANCE
 #endif

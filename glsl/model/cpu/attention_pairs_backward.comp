@@ -7,10 +7,19 @@
 #include "thread.glsl"
 #include "attention.glsl"
 #include "lanes.glsl"
-// What the gradients need of every pair of tokens, kept in matrices of all heads: with p, r and grad_s as in
-// attention_backward, token i inside, token j around,  p_ij,  r_ij  and  grad_s_ij / 8  in rows of j. For subgroups of 8
-// (CPU drivers): a subgroup takes 32 tokens inside, 4 neighbours in a lane, and 8 tokens around at a time, of which each
-// lane loads one. The loop over these is not unrolled: its body would no longer fit into the cache of instructions.
+// What the gradients need of every pair of tokens, kept in matrices of all heads, in rows of the token around.
+//
+// Token i inside, j around, in one head: s_ij = qk_i . qk_j / 8 serves both directions,
+//   mixed_i = sum_j p_ij value_j, p_ij = exp(s_ij - top_i) / sum_i,   mixed_j = sum_i r_ij value_i, r_ij = exp(s_ij - top_j) / sum_j.
+// A softmax passes p_ij (a_ij - sum_k p_ik a_ik) back with a_ij = dL/dmixed_i . value_j, and the sum over k is
+// dL/dmixed_i . mixed_i. With b_ij = dL/dmixed_j . value_i likewise:
+//   dL/ds_ij = p_ij (a_ij - dL/dmixed_i . mixed_i) + r_ij (b_ij - dL/dmixed_j . mixed_j).
+// `rows` holds top, 1 / sum and dL/dmixed . mixed of each token, `grad_s` an eighth of dL/ds: what multiplies qk.
+//
+// Threads: a subgroup of 8 (CPU drivers) takes 32 tokens inside, 4 neighbours in a lane's registers (query, value, gradient,
+// row), and goes over all tokens around, 8 at a time: each lane loads one, shuffles hand them round, and a lane writes its
+// 4 pairs of each as one vec4. The loop over the 8 is not unrolled: its body would no longer fit into the cache of
+// instructions.
 layout(local_size_x = 8) in;
 layout(binding = 0, scalar) readonly buffer Tokens { uint tokens[]; };                     // [2] tokens inside, around
 layout(binding = 1, scalar) readonly buffer Qk { vec4 qk[]; };                             // [capacity * 128] inside
@@ -36,10 +45,10 @@ void main() {
   uint lane = gl_SubgroupInvocationID;
   uint h = id / blocks, head = h * HEAD, first = (id % blocks) * 32u + 4u * lane;
   uint stride = push.stride, to = h * push.capacity * stride + first / 4u;
-  vec4 q[4][16], v[4][16], g[4][16];
-  vec3 row[4];
+  vec4 query[4][16], own_value[4][16], own_grad[4][16]; // of tokens first to first + 3; the query already an eighth
+  vec3 row[4]; // top, 1 / sum, dL/dmixed . mixed
   [[unroll]] for (uint r = 0u; r < 4u; r++) {
-    [[unroll]] for (uint d = 0u; d < 16u; d++) q[r][d] = v[r][d] = g[r][d] = vec4(0.0);
+    [[unroll]] for (uint d = 0u; d < 16u; d++) query[r][d] = own_value[r][d] = own_grad[r][d] = vec4(0.0);
     row[r] = vec3(0.0);
   }
   // A loop whose length the compiler does not know: llvmpipe makes a loop of every load, and its compiler's time grows
@@ -47,11 +56,11 @@ void main() {
   for (uint i = 0u; i < min(4u, n.x * HEADS); i++) {
     uint token = min(first + i, n.x - 1u), at = token * INNER + head;
     [[unroll]] for (uint d = 0u; d < 16u; d++) {
-      vec4 own_qk = 0.125 * qk[at + d], own_value = value[at + d], own_grad = grad_mixed[at + d];
+      vec4 next_query = 0.125 * qk[at + d], next_value = value[at + d], next_grad = grad_mixed[at + d];
       [[unroll]] for (uint r = 0u; r < 4u; r++) {
-        q[r][d] = i == r ? own_qk : q[r][d];
-        v[r][d] = i == r ? own_value : v[r][d];
-        g[r][d] = i == r ? own_grad : g[r][d];
+        query[r][d] = i == r ? next_query : query[r][d];
+        own_value[r][d] = i == r ? next_value : own_value[r][d];
+        own_grad[r][d] = i == r ? next_grad : own_grad[r][d];
       }
     }
     vec3 own_row = rows[token * HEADS + h];
@@ -73,7 +82,7 @@ void main() {
       [[unroll]] for (uint i = 0u; i < 4u; i++) sum[i] = vec4(0.0);
       [[unroll]] for (uint d = 0u; d < 16u; d++) {
         vec4 k = subgroupShuffle(their_qk[d], c);
-        [[unroll]] for (uint i = 0u; i < 4u; i++) sum[i] = fma(q[i][d], k, sum[i]);
+        [[unroll]] for (uint i = 0u; i < 4u; i++) sum[i] = fma(query[i][d], k, sum[i]);
       }
       [[unroll]] for (uint i = 0u; i < 4u; i++) {
         logit[i] = sum4(sum[i]);
@@ -81,7 +90,7 @@ void main() {
       }
       [[unroll]] for (uint d = 0u; d < 16u; d++) {
         vec4 w = subgroupShuffle(their_value[d], c);
-        [[unroll]] for (uint i = 0u; i < 4u; i++) sum[i] = fma(g[i][d], w, sum[i]);
+        [[unroll]] for (uint i = 0u; i < 4u; i++) sum[i] = fma(own_grad[i][d], w, sum[i]);
       }
       [[unroll]] for (uint i = 0u; i < 4u; i++) {
         a[i] = sum4(sum[i]);
@@ -89,7 +98,7 @@ void main() {
       }
       [[unroll]] for (uint d = 0u; d < 16u; d++) {
         vec4 e = subgroupShuffle(their_grad[d], c);
-        [[unroll]] for (uint i = 0u; i < 4u; i++) sum[i] = fma(v[i][d], e, sum[i]);
+        [[unroll]] for (uint i = 0u; i < 4u; i++) sum[i] = fma(own_value[i][d], e, sum[i]);
       }
       [[unroll]] for (uint i = 0u; i < 4u; i++) {
         bool present = first + i < n.x; // behind the last token it is repeated

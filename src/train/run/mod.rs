@@ -1,21 +1,8 @@
 //! The training loop: views in order, one submission per step, everything the host wants to know a step late.
 
-use std::cell::OnceCell;
-use std::collections::VecDeque;
-use std::fs::File;
-use std::io::Write as _;
-use std::path::{Path, PathBuf};
-use std::time::Instant;
+mod error;
+mod observer;
 
-use atomic_write_file::AtomicWriteFile;
-use serde::Serialize;
-
-use super::checkpoint::{self, History, LastFigures, Model, Owner, State};
-
-use super::order::Order;
-use super::photographs::{self, Photograph};
-use super::plan::Plan;
-use super::step::{Rates, Step};
 use crate::config::Settings;
 use crate::evaluate::{self, Report, ViewMetrics};
 use crate::gpu::{self, Buffer, Gpu, NotFinite, Submission, Timing, Timings};
@@ -24,155 +11,23 @@ use crate::model::{files, init};
 use crate::primitives::finite::NOT_FINITE;
 use crate::primitives::limit::{COUNTERS, Counter};
 use crate::render::view::{Capacity, Rendered};
-use crate::scene::{Camera, Scene};
-
-/// Why a run ended early.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The device.
-    #[error(transparent)]
-    Gpu(#[from] gpu::Error),
-    /// The points.
-    #[error(transparent)]
-    Init(#[from] init::Error),
-    /// The model's files.
-    #[error(transparent)]
-    Files(#[from] files::Error),
-    /// The figures.
-    #[error(transparent)]
-    Evaluate(#[from] evaluate::Error),
-    /// A checkpoint.
-    #[error(transparent)]
-    Checkpoint(#[from] checkpoint::WriteError),
-    /// Somebody asked for an end.
-    #[error("stopped by {signal}")]
-    Interrupted {
-        /// How.
-        signal: Signal,
-    },
-    /// Any of the others, once the run is under way.
-    #[error("{source}; {}", how_to_go_on(source, *kept, folder))]
-    Stopped {
-        /// Why.
-        source: Box<Error>,
-        /// Step of the last checkpoint, if there is one.
-        kept: Option<u32>,
-        /// The run folder.
-        folder: PathBuf,
-    },
-    /// A file of the run folder.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// The system's words.
-        source: std::io::Error,
-    },
-    /// A number stopped being one.
-    #[error("step {step} (view {view}): {}", where_from(found.as_ref()))]
-    NotFinite {
-        /// The step.
-        step: u32,
-        /// The view's name.
-        view: String,
-        /// The first one, if it came again when the step was repeated.
-        found: Option<NotFinite>,
-    },
-}
-
-fn where_from(found: Option<&NotFinite>) -> String {
-    match found {
-        Some(NotFinite { pass, tensor, index, value }) => format!(
-            "pass {pass} wrote {value} into `{tensor}` (its float {index}), the first value that is not finite; lower the \
-             learning rates, or look at that view's prior and mask"
-        ),
-        None => {
-            "values that are not finite came up, and did not when the steps were repeated from good ones: the device's \
-                 memory may be faulty"
-                .to_owned()
-        }
-    }
-}
-
-impl Error {
-    /// The signal that ended the run, if one did.
-    pub fn signal(&self) -> Option<Signal> {
-        match self {
-            Self::Interrupted { signal } => Some(*signal),
-            Self::Stopped { source, .. } => source.signal(),
-            _ => None,
-        }
-    }
-}
-
-fn how_to_go_on(source: &Error, kept: Option<u32>, folder: &Path) -> String {
-    match kept {
-        // The same step would end the same way.
-        Some(step) if matches!(source, Error::NotFinite { found: Some(_), .. }) => {
-            format!("the last good state, behind step {step}, is {}", checkpoint::path(folder, step).display())
-        }
-        Some(step) => {
-            format!("`gscream-vk train --resume {}` goes on behind step {step}", folder.display())
-        }
-        None => "there is no checkpoint to go on from".to_owned(),
-    }
-}
-
-/// What asks a run to end early.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Signal {
-    /// SIGINT: Ctrl-C.
-    Interrupt,
-    /// SIGTERM: a scheduler, a shutdown.
-    Terminate,
-}
-
-impl Signal {
-    /// The system's number for it.
-    pub fn number(self) -> u8 {
-        match self {
-            Self::Interrupt => 2,
-            Self::Terminate => 15,
-        }
-    }
-
-    /// What a program that it ended returns to the shell.
-    pub fn exit_code(self) -> u8 {
-        128 + self.number()
-    }
-}
-
-impl std::fmt::Display for Signal {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(match self {
-            Self::Interrupt => "SIGINT",
-            Self::Terminate => "SIGTERM",
-        })
-    }
-}
-
-/// What the host learns of a step, once it has ended.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Progress {
-    /// Step, counted from 1.
-    pub step: u32,
-    /// Seconds since training began.
-    pub seconds: f64,
-    /// The view's name.
-    pub view: String,
-    /// Sum of the losses.
-    pub loss: f32,
-    /// Each loss by its name.
-    pub losses: Vec<(&'static str, f32)>,
-    /// Anchors.
-    pub anchors: u32,
-    /// Anchors in view.
-    pub visible: u32,
-    /// Gaussians that touched a tile.
-    pub gaussians: u32,
-    /// (Gaussian, tile) pairs.
-    pub pairs: u32,
-}
+use crate::scene::Scene;
+use crate::train::checkpoint::{self, History, LastFigures, Model, Owner, State};
+use crate::train::order::Order;
+use crate::train::photographs::{self, Photograph};
+use crate::train::plan::Plan;
+use crate::train::step::{Rates, Step};
+use atomic_write_file::AtomicWriteFile;
+pub use error::{Error, Signal};
+use observer::StepsLeft;
+pub use observer::{Observer, Progress, Silent, Summary};
+use serde::Serialize;
+use std::cell::OnceCell;
+use std::collections::VecDeque;
+use std::fs::File;
+use std::io::Write as _;
+use std::path::Path;
+use std::time::Instant;
 
 /// A line of `log.jsonl`.
 #[derive(Serialize)]
@@ -189,78 +44,6 @@ struct Line<'a> {
     device_bytes: u64,
     /// Resident bytes of the process, where the system tells.
     host_bytes: Option<u64>,
-}
-
-/// What a run leaves behind.
-#[derive(Debug, Serialize)]
-pub struct Summary {
-    /// Steps taken.
-    pub steps: u32,
-    /// Seconds of training, evaluations left out.
-    pub seconds: f64,
-    /// Steps repeated because buffers had to grow.
-    pub repeated: u32,
-    /// Anchors at the end.
-    pub anchors: u32,
-    /// Means over the last steps (at most one round of views).
-    pub gaussians: f64,
-    /// Likewise.
-    pub pairs: f64,
-    /// Most bytes of device memory in buffers at any time.
-    pub peak_device_bytes: u64,
-    /// Figures on the test views, if there are any.
-    #[serde(skip)]
-    pub report: Option<Report>,
-    /// Milliseconds per pass, when timestamps were asked for.
-    #[serde(skip)]
-    pub timings: Timings,
-    /// The passes of the last step, likewise.
-    #[serde(skip)]
-    pub last: Vec<Timing>,
-}
-
-/// Watches a run: progress bars, tests.
-pub trait Observer {
-    /// A step has ended.
-    fn step(&mut self, _progress: &Progress) {}
-    /// Something worth a line.
-    fn say(&mut self, _line: &str) {}
-    /// A test view as rendered after the last step.
-    fn rendered(&mut self, _view: &str, _picture: &Rendered) {}
-    /// Whether to end behind the steps in flight, with a checkpoint; asked before every step.
-    fn interrupted(&mut self) -> Option<Signal> {
-        None
-    }
-    /// Whether somebody wants to see the model now; asked before every step.
-    fn visited(&mut self) -> bool {
-        false
-    }
-    /// Lets somebody look, where [`Observer::visited`] said so, once nothing is in flight: `draw` renders the model as it is
-    /// now ([`Step::glance`]). The clock stands still, and training goes on as if nobody had looked.
-    fn look(&mut self, _draw: &mut dyn FnMut(&Camera) -> Result<Option<Rendered>, gpu::Error>) {}
-    /// Steps to evaluate at besides those of the settings.
-    fn samples(&self) -> Vec<u32> {
-        vec![]
-    }
-    /// A test view (by its index) as rendered in any evaluation; the clock stands still.
-    fn compared(&mut self, _view: usize, _picture: &Rendered) {}
-    /// An evaluation behind `progress` has ended; its seconds are those of training alone.
-    fn evaluated(&mut self, _progress: &Progress, _report: &Report) {}
-}
-
-/// Watches nothing.
-pub struct Silent;
-impl Observer for Silent {}
-
-/// Ends a run after so many steps.
-struct StepsLeft(u32);
-impl Observer for StepsLeft {
-    fn step(&mut self, _progress: &Progress) {
-        self.0 -= 1;
-    }
-    fn interrupted(&mut self) -> Option<Signal> {
-        (self.0 == 0).then_some(Signal::Interrupt)
-    }
 }
 
 /// Buffers in host memory that the device fills at the end of a step.
