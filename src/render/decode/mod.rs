@@ -1,7 +1,7 @@
 //! Visible anchors into neural Gaussians (Scaffold-GS, section 3.2), and the gradients back to the model.
 //!
 //! Two in three Gaussians do not exist: their opacity is not positive. Opacities come first; the Gaussians that exist are
-//! listed by their number k, then by anchor ([`Slots`]), and the other heads and the second layer's weight gradients are
+//! listed by their number k, then by anchor ([`Slots`](super::slots::Slots)), and the other heads and the second layer's weight gradients are
 //! computed for those alone. What is not listed is not written. On the way back those of them that touch no tile have a
 //! gradient of 0, whatever its arrays hold.
 //!

@@ -75,7 +75,7 @@ pub trait Observer {
         false
     }
     /// Lets somebody look, where [`Observer::visited`] said so, once nothing is in flight: `draw` renders the model as it is
-    /// now ([`Step::glance`]). The clock stands still, and training goes on as if nobody had looked.
+    /// now ([`Step::glance`](crate::train::step::Step::glance)). The clock stands still, and training goes on as if nobody had looked.
     fn look(&mut self, _draw: &mut dyn FnMut(&Camera) -> Result<Option<Rendered>, gpu::Error>) {}
     /// Steps to evaluate at besides those of the settings.
     fn samples(&self) -> Vec<u32> {
