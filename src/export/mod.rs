@@ -225,7 +225,7 @@ pub fn make(
     let turn = if options.upright { up::upright(&train) } else { DMat3::IDENTITY };
     let turned = |camera: &Camera| up::turn_camera(camera, turn);
     let looked = poses::spread(&train, TRAIN_VIEWS);
-    let between = poses::virtual_views(&train, options.views, options.seed);
+    let between = poses::every_other_wide(poses::virtual_views(&train, options.views, options.seed));
     let cameras: Vec<Camera> = looked.iter().chain(&between).copied().collect();
 
     let held_out = poses::virtual_views(&train, HELD_OUT, !options.seed);

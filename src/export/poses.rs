@@ -3,6 +3,10 @@
 //! What an anchor's Gaussians look like depends on the direction and the distance they are seen from, so attributes taken
 //! at training poses alone are those of no other pose. Between two training cameras whose views agree to 60 degrees
 //! everything is interpolated: the centre on the straight line, the axes on the great circle, the lens of the first.
+//!
+//! Whoever turns the scene in a viewer looks past the edges of the photographs, and so do the test views of some captures.
+//! What no pose sees is in no file, a hole where the anchors show something. So every other of these cameras has a wider
+//! angle ([`every_other_wide`]).
 
 use glam::{DMat3, DQuat, DVec3};
 use rand::{RngExt as _, SeedableRng as _};
@@ -41,6 +45,18 @@ pub fn virtual_views(cameras: &[Camera], count: u32, seed: u64) -> Vec<Camera> {
             between(first, second, rng.random_range(0.1..0.9))
         })
         .collect()
+}
+
+/// By how much the focal length of a wide camera is shorter.
+const WIDER: f32 = 1.5;
+
+/// Every other camera with a wider angle, on as many pixels. Without distortion, which beyond the photographs' edge is
+/// nobody's.
+pub fn every_other_wide(mut cameras: Vec<Camera>) -> Vec<Camera> {
+    for camera in cameras.iter_mut().skip(1).step_by(2) {
+        *camera = Camera { focal: camera.focal.map(|f| f / WIDER), distortion: [0.0; 4], ..*camera };
+    }
+    cameras
 }
 
 /// At most `most` of them, evenly spread.
@@ -101,6 +117,15 @@ mod tests {
         assert!(virtual_views(&[], 5, 1).is_empty());
         let alone = virtual_views(&cameras[..1], 2, 1);
         assert!((DVec3::from_array(alone[1].center()) - DVec3::from_array(cameras[0].center())).length() < 1e-6);
+    }
+
+    #[test]
+    fn wide_cameras_see_what_lies_beyond_the_edge() {
+        let all = every_other_wide(vec![camera(DVec3::ZERO, 0.0); 3]);
+        assert_eq!((all[0], all[2]), (camera(DVec3::ZERO, 0.0), all[0]));
+        // A direction on the right edge of the picture of 60 px, at 30 px from the centre, is at 20.
+        assert_eq!((all[1].focal, all[1].principal, all[1].size), ([60.0; 2], all[0].principal, all[0].size));
+        assert_eq!(all[1].distortion, [0.0; 4]);
     }
 
     #[test]
