@@ -36,7 +36,7 @@ pub struct Case {
 
 /// Every case.
 fn cases() -> Vec<&'static Case> {
-    let stages: [&[Case]; _] = [
+    let stages: [&[Case]; 12] = [
         project::CASES,
         screen::CASES,
         decode::CASES,
