@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 
 use super::counts::Counts;
 use crate::gpu::Access;
+use crate::gpu::form::without_form;
 use crate::math::attention::WEIGHTS as ATTENTION_WEIGHTS;
 use crate::math::decoder::Layout;
 
@@ -785,5 +786,5 @@ pub fn formula(name: &str) -> Option<&'static Formula> {
                     .is_some_and(|variant| f.variants.contains(&variant))
         })
     };
-    line(name).or_else(|| line(&name.replacen("/cpu/", "/", 1)))
+    line(name).or_else(|| line(&without_form(name)))
 }

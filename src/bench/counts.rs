@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use crate::gpu::form::without_form;
 use crate::gpu::{Entry, Schedule};
 use crate::render::bin::Tiling;
 use crate::render::method::Method;
@@ -167,7 +168,7 @@ pub fn count(words: &BTreeMap<&'static str, Vec<u32>>, schedule: &Schedule, meth
 /// The buffer that the rasteriser takes the tiles' lists from: its second binding.
 fn sorted_list(schedule: &Schedule) -> Option<&'static str> {
     schedule.entries.iter().find_map(|entry| match entry {
-        Entry::Pass { name, accesses, .. } if name.replacen("/cpu/", "/", 1).starts_with("render/rasterize") => {
+        Entry::Pass { name, accesses, .. } if without_form(name).starts_with("render/rasterize") => {
             Some(accesses.get(1)?.0)
         }
         _ => None,

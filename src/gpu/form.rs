@@ -25,6 +25,11 @@ impl Form {
     }
 }
 
+/// A pass's name whatever its form: kernels for CPU drivers lie in the folder `cpu` of their room.
+pub(crate) fn without_form(pass: &str) -> String {
+    pass.replacen("/cpu/", "/", 1)
+}
+
 impl Gpu {
     /// The form that work takes here: the device's own unless it was opened with another.
     pub fn form(&self) -> Form {

@@ -1,5 +1,6 @@
 //! Passes by the stage of the step they belong to, and the tensors a stage is judged by.
 
+use crate::gpu::form::without_form;
 use serde::Serialize;
 
 /// A stage of the step, in the order of the step.
@@ -83,8 +84,8 @@ pub fn of_passes<'a>(passes: impl IntoIterator<Item = &'a str>) -> Vec<Stage> {
     let (mut stage, mut backward) = (Stage::Cull, false);
     let mut stages = vec![];
     for pass in passes {
-        let (folder, stem) = pass.split_once('/').unwrap_or(("", pass));
-        let stem = stem.strip_prefix("cpu/").unwrap_or(stem);
+        let pass = without_form(pass);
+        let (folder, stem) = pass.split_once('/').unwrap_or(("", &pass));
         stage = match folder {
             "losses" => Stage::Losses,
             "densify" => Stage::Statistics,

@@ -69,6 +69,37 @@ fn backward(
     pairs
 }
 
+/// A pixel's gradients, and their product with what was rendered there.
+macro_rules! upstream {
+    ($host:ident, $p:ident $(, depth: $depth:ident)? $(, transmittance: $transmittance:ident)?) => {{
+        let rgb = $host.grad_rgb[$p].map(f64::from);
+        let mut _total: f64 = (0..3).map(|c| f64::from($host.rgb[$p][c]) * rgb[c]).sum();
+        let mut _z = 0.0;
+        $(
+            let _ = &$host.$depth;
+            _z = f64::from($host.grad_depth_map[$p]);
+            _total += f64::from($host.depth_map[$p]) * _z;
+        )?
+        $(_total += f64::from($host.$transmittance[$p]) * f64::from($host.grad_transmittance[$p]);)?
+        Upstream { total: _total, rgb, z: _z }
+    }};
+}
+
+/// A pair's gradients to where the kernel writes them.
+macro_rules! write_pair {
+    ($host:ident, $gradients:ident, $pair:expr $(, depth: $depth:ident)?) => {{
+        let (p, g) = ($pair, &$gradients[$pair]);
+        $host.pair_mean[p] = g.mean.map(|v| v as f32);
+        $host.pair_conic[p] = g.conic.map(|v| v as f32);
+        $host.pair_opacity[p] = g.opacity as f32;
+        $host.pair_color[p] = g.color.map(|v| v as f32);
+        $(
+            let _ = &$host.$depth;
+            $host.pair_depth[p] = g.depth as f32;
+        )?
+    }};
+}
+
 macro_rules! backward_twin {
     ($module:path, $tile:expr $(, depth: $depth:ident)? $(, transmittance: $transmittance:ident)?) => {
         const _: () = {
@@ -82,31 +113,12 @@ macro_rules! backward_twin {
                     let mut _depth: Option<&[f32]> = None;
                     $(_depth = Some(host.$depth);)?
                     let gradients = backward(&splats, _depth, push.size, $tile, push.tiles_x, |p| {
-                        let rgb = host.grad_rgb[p].map(f64::from);
-                        let mut total: f64 = (0..3).map(|c| f64::from(host.rgb[p][c]) * rgb[c]).sum();
-                        let mut _z = 0.0;
-                        $(
-                            let _ = &host.$depth;
-                            _z = f64::from(host.grad_depth_map[p]);
-                            total += f64::from(host.depth_map[p]) * _z;
-                        )?
-                        $(total += f64::from(host.$transmittance[p]) * f64::from(host.grad_transmittance[p]);)?
-                        let z = _z;
-                        total += 0.0;
-                        Upstream { total, rgb, z }
+                        upstream!(host, p $(, depth: $depth)? $(, transmittance: $transmittance)?)
                     });
                     // The last range is of the pairs that touch no tile: their gradients are 0.
                     for range in ranges.iter().take((push.tiles_x * push.size[1].div_ceil($tile)) as usize + 1) {
                         for &pair in &sorted[range[0] as usize..range[1] as usize] {
-                            let (p, g) = (pair as usize, &gradients[pair as usize]);
-                            host.pair_mean[p] = g.mean.map(|v| v as f32);
-                            host.pair_conic[p] = g.conic.map(|v| v as f32);
-                            host.pair_opacity[p] = g.opacity as f32;
-                            host.pair_color[p] = g.color.map(|v| v as f32);
-                            $(
-                                let _ = &host.$depth;
-                                host.pair_depth[p] = g.depth as f32;
-                            )?
+                            write_pair!(host, gradients, pair as usize $(, depth: $depth)?);
                         }
                     }
                 }
@@ -147,29 +159,11 @@ macro_rules! narrow_backward_twin {
                     let mut _depth: Option<&[f32]> = None;
                     $(_depth = Some(host.$depth);)?
                     let gradients = backward(&splats, _depth, push.size, 8, push.tiles_x, |p| {
-                        let rgb = host.grad_rgb[p].map(f64::from);
-                        let mut total: f64 = (0..3).map(|c| f64::from(host.rgb[p][c]) * rgb[c]).sum();
-                        let mut _z = 0.0;
-                        $(
-                            let _ = &host.$depth;
-                            _z = f64::from(host.grad_depth_map[p]);
-                            total += f64::from(host.depth_map[p]) * _z;
-                        )?
-                        $(total += f64::from(host.$transmittance[p]) * f64::from(host.grad_transmittance[p]);)?
-                        let z = _z;
-                        total += 0.0;
-                        Upstream { total, rgb, z }
+                        upstream!(host, p $(, depth: $depth)? $(, transmittance: $transmittance)?)
                     });
                     for pair in lists.iter().flat_map(|list| &sorted[list[0] as usize..list[1] as usize]) {
-                        let (p, g) = (*pair as usize, &gradients[*pair as usize]);
-                        host.pair_mean[p] = g.mean.map(|v| v as f32);
-                        host.pair_conic[p] = g.conic.map(|v| v as f32);
-                        host.pair_opacity[p] = g.opacity as f32;
-                        host.pair_color[p] = g.color.map(|v| v as f32);
-                        $(
-                            let _ = &host.$depth;
-                            host.pair_depth[p] = g.depth as f32;
-                        )?
+                        let p = *pair as usize;
+                        write_pair!(host, gradients, p $(, depth: $depth)?);
                         host.marks[p / 32] |= 1 << (p % 32);
                     }
                 }
