@@ -18,7 +18,7 @@ pub const AGREE: f64 = 0.03;
 /// Views that are asked, the nearest ones.
 const WITNESSES: usize = 6;
 /// The object is enlarged by this part of the picture's longer side: the fit is not sharp at its border.
-const MARGIN: f64 = 0.012;
+pub const MARGIN: f64 = 0.012;
 
 /// A view's depth.
 pub struct DepthMap {

@@ -44,28 +44,29 @@ pub enum Known {
 
 // ---------------------------------------------------------------- minimum cut
 
-/// Shifts to the neighbours of a pixel; the opposite of `d` is `7 - d`.
+/// Shifts to the neighbours of a pixel; the opposite of the `d`-th is the `d`-th from the end.
 const SHIFTS: [[isize; 2]; 8] = [[-1, -1], [0, -1], [1, -1], [-1, 0], [1, 0], [-1, 1], [0, 1], [1, 1]];
 
-/// A graph whose nodes are pixels, each joined to its eight neighbours, to the object's terminal and to the background's.
-pub struct Grid {
+/// A graph whose nodes are pixels, each joined to its neighbours, to the object's terminal and to the background's.
+pub struct Grid<const N: usize> {
     size: [usize; 2],
+    shifts: &'static [[isize; 2]; N],
     /// What still fits through the edge to each neighbour.
-    edges: Vec<[i32; 8]>,
+    edges: Vec<[i32; N]>,
     /// What still fits from the object's terminal, or, below zero, to the background's.
     terminal: Vec<i64>,
 }
 
-impl Grid {
-    /// Without any edges.
-    pub fn new(size: [usize; 2]) -> Self {
+impl<const N: usize> Grid<N> {
+    /// Without any edges. The opposite of shift `d` is shift `N - 1 - d`.
+    pub fn new(size: [usize; 2], shifts: &'static [[isize; 2]; N]) -> Self {
         let n = size[0] * size[1];
-        Self { size, edges: vec![[0; 8]; n], terminal: vec![0; n] }
+        Self { size, shifts, edges: vec![[0; N]; n], terminal: vec![0; n] }
     }
 
     fn neighbour(&self, node: usize, direction: usize) -> Option<usize> {
         let (x, y) = ((node % self.size[0]) as isize, (node / self.size[0]) as isize);
-        let [u, v] = [x + SHIFTS[direction][0], y + SHIFTS[direction][1]];
+        let [u, v] = [x + self.shifts[direction][0], y + self.shifts[direction][1]];
         let inside = u >= 0 && v >= 0 && u < self.size[0] as isize && v < self.size[1] as isize;
         inside.then(|| (v * self.size[0] as isize + u) as usize)
     }
@@ -79,7 +80,15 @@ impl Grid {
     pub fn set_edge(&mut self, node: usize, direction: usize, cost: i32) {
         if let Some(other) = self.neighbour(node, direction) {
             self.edges[node][direction] = cost;
-            self.edges[other][7 - direction] = cost;
+            self.edges[other][N - 1 - direction] = cost;
+        }
+    }
+
+    /// Labelling this pixel as object and its neighbour in this direction as background costs so much more than the other
+    /// way round.
+    pub fn set_arc(&mut self, node: usize, direction: usize, cost: i32) {
+        if self.neighbour(node, direction).is_some() {
+            self.edges[node][direction] = cost;
         }
     }
 
@@ -96,7 +105,7 @@ impl Grid {
                 if level[node] >= last {
                     break;
                 }
-                for d in 0..8 {
+                for d in 0..N {
                     if self.edges[node][d] > 0
                         && let Some(next) = self.neighbour(node, d)
                         && level[next] == u32::MAX
@@ -134,7 +143,7 @@ impl Grid {
                         let to = self.neighbour(from, d).expect("the path is in the picture");
                         // A flow is at most the least capacity of its path.
                         self.edges[from][d] -= flow as i32;
-                        self.edges[to][7 - d] += flow as i32;
+                        self.edges[to][N - 1 - d] += flow as i32;
                         if self.edges[from][d] == 0 && back.is_none() {
                             back = Some(i);
                         }
@@ -146,7 +155,7 @@ impl Grid {
                     }
                     continue;
                 }
-                let onward = (usize::from(tried[node])..8).find_map(|d| {
+                let onward = (usize::from(tried[node])..N).find_map(|d| {
                     let next = self.neighbour(node, d)?;
                     (self.edges[node][d] > 0 && level[next] == level[node] + 1).then_some((d, next))
                 });
@@ -157,7 +166,7 @@ impl Grid {
                         node = next;
                     }
                     None => {
-                        tried[node] = 8;
+                        tried[node] = N as u8;
                         let Some((before, _)) = path.pop() else { break };
                         tried[before] += 1;
                         node = before;
@@ -288,7 +297,7 @@ pub fn segment(picture: &RgbImage, known: &[Known]) -> Option<Vec<bool>> {
             return None;
         }
         let (inside, outside) = (Mixture::of(&inside, COMPONENTS[0], 1), Mixture::of(&outside, COMPONENTS[1], 2));
-        let mut grid = Grid::new([w, h]);
+        let mut grid = Grid::new([w, h], &SHIFTS);
         for &(i, d, cost) in &edges {
             grid.set_edge(i, d, cost);
         }
@@ -474,19 +483,19 @@ mod tests {
         let cost = |labels: u32| {
             let on = |i: usize| labels >> i & 1 == 1;
             let own: i64 = (0..n).map(|i| terminals[i][usize::from(on(i))]).sum();
-            own + edges.iter().filter(|(i, j, _)| on(*i) != on(*j)).map(|e| i64::from(e.2)).sum::<i64>()
+            own + edges.iter().filter(|(i, j, _)| on(*i) && !on(*j)).map(|e| i64::from(e.2)).sum::<i64>()
         };
         let least = (0..1u32 << n).map(cost).min().unwrap();
         (least, (0..1 << n).filter(|l| cost(*l) == least).collect())
     }
 
-    /// Random grids of 3 x 4 against every one of their 4,096 labellings.
+    /// Random grids of 3 x 4 against every one of their 4,096 labellings; every other with edges that cost one way alone.
     #[test]
     fn the_cut_is_the_cheapest_labelling() {
         let mut rng = Pcg64::new(5, 5);
         let size = [3, 4];
-        for _ in 0..200 {
-            let mut grid = Grid::new(size);
+        for round in 0..400 {
+            let mut grid = Grid::new(size, &SHIFTS);
             let (mut terminals, mut edges) = (vec![], vec![]);
             for i in 0..12 {
                 // Of background and of object.
@@ -496,7 +505,12 @@ mod tests {
                 for d in 4..8 {
                     let cost = rng.random_range(0..6);
                     if let Some(j) = grid.neighbour(i, d) {
-                        grid.set_edge(i, d, cost);
+                        if round % 2 == 0 {
+                            grid.set_edge(i, d, cost);
+                            edges.push((j, i, cost));
+                        } else {
+                            grid.set_arc(i, d, cost);
+                        }
                         edges.push((i, j, cost));
                     }
                 }

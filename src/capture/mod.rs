@@ -8,6 +8,7 @@ pub mod lens;
 pub mod masks;
 pub mod network;
 pub mod patchmatch;
+pub mod planes;
 pub mod poses;
 pub mod record;
 pub mod reference;

@@ -15,6 +15,8 @@ const RADIUS: usize = 3;
 const ROUNDS: u32 = 5;
 /// By how much less a patch counts for each pixel that it lies farther in the hole (Wexler et al.).
 const INWARDS: f32 = 1.2;
+/// Blur of the last vote: the best patches alone, as the mean of many is smooth where the surroundings are not.
+const SHARP: f32 = 0.1;
 /// Fillings that are tried; the one whose patches are most like others is taken.
 const TRIES: u64 = 3;
 /// A side of the smallest picture that is worked on, pixels.
@@ -29,6 +31,8 @@ pub struct Canvas {
     pub rgb: Vec<[f32; 3]>,
     /// `[pixel]` compared along with the colours, known everywhere; 0 to 1, or all 0 for no guide.
     pub guide: Vec<f32>,
+    /// `[pixel]` the surface it is of: patches are taken from the same one.
+    pub surface: Vec<u8>,
     /// `[pixel]` whether it is to be filled.
     pub hole: Vec<bool>,
     /// `[pixel]` whether its colour may be copied. What is in the hole never is.
@@ -48,6 +52,7 @@ impl Canvas {
             size,
             rgb: Vec::with_capacity(n),
             guide: Vec::with_capacity(n),
+            surface: Vec::with_capacity(n),
             hole: Vec::with_capacity(n),
             source: Vec::with_capacity(n),
         };
@@ -63,6 +68,7 @@ impl Canvas {
                 let count = of.len() as f32;
                 out.rgb.push(std::array::from_fn(|c| of.iter().map(|i| self.rgb[*i][c]).sum::<f32>() / count));
                 out.guide.push(children.iter().map(|i| self.guide[*i]).sum::<f32>() / children.len() as f32);
+                out.surface.push(self.surface[children[0]]);
                 out.hole.push(hole);
                 out.source.push(!hole && known.iter().all(|i| self.source[*i]));
             }
@@ -124,6 +130,8 @@ struct Search<'a> {
 
 /// Weight of the guide beside the three colours.
 const GUIDE: f32 = 6.0;
+/// What a pixel of another surface counts: as much as a third of the way from black to white in one channel.
+const OTHER: f32 = 0.1;
 
 impl Search<'_> {
     /// Sum of squared differences of two patches over the pixels that both have, given up beyond `limit`.
@@ -147,7 +155,8 @@ impl Search<'_> {
                 let weight = if self.canvas.hole[t] { 1.0 } else { 2.0 };
                 let guide = self.canvas.guide[t] - self.canvas.guide[s];
                 let color: f32 = (0..3).map(|c| (a[c] - b[c]) * (a[c] - b[c])).sum();
-                sum += weight * (color + GUIDE * guide * guide);
+                let other = if self.canvas.surface[t] == self.canvas.surface[s] { 0.0 } else { OTHER };
+                sum += weight * (color + GUIDE * guide * guide + other);
                 count += 1;
             }
             if sum > limit * (4 * RADIUS * RADIUS) as f32 {
@@ -220,9 +229,9 @@ fn patch(size: [usize; 2], middle: usize) -> impl Iterator<Item = (usize, [isize
 }
 
 /// Rounds of search and vote on one scale. `guess` holds for each pixel the source pixel it was made from on the scale
-/// before. Returns the same of this scale, and how much the patches differ from what they were made from; nothing where no
+/// before; the last vote is `sharp` on the largest scale. Returns the same of this scale, and how much the patches differ from what they were made from; nothing where no
 /// patch can be copied from.
-fn refine(canvas: &mut Canvas, guess: Option<&[usize]>, rng: &mut Pcg64) -> Option<(Vec<usize>, f32)> {
+fn refine(canvas: &mut Canvas, guess: Option<&[usize]>, sharp: bool, rng: &mut Pcg64) -> Option<(Vec<usize>, f32)> {
     let size @ [w, h] = canvas.size;
     let whole = |i: usize| {
         let (x, y) = (i % w, i / w);
@@ -246,7 +255,8 @@ fn refine(canvas: &mut Canvas, guess: Option<&[usize]>, rng: &mut Pcg64) -> Opti
         .collect();
     let inwards = canvas.steps_inwards();
     // On a small picture, where what goes where is decided, a round costs next to nothing.
-    for round in 0..if targets.len() < 2000 { 4 * ROUNDS } else { ROUNDS } {
+    let rounds = if targets.len() < 2000 { 4 * ROUNDS } else { ROUNDS };
+    for round in 0..rounds {
         let search = Search { canvas, targets: &targets, is_source: &is_source };
         // The colours have changed since the last round, and the distances with them.
         for (target, found) in targets.iter().zip(&mut matches) {
@@ -254,7 +264,7 @@ fn refine(canvas: &mut Canvas, guess: Option<&[usize]>, rng: &mut Pcg64) -> Opti
         }
         search.improve(&mut matches, &of, 2 * round, rng);
         search.improve(&mut matches, &of, 2 * round + 1, rng);
-        vote(canvas, &targets, &matches, &inwards);
+        vote(canvas, &targets, &matches, &inwards, if sharp && round + 1 == rounds { SHARP } else { 1.0 });
     }
     let mut map = vec![usize::MAX; w * h];
     for (target, found) in targets.iter().zip(&matches) {
@@ -265,12 +275,13 @@ fn refine(canvas: &mut Canvas, guess: Option<&[usize]>, rng: &mut Pcg64) -> Opti
 }
 
 /// Every pixel of the hole becomes the mean of what the patches over it say, the similar ones first and those at the
-/// hole's border, which see what is known. `inwards` counts the steps from there.
-fn vote(canvas: &mut Canvas, targets: &[usize], matches: &[(usize, f32)], inwards: &[u32]) {
+/// hole's border, which see what is known. `inwards` counts the steps from there; the less `blur`, the less others count
+/// beside the most similar patch.
+fn vote(canvas: &mut Canvas, targets: &[usize], matches: &[(usize, f32)], inwards: &[u32], blur: f32) {
     let size = canvas.size;
     let mut distances: Vec<f32> = matches.iter().map(|(_, distance)| *distance).collect();
     distances.sort_unstable_by(f32::total_cmp);
-    let typical = distances[distances.len() * 3 / 4].max(1e-6);
+    let typical = blur * distances[distances.len() * 3 / 4].max(1e-6);
     let mut sums = vec![[0f32; 4]; canvas.rgb.len()];
     for (target, (source, distance)) in targets.iter().zip(matches) {
         let weight = (-distance / (2.0 * typical)).exp() * INWARDS.powi(-(inwards[*target] as i32));
@@ -321,7 +332,8 @@ type Matches = (Vec<usize>, f32);
 /// From the smallest scale, the first, to the largest; its colours, and how much its patches differ from their sources.
 fn ascend(scales: Vec<Canvas>, rng: &mut Pcg64) -> (Vec<[f32; 3]>, f32) {
     let mut coarser: Option<(Canvas, Option<Matches>)> = None;
-    for mut scale in scales {
+    let largest = scales.len();
+    for (n, mut scale) in (1..).zip(scales) {
         let [w, h] = scale.size;
         let mut guess = None;
         match &coarser {
@@ -345,7 +357,7 @@ fn ascend(scales: Vec<Canvas>, rng: &mut Pcg64) -> (Vec<[f32; 3]>, f32) {
             }
             None => scale.peel(),
         }
-        let found = refine(&mut scale, guess.as_deref(), rng);
+        let found = refine(&mut scale, guess.as_deref(), n == largest, rng);
         coarser = Some((scale, found));
     }
     coarser.map_or((vec![], 0.0), |(scale, found)| (scale.rgb, found.map_or(f32::INFINITY, |(_, off)| off)))
@@ -366,6 +378,7 @@ mod tests {
             size,
             rgb: (0..w * h).map(|i| if hole[i] { [9.0; 3] } else { color(i % w, i / w) }).collect(),
             guide: vec![0.0; w * h],
+            surface: vec![0; w * h],
             source: hole.iter().map(|hole| !hole).collect(),
             hole,
         }

@@ -16,6 +16,7 @@ use super::fit::Fit;
 use super::masks::{self, Shares, Votes};
 use super::network::{self, Inpainting};
 use super::patchmatch::{self, Canvas};
+use super::planes;
 use super::record::Batch;
 use super::splats::Splats;
 use super::{Error, Watch};
@@ -43,6 +44,8 @@ const MOST: f32 = 0.5;
 const AWAY: f32 = 0.002;
 /// Photographs agree on a pixel if no channel of their means over 3 x 3 pixels differs by more.
 const SAME: f32 = 0.09;
+/// What speaks against a surface that something else than the object hides from all other views; 1 is a proof.
+const BURIED: f64 = 0.1;
 
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
@@ -158,7 +161,7 @@ fn seen_elsewhere(of: usize, behind: &DepthMap, maps: &[DepthMap], masks: &[Gray
 
 /// Fills what is not a number with a membrane over what is: values spread inwards, then settle to the mean of their
 /// neighbours. Only pixels for which `wanted` says so are filled.
-fn membrane(values: &mut [f32], size: [usize; 2], wanted: impl Fn(usize) -> bool) {
+pub(super) fn membrane(values: &mut [f32], size: [usize; 2], wanted: impl Fn(usize) -> bool) {
     let [w, h] = size;
     let missing: Vec<usize> = (0..w * h).filter(|i| !values[*i].is_finite() && wanted(*i)).collect();
     let neighbours = |i: usize| {
@@ -257,7 +260,7 @@ pub fn make(task: &Task<'_>, fit: &Fit, splats: &mut Splats, watch: &mut dyn Wat
         }
     };
     watch.at(2 * n);
-    fill(task, of, &behind, &maps, seen, watch)
+    fill(task, of, &behind, &Others { of, maps: &maps, masks: &small }, seen, watch)
 }
 
 /// One pixel's part in the hole's filling.
@@ -266,14 +269,50 @@ struct Lookup {
     photographs: Vec<usize>,
 }
 
+/// What all views know, by view, at the fit's size.
+struct Others<'a> {
+    /// The reference view.
+    of: usize,
+    /// With the object.
+    maps: &'a [DepthMap],
+    /// Enlarged.
+    masks: &'a [GrayImage],
+}
+
+impl Others<'_> {
+    /// What they say against a surface at a point that the reference sees past the object: 1 if it cannot be there.
+    fn against(&self, point: [f64; 3]) -> f64 {
+        let (mut through, mut agree, mut hidden, mut asked) = (0u32, 0u32, 0u32, 0u32);
+        for (map, mask) in self.maps.iter().zip(self.masks) {
+            let said = map.witness(point, HIDDEN);
+            asked += u32::from(said != Witness::Silent);
+            match said {
+                Witness::Contradicts => through += 1,
+                Witness::Agrees => agree += 1,
+                // What is nearer than the point, if it is not the object, would stand before it here too.
+                Witness::Hidden => {
+                    let pixel = map.camera.project(point).map(|pixel| pixel.map(|v| v as u32));
+                    hidden += u32::from(pixel.is_some_and(|[x, y]| mask.get_pixel(x, y).0[0] == 0));
+                }
+                Witness::Silent => {}
+            }
+        }
+        if through >= 2 && through > 2 * agree {
+            return 1.0;
+        }
+        BURIED * f64::from(hidden) / f64::from(asked.max(1))
+    }
+}
+
 fn fill(
     task: &Task<'_>,
     of: usize,
     behind: &DepthMap,
-    maps: &[DepthMap],
+    others: &Others<'_>,
     expected: f64,
     watch: &mut dyn Watch,
 ) -> Result<Batch, Error> {
+    let maps = others.maps;
     let view = &task.fine.train[of];
     let name = &view.name;
     let size = view.camera.size;
@@ -329,10 +368,9 @@ fn fill(
         }
     }
     lonely(&mut guessed, hole.as_raw(), [w, h]);
-    // Where nobody looked the sweep has found nothing: what lies around is continued.
-    for (value, _) in disparity.iter_mut().zip(&guessed).filter(|(_, guessed)| **guessed) {
-        *value = f32::NAN;
-    }
+    // Where nobody looked the sweep has found nothing: the surfaces around are continued.
+    let around = surroundings(hole.as_raw(), [w, h]);
+    let surfaces = continue_surfaces(&view.camera, &guessed, hole.as_raw(), &mut disparity, others, &around, task.seed);
     membrane(&mut disparity, [w, h], |_| true);
     watch.at(2 * task.scene.train.len() as u64 + 3);
     let guesser = match task.inpainting {
@@ -341,7 +379,7 @@ fn fill(
             "the inpainting network"
         }
         None => {
-            inpaint(&mut rgb, &guessed, hole.as_raw(), &disparity, [w, h], task.seed);
+            inpaint(&mut rgb, &guessed, &disparity, &surfaces, &around, task.seed);
             "PatchMatch"
         }
     };
@@ -576,12 +614,16 @@ fn lonely(guessed: &mut [bool], hole: &[u8], [w, h]: [usize; 2]) {
     }
 }
 
-/// PatchMatch over the hole's surroundings, guided by disparity.
-fn inpaint(rgb: &mut [[f32; 3]], guessed: &[bool], hole: &[u8], disparity: &[f32], [w, h]: [usize; 2], seed: u64) {
+/// The pixels of a rectangle.
+struct Cells {
+    size: [usize; 2],
+    /// Their numbers in the whole picture.
+    pixels: Vec<usize>,
+}
+
+/// The hole's box and as much again on each side: what it is filled from.
+fn surroundings(hole: &[u8], [w, h]: [usize; 2]) -> Cells {
     let of_hole: Vec<usize> = (0..w * h).filter(|i| hole[*i] != 0).collect();
-    if !guessed.iter().any(|g| *g) {
-        return;
-    }
     let bounds = |f: &dyn Fn(usize) -> usize, end: usize| {
         let low = of_hole.iter().map(|i| f(*i)).min().unwrap_or(0);
         let high = of_hole.iter().map(|i| f(*i)).max().unwrap_or(end - 1) + 1;
@@ -589,15 +631,66 @@ fn inpaint(rgb: &mut [[f32; 3]], guessed: &[bool], hole: &[u8], disparity: &[f32
         (low.saturating_sub(margin), (high + margin).min(end))
     };
     let ((x0, x1), (y0, y1)) = (bounds(&|i| i % w, w), bounds(&|i| i / w, h));
-    let cells: Vec<usize> = (y0..y1).flat_map(|y| (x0..x1).map(move |x| y * w + x)).collect();
+    let pixels = (y0..y1).flat_map(|y| (x0..x1).map(move |x| y * w + x)).collect();
+    Cells { size: [x1 - x0, y1 - y0], pixels }
+}
+
+/// Gives what is guessed the inverse depth of the surfaces around it. Returns `[cell]` the surface.
+///
+/// No surface stands before the object, nor where other views look through it.
+fn continue_surfaces(
+    camera: &Camera,
+    guessed: &[bool],
+    hole: &[u8],
+    disparity: &mut [f32],
+    others: &Others<'_>,
+    around: &Cells,
+    seed: u64,
+) -> Vec<u8> {
+    let w = camera.size[0] as usize;
+    let pick = |values: &[f32]| -> Vec<f32> { around.pixels.iter().map(|i| values[*i]).collect() };
+    let position = |i: usize| [(i % w) as f64 + 0.5, (i / w) as f64 + 0.5];
+    let rays: Vec<Option<[f64; 2]>> = around.pixels.iter().map(|i| camera.unproject(position(*i))).collect();
+    // The fit is not sharp at the object's border.
+    let [width, height] = camera.size;
+    let border = GrayImage::from_raw(width, height, hole.to_vec()).expect("a value per pixel");
+    let border = resample::dilate(&border, (depth::MARGIN * f64::from(width.max(height))).ceil() as u32);
+    let blurred = |i: usize| border.as_raw()[i] != 0 && hole[i] == 0;
+    let unknown: Vec<bool> = around.pixels.iter().map(|i| guessed[*i] || blurred(*i)).collect();
+    let against = |cell: usize, d: f64| {
+        let pixel = around.pixels[cell];
+        let map = &others.maps[others.of];
+        let own = map.smooth(scaled(position(pixel), camera.size, map.camera.size));
+        if guessed[pixel] && own.is_finite() && d * f64::from(own) > 1.0 + HIDDEN {
+            return 1.0;
+        }
+        world(camera, pixel, d).map_or(1.0, |point| others.against(point))
+    };
+    let hole = planes::Hole { size: around.size, disparity: &pick(disparity), rays: &rays, unknown: &unknown, against };
+    let found = planes::surfaces(&hole, seed);
+    for (i, value) in around.pixels.iter().zip(found.disparity) {
+        if guessed[*i] {
+            disparity[*i] = value;
+        }
+    }
+    found.label
+}
+
+/// PatchMatch over the hole's surroundings, guided by surfaces and disparity.
+fn inpaint(rgb: &mut [[f32; 3]], guessed: &[bool], disparity: &[f32], surfaces: &[u8], around: &Cells, seed: u64) {
+    let cells = &around.pixels;
+    if !guessed.iter().any(|g| *g) {
+        return;
+    }
     let finite = || cells.iter().map(|i| disparity[*i]).filter(|v| v.is_finite());
     let (low, high) = finite().fold((f32::INFINITY, 0f32), |(low, high), v| (low.min(v), high.max(v)));
     let span = (high - low).max(1e-12);
     let guide = |i: usize| if disparity[i].is_finite() { (disparity[i] - low) / span } else { 0.0 };
     let mut canvas = Canvas {
-        size: [x1 - x0, y1 - y0],
+        size: around.size,
         rgb: cells.iter().map(|i| rgb[*i]).collect(),
         guide: cells.iter().map(|i| guide(*i)).collect(),
+        surface: surfaces.to_vec(),
         hole: cells.iter().map(|i| guessed[*i]).collect(),
         source: cells.iter().map(|i| !guessed[*i]).collect(),
     };

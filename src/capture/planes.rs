@@ -1,0 +1,331 @@
+//! What the surfaces around a hole are, and where in it one ends and the next begins.
+//!
+//! Inverse depth is linear over the picture of a plane. The planes around the hole are found by RANSAC (Fischler and
+//! Bolles 1981) on the inverse depths there, the largest first; what lies on none of them is the rest. Every pixel, of the
+//! hole too, then takes one of these surfaces by alpha expansion (Boykov et al. 2001): a known depth must fit, a surface
+//! must not stand before the object nor where other views look through it, and borders are short. In the hole each surface
+//! is continued, with what it was off at its border spread inwards.
+
+use rand::RngExt;
+use rand_pcg::Pcg64;
+
+use super::graph_cut::Grid;
+
+/// Planes that are looked for.
+const PLANES: usize = 6;
+/// Least part of the known pixels that makes a plane.
+const LEAST: f64 = 0.05;
+/// An inverse depth lies on a plane if it differs by at most this part.
+const THICKNESS: f64 = 0.02;
+/// Triples of pixels that are tried for each plane.
+const TRIES: usize = 500;
+/// Known pixels that take part in the search.
+const SAMPLES: usize = 6000;
+/// Longer side of the grid that surfaces are chosen on, pixels.
+const SIDE: usize = 224;
+/// What a pixel off its surface costs at most, in thicknesses.
+const OFF: f64 = 4.0;
+/// What a pixel without a surface of its own costs: a plane that fits is preferred.
+const REST: f64 = 1.5;
+/// What a pixel costs where its surface is impossible.
+const IMPOSSIBLE: f64 = 40.0;
+/// What a border costs per pixel of its length.
+const BORDER: f64 = 6.0;
+/// Costs are whole numbers of this fraction.
+const UNIT: f64 = 64.0;
+
+/// The surroundings of a hole.
+pub struct Hole<'a, F> {
+    /// Width and height in pixels.
+    pub size: [usize; 2],
+    /// `[pixel]` inverse depth; anything that is not finite and positive is not known.
+    pub disparity: &'a [f32],
+    /// `[pixel]` x/z and y/z of the ray.
+    pub rays: &'a [Option<[f64; 2]>],
+    /// `[pixel]` whether it is to be filled; its inverse depth is not looked at.
+    pub unknown: &'a [bool],
+    /// What speaks against a surface of this inverse depth at the pixel (its number): from 0, nothing, to 1, it cannot be.
+    pub against: F,
+}
+
+/// The surface of every pixel.
+pub struct Surfaces {
+    /// `[pixel]` number of its surface, the last for what is on no plane.
+    pub label: Vec<u8>,
+    /// `[pixel]` inverse depth, the known ones as they were; NaN where nothing is known of the surface.
+    pub disparity: Vec<f32>,
+    /// Planes that were found.
+    pub planes: usize,
+}
+
+/// Inverse depth by x/z, y/z and 1.
+type Plane = [f64; 3];
+
+fn on(plane: &Plane, [x, y]: [f64; 2]) -> f64 {
+    plane[0] * x + plane[1] * y + plane[2]
+}
+
+/// The plane of least squares, relative to the inverse depth.
+fn fitted(points: &[([f64; 2], f64)]) -> Option<Plane> {
+    let (mut normal, mut right) = (glam::DMat3::ZERO, glam::DVec3::ZERO);
+    for ([x, y], d) in points {
+        let row = glam::DVec3::new(*x, *y, 1.0) / *d;
+        normal += glam::DMat3::from_cols(row * row.x, row * row.y, row * row.z);
+        right += row;
+    }
+    let solved = normal.inverse() * right;
+    solved.is_finite().then(|| solved.to_array())
+}
+
+/// The largest planes among pixels (ray, inverse depth), the largest first.
+fn planes(mut points: Vec<([f64; 2], f64)>, rng: &mut Pcg64) -> Vec<Plane> {
+    let least = (LEAST * points.len() as f64).ceil().max(12.0) as usize;
+    let mut found = vec![];
+    let fits = |plane: &Plane, (ray, d): &([f64; 2], f64)| (on(plane, *ray) - d).abs() <= THICKNESS * d;
+    while found.len() < PLANES && points.len() >= least {
+        let mut best: (usize, Plane) = (0, [0.0; 3]);
+        for _ in 0..TRIES {
+            let three: [([f64; 2], f64); 3] = std::array::from_fn(|_| points[rng.random_range(0..points.len())]);
+            let Some(plane) = fitted(&three) else { continue };
+            let count = points.iter().filter(|point| fits(&plane, point)).count();
+            if count > best.0 {
+                best = (count, plane);
+            }
+        }
+        let mut plane = best.1;
+        for _ in 0..3 {
+            let inliers: Vec<_> = points.iter().filter(|point| fits(&plane, point)).copied().collect();
+            plane = fitted(&inliers).unwrap_or(plane);
+        }
+        let before = points.len();
+        points.retain(|point| !fits(&plane, point));
+        if before - points.len() < least {
+            break;
+        }
+        found.push(plane);
+    }
+    found
+}
+
+/// Finds the surfaces around a hole and continues them in it. The same seed finds the same.
+pub fn surfaces<F: Fn(usize, f64) -> f64>(hole: &Hole<'_, F>, seed: u64) -> Surfaces {
+    let [w, h] = hole.size;
+    let known = |i: usize| !hole.unknown[i] && hole.disparity[i] > 0.0 && hole.disparity[i].is_finite();
+    let all: Vec<usize> = (0..w * h).filter(|i| known(*i) && hole.rays[*i].is_some()).collect();
+    let every = all.len().div_ceil(SAMPLES).max(1);
+    let points = all.iter().step_by(every).filter_map(|i| Some((hole.rays[*i]?, f64::from(hole.disparity[*i]))));
+    let planes = planes(points.collect(), &mut Pcg64::new(seed.into(), 41));
+    let label = labels(hole, &planes);
+    let disparity = continued(hole, &planes, &label);
+    Surfaces { label, disparity, planes: planes.len() }
+}
+
+/// The surface of each pixel.
+fn labels<F: Fn(usize, f64) -> f64>(hole: &Hole<'_, F>, planes: &[Plane]) -> Vec<u8> {
+    let [w, h] = hole.size;
+    let stride = w.max(h).div_ceil(SIDE).max(1);
+    let size @ [gw, gh] = [w.div_ceil(stride), h.div_ceil(stride)];
+    let middle = |node: usize| {
+        let [x, y] = [(node % gw) * stride + stride / 2, (node / gw) * stride + stride / 2];
+        y.min(h - 1) * w + x.min(w - 1)
+    };
+    let rest = planes.len();
+    let cost = |node: usize, label: usize| -> f64 {
+        let i = middle(node);
+        let Some(ray) = hole.rays[i] else { return 0.0 };
+        let d = f64::from(hole.disparity[i]);
+        let is_known = !hole.unknown[i] && d > 0.0 && d.is_finite();
+        if label == rest {
+            return REST;
+        }
+        let surface = on(&planes[label], ray);
+        if is_known {
+            return ((surface - d).abs() / (THICKNESS * d)).min(OFF);
+        }
+        match hole.unknown[i] {
+            true if surface <= 0.0 => IMPOSSIBLE,
+            true => IMPOSSIBLE * (hole.against)(i, surface),
+            false => 0.0,
+        }
+    };
+    let nodes = gw * gh;
+    let scale = stride as f64;
+    // A node stands for stride^2 pixels, an edge of the grid for a border of stride pixels.
+    let units: Vec<Vec<i64>> =
+        (0..=rest).map(|label| (0..nodes).map(|node| (UNIT * scale * cost(node, label)) as i64).collect()).collect();
+    let mut current: Vec<usize> =
+        (0..nodes).map(|node| (0..=rest).min_by_key(|label| units[*label][node]).unwrap_or(rest)).collect();
+    for _ in 0..3 {
+        let before = current.clone();
+        for alpha in 0..=rest {
+            expand(&mut current, alpha, &units, size);
+        }
+        if before == current {
+            break;
+        }
+    }
+    (0..w * h).map(|i| current[(i / w / stride) * gw + (i % w) / stride] as u8).collect()
+}
+
+/// Sixteen neighbours: with eight, the staircases between two points within half a right angle are as short as the line.
+const SHIFTS: [[isize; 2]; 16] = [
+    [-1, -2],
+    [1, -2],
+    [-2, -1],
+    [-1, -1],
+    [0, -1],
+    [1, -1],
+    [2, -1],
+    [-1, 0],
+    [1, 0],
+    [-2, 1],
+    [-1, 1],
+    [0, 1],
+    [1, 1],
+    [2, 1],
+    [-1, 2],
+    [1, 2],
+];
+
+/// What an edge of the grid adds to the length of a border across it: half the angle to its neighbours in direction, over
+/// the edge's length (Boykov and Kolmogorov 2003).
+fn length(dx: isize, dy: isize) -> f64 {
+    let knight = 0.5f64.atan();
+    let quarter = std::f64::consts::FRAC_PI_4;
+    let angle = match dx.abs() + dy.abs() {
+        1 => knight,
+        2 => quarter - knight,
+        _ => quarter / 2.0,
+    };
+    0.5 * angle / f64::hypot(dx as f64, dy as f64)
+}
+
+/// Every pixel keeps its label or takes `alpha`, as is cheapest: one minimum cut (Kolmogorov and Zabih 2004).
+fn expand(current: &mut [usize], alpha: usize, units: &[Vec<i64>], size @ [w, h]: [usize; 2]) {
+    let mut grid = Grid::new(size, &SHIFTS);
+    // Of keeping, minus of taking alpha.
+    let mut gain: Vec<i64> = (0..current.len()).map(|i| units[current[i]][i] - units[alpha][i]).collect();
+    for p in 0..current.len() {
+        for (d, [dx, dy]) in SHIFTS.into_iter().enumerate().skip(8) {
+            let (x, y) = ((p % w) as isize + dx, (p / w) as isize + dy);
+            if x < 0 || x >= w as isize || y >= h as isize {
+                continue;
+            }
+            let q = y as usize * w + x as usize;
+            let border = (UNIT * BORDER * length(dx, dy)) as i64;
+            let differ = |a: usize, b: usize| if a == b { 0 } else { border };
+            let (keep, take_q, take_p) =
+                (differ(current[p], current[q]), differ(current[p], alpha), differ(alpha, current[q]));
+            gain[p] += keep - take_p;
+            gain[q] += take_p;
+            grid.set_arc(q, SHIFTS.len() - 1 - d, (take_q + take_p - keep) as i32);
+        }
+    }
+    for (i, gain) in gain.into_iter().enumerate() {
+        grid.set_terminals(i, gain, 0);
+    }
+    for (label, takes) in current.iter_mut().zip(grid.cut()) {
+        if takes {
+            *label = alpha;
+        }
+    }
+}
+
+/// Each surface's inverse depth in the hole: its plane, and on it a membrane over what known pixels are off from it.
+fn continued<F>(hole: &Hole<'_, F>, planes: &[Plane], label: &[u8]) -> Vec<f32> {
+    let mut out = hole.disparity.to_vec();
+    for surface in 0..=planes.len() {
+        let of = |i: usize| match (planes.get(surface), hole.rays[i]) {
+            (Some(plane), Some(ray)) => on(plane, ray) as f32,
+            _ => 0.0,
+        };
+        let mut off: Vec<f32> = (0..label.len())
+            .map(|i| {
+                let own = label[i] as usize == surface && !hole.unknown[i] && hole.disparity[i] > 0.0;
+                let off = hole.disparity[i] - of(i);
+                // What is short or thin has the surface of its surroundings without lying on it.
+                let on_it = surface == planes.len() || off.abs() <= THICKNESS as f32 * hole.disparity[i];
+                if own && on_it { off } else { f32::NAN }
+            })
+            .collect();
+        let wanted = |i: usize| label[i] as usize == surface && hole.unknown[i];
+        super::reference::membrane(&mut off, hole.size, wanted);
+        for i in (0..label.len()).filter(|i| wanted(*i)) {
+            // A surface that touches the hole nowhere is its plane alone.
+            let value = of(i) + if off[i].is_finite() || planes.get(surface).is_none() { off[i] } else { 0.0 };
+            out[i] = if value > 0.0 { value } else { f32::NAN };
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIZE: [usize; 2] = [120, 90];
+
+    fn rays() -> Vec<Option<[f64; 2]>> {
+        (0..SIZE[0] * SIZE[1])
+            .map(|i| Some([(i % SIZE[0]) as f64 / 100.0 - 0.6, (i / SIZE[0]) as f64 / 100.0 - 0.45]))
+            .collect()
+    }
+
+    /// A floor, and a table top above it that ends in the hole along a line: both go on as planes, and the border is the
+    /// straight line between where it enters the hole and where it leaves it.
+    #[test]
+    fn two_planes_meet_in_the_hole_along_a_straight_line() {
+        let rays = rays();
+        let table = |i: usize| (i % SIZE[0]) < 20 + (i / SIZE[0]) / 2;
+        let truth: Vec<f32> = rays
+            .iter()
+            .enumerate()
+            .map(|(i, ray)| {
+                let [_, y] = ray.unwrap();
+                (if table(i) { 0.40 + 0.5 * y } else { 0.28 + 0.35 * y }) as f32
+            })
+            .collect();
+        let unknown: Vec<bool> =
+            (0..truth.len()).map(|i| (30..80).contains(&(i % SIZE[0])) && (20..70).contains(&(i / SIZE[0]))).collect();
+        let seen: Vec<f32> = truth.iter().zip(&unknown).map(|(d, u)| if *u { f32::NAN } else { *d }).collect();
+        let hole = Hole { size: SIZE, disparity: &seen, rays: &rays, unknown: &unknown, against: |_, _| 0.0 };
+        let found = surfaces(&hole, 5);
+        assert_eq!(found.planes, 2, "planes");
+        let wrong = (0..truth.len()).filter(|i| unknown[*i] && (found.disparity[*i] / truth[*i] - 1.0).abs() > 0.01);
+        let border = |i: usize| {
+            let at = 20.0 + (i / SIZE[0]) as f64 / 2.0;
+            ((i % SIZE[0]) as f64 - at).abs() < 4.0
+        };
+        let wrong: Vec<usize> = wrong.filter(|i| !border(*i)).collect();
+        assert!(wrong.is_empty(), "{} pixels off the border are wrong", wrong.len());
+        assert!(found.disparity.iter().all(|d| d.is_finite()));
+    }
+
+    /// Where other views look through the table top, the floor goes on: the hole is all floor but for its left edge.
+    #[test]
+    fn a_surface_ends_where_other_views_look_through_it() {
+        let rays = rays();
+        let truth: Vec<f32> = (0..rays.len()).map(|i| if i % SIZE[0] < 60 { 0.5f32 } else { 0.25 }).collect();
+        let unknown: Vec<bool> =
+            (0..truth.len()).map(|i| (40..80).contains(&(i % SIZE[0])) && (20..70).contains(&(i / SIZE[0]))).collect();
+        let against = |i: usize, d: f64| if d > 0.4 && i % SIZE[0] >= 45 { 1.0 } else { 0.0 };
+        let hole = Hole { size: SIZE, disparity: &truth, rays: &rays, unknown: &unknown, against };
+        let found = surfaces(&hole, 5);
+        for i in (0..truth.len()).filter(|i| unknown[*i] && (40..50).contains(&(i / SIZE[0]))) {
+            let expected = if i % SIZE[0] < 45 { 0.5 } else { 0.25 };
+            let near = (44..47).contains(&(i % SIZE[0]));
+            assert!(near || (found.disparity[i] - expected).abs() < 0.01, "{} {}", i % SIZE[0], found.disparity[i]);
+        }
+    }
+
+    #[test]
+    fn nothing_known_is_no_fault() {
+        let rays = rays();
+        let nothing = vec![f32::NAN; rays.len()];
+        let unknown = vec![true; rays.len()];
+        let hole = Hole { size: SIZE, disparity: &nothing, rays: &rays, unknown: &unknown, against: |_, _| 0.0 };
+        let found = surfaces(&hole, 0);
+        assert_eq!(found.planes, 0);
+        assert!(found.disparity.iter().all(|d| d.is_nan()));
+    }
+}
