@@ -576,7 +576,8 @@ mod tests {
     /// would be worth its border.
     #[test]
     fn a_thin_object_fills_its_box() {
-        let leaf = |x: u32, y: u32| (40..80).contains(&x) && y >= 30 && y < 90 && (y % 4 < 2 || (58..62).contains(&x));
+        let leaf =
+            |x: u32, y: u32| (40..80).contains(&x) && (30..90).contains(&y) && (y % 4 < 2 || (58..62).contains(&x));
         let picture = RgbImage::from_fn(120, 120, |x, y| {
             let noise = ((x * 7 + y * 13) % 29) as u8;
             let green = leaf(x, y) || y < 28 && x > 30 && x < 90;
