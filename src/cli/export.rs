@@ -11,7 +11,7 @@ use super::folders::Origin;
 use super::next;
 use super::shared::{self, DeviceArgs};
 use crate::config::{Settings, Source};
-use crate::export::{self, Cloud, Export, Observer, Options, gltf, measure, ply, spz, up};
+use crate::export::{self, Cloud, Export, Observer, Options, gltf, low_pass, measure, ply, spz, up};
 use crate::model;
 use crate::scene::{Camera, Scene, path};
 
@@ -57,6 +57,12 @@ pub(super) struct Args {
     /// Steps of the refinement
     #[arg(long, value_name = "N", default_value_t = Options::default().steps)]
     steps: u32,
+    /// Longer side of the picture that the scene will be looked at in, pixels
+    ///
+    /// Gaussians that are thinner than the pixels of the training are widened, or larger pictures would show needles and
+    /// holes. 1 leaves them as they are.
+    #[arg(long, value_name = "PIXELS", default_value_t = Options::default().screen, value_parser = clap::value_parser!(u32).range(1..))]
+    screen: u32,
     /// Scene to take the cameras from, or the word `synthetic` [default: the run's own]
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
@@ -176,6 +182,9 @@ struct Figures {
     virtual_views: usize,
     steps: u32,
     degree: u32,
+    /// Longer side of the picture it is to be looked at in, and how many times larger that is than the training's.
+    screen: u32,
+    larger: f64,
     up: &'static str,
     /// Rows: a world point p of the scene is `rotation p` in the PLY.
     rotation: [[f64; 3]; 3],
@@ -242,6 +251,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             degree: args.degree,
             views: args.views,
             steps: args.steps,
+            screen: args.screen,
             seed: settings.train.seed,
         };
         let mut bars = Bars::default();
@@ -254,7 +264,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             let bytes = format.encode(&made.cloud)?;
             let background = settings.train.background.map(|channel| channel as f32);
             let read_back = format.decode(&bytes)?;
-            let loss = made.yardstick.of_cloud(gpu, &read_back, &settings.render, background)?;
+            let times = low_pass::measured(made.larger);
+            let loss = made.yardstick.of_cloud(gpu, &read_back, times, &settings.render, background)?;
             let name = format!("{STEM}.{}", format.extension());
             made.losses.push((format!("{name}, {}", size(bytes.len())), loss));
             written.push((File { name, bytes: bytes.len(), loss }, bytes));
@@ -312,6 +323,8 @@ fn figures(
         virtual_views: made.poses[1],
         steps: args.steps,
         degree: args.degree,
+        screen: args.screen,
+        larger: made.larger,
         up: if args.up == Up::Auto { "auto" } else { "keep" },
         rotation: made.turn.transpose().to_cols_array_2d(),
         gaussians_of_the_model: made.gaussians[0],
@@ -339,6 +352,14 @@ fn report(made: &Export, figures: &Figures, formats: &[Format]) {
         figures.virtual_views,
         figures.seconds
     );
+    if low_pass::variance(made.larger) > 0.0 {
+        println!(
+            "widened for pictures of {} pixels, {:.1} times the training's size; the files were drawn {} times as large",
+            figures.screen,
+            made.larger,
+            low_pass::measured(made.larger)
+        );
+    }
     let cut = spz::beyond_range(&made.cloud);
     if formats.contains(&Format::Spz) && cut > 0 {
         println!("SPZ holds scales between 4.5e-5 and 380 units: {cut} of {} were cut off", 3 * made.cloud.len());

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::activate::Static;
 use super::draw::Drawer;
-use super::{Cloud, Error};
+use super::{Cloud, Error, low_pass};
 use crate::evaluate::{self, Mean, Report, ViewMetrics};
 use crate::gpu::Gpu;
 use crate::render::Config;
@@ -96,12 +96,19 @@ impl Yardstick {
         Ok(Loss { anchors: None, photographs: self.mean(|pose| Some((&pose.anchors, pose.photograph.as_ref()?)))? })
     }
 
-    /// These Gaussians.
+    /// These Gaussians, on `times` as many pixels each way as the pictures have, reduced to those.
     ///
     /// # Errors
     /// When the device has no room, or is lost.
-    pub fn of_cloud(&self, gpu: &Gpu, cloud: &Cloud, config: &Config, background: [f32; 3]) -> Result<Loss, Error> {
-        self.of_drawer(&mut Drawer::new(gpu, Static::upload(gpu, cloud)?, config, background)?)
+    pub fn of_cloud(
+        &self,
+        gpu: &Gpu,
+        cloud: &Cloud,
+        times: u32,
+        config: &Config,
+        background: [f32; 3],
+    ) -> Result<Loss, Error> {
+        self.of_drawing(&mut Drawer::new(gpu, Static::upload(gpu, cloud)?, config, background)?, times)
     }
 
     /// The Gaussians of a drawer as they are now.
@@ -109,7 +116,14 @@ impl Yardstick {
     /// # Errors
     /// As [`Yardstick::of_cloud`].
     pub fn of_drawer(&self, drawer: &mut Drawer) -> Result<Loss, Error> {
-        let draw = |pose: &Pose| Ok(to_rgb8(pose.camera.size, &drawer.draw(&pose.camera)?));
+        self.of_drawing(drawer, 1)
+    }
+
+    fn of_drawing(&self, drawer: &mut Drawer, times: u32) -> Result<Loss, Error> {
+        let draw = |pose: &Pose| {
+            let large = low_pass::enlarged(&pose.camera, times);
+            Ok(to_rgb8(pose.camera.size, &low_pass::reduced(&drawer.draw(&large)?, large.size, times)))
+        };
         let pictures: Vec<RgbImage> = self.poses.iter().map(draw).collect::<Result<_, Error>>()?;
         let mut pictures_again = pictures.iter();
         let anchors = self.mean(|pose| Some((pictures_again.next()?, &pose.anchors)))?;

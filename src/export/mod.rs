@@ -4,6 +4,7 @@ pub mod activate;
 pub mod bake;
 pub mod draw;
 pub mod gltf;
+pub mod low_pass;
 pub mod measure;
 pub mod ply;
 pub mod poses;
@@ -167,13 +168,15 @@ pub struct Options {
     pub views: u32,
     /// Steps of the refinement.
     pub steps: u32,
+    /// Longer side of the picture that the scene will be looked at in, pixels: see [`low_pass`].
+    pub screen: u32,
     /// Seed of the poses and of their order.
     pub seed: u64,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { upright: true, degree: 0, views: 48, steps: 1000, seed: 0 }
+        Self { upright: true, degree: 0, views: 48, steps: 1000, screen: 1920, seed: 0 }
     }
 }
 
@@ -206,6 +209,8 @@ pub struct Export {
     pub poses: [usize; 2],
     /// Gaussians of the model, and those that were baked.
     pub gaussians: [usize; 2],
+    /// How many times larger than the training's pictures the scene will be looked at.
+    pub larger: f64,
 }
 
 /// Bakes, refines and prunes.
@@ -268,7 +273,10 @@ pub fn make(
     }
     cloud = drawer.gaussians.read(gpu)?;
     cloud.retain(&shares.iter().map(|share| *share > SEEN).collect::<Vec<_>>());
-    Ok(Export { cloud, turn, yardstick, losses, poses: [looked.len(), between.len()], gaussians })
+    let longest = train.iter().flat_map(|camera| camera.size).max().unwrap_or(1);
+    let larger = (f64::from(options.screen) / f64::from(longest)).max(1.0);
+    low_pass::widen(&mut cloud, &train.iter().map(turned).collect::<Vec<_>>(), larger);
+    Ok(Export { cloud, turn, yardstick, losses, poses: [looked.len(), between.len()], gaussians, larger })
 }
 
 #[cfg(test)]

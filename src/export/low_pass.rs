@@ -1,0 +1,149 @@
+//! Gaussians as wide as the pixels they were trained with.
+//!
+//! In training every Gaussian is drawn with [`DILATION`] px^2 more variance (EWA splatting's low-pass), and a render is
+//! compared with pixels that are means over their squares. A Gaussian may therefore be as thin as it likes: where the
+//! pictures are small, many are needles. A viewer draws larger pictures and adds as many px^2 of its own, smaller, pixels:
+//! needles and holes would show. What is missing is added to the Gaussians themselves (as Mip-Splatting does in training, Yu et
+//! al. 2024): in px^2 of the training's pictures, drawn `k` times larger,
+//!
+//! `DILATION - 1/12 - DILATION / k^2`,
+//!
+//! 1/12 for the mean over a pixel's square, which the eye or a reduction takes, and the last for what the viewer adds. A
+//! picture of the viewer's, reduced to the training's size, is then the one that was trained.
+
+use super::Cloud;
+use crate::math::camera::DILATION;
+use crate::scene::Camera;
+
+/// Variance to add for pictures `larger` times as large as the training's, in px^2 of those; 0 where they are hardly larger.
+pub fn variance(larger: f64) -> f64 {
+    (DILATION - 1.0 / 12.0 - DILATION / (larger * larger)).max(0.0)
+}
+
+/// Widens all Gaussians for pictures `larger` times as large as those of the `cameras`, which are in the cloud's axes. A
+/// pixel's size at a Gaussian is the mean over the cameras whose picture it lies in, of its square.
+pub fn widen(cloud: &mut Cloud, cameras: &[Camera], larger: f64) {
+    let variance = variance(larger);
+    if variance == 0.0 {
+        return;
+    }
+    for (position, log_scale) in cloud.position.iter().zip(&mut cloud.log_scale) {
+        let added = variance * pixel_area(cameras, position.map(f64::from));
+        for scale in log_scale {
+            *scale = (0.5 * ((2.0 * f64::from(*scale)).exp() + added).ln()) as f32;
+        }
+    }
+}
+
+/// Mean area of a pixel at a point, scene units squared; of the cameras before which it lies where it is in no picture, and
+/// 0 where it lies before none.
+fn pixel_area(cameras: &[Camera], point: [f64; 3]) -> f64 {
+    let (mut seen, mut before) = ([0.0, 0.0], [0.0, 0.0]);
+    for camera in cameras {
+        let z = camera.to_camera(point)[2];
+        if z <= 0.0 {
+            continue;
+        }
+        let area = z * z / (f64::from(camera.focal[0]) * f64::from(camera.focal[1]));
+        let [w, h] = camera.size.map(f64::from);
+        before = [before[0] + area, before[1] + 1.0];
+        if camera.project(point).is_some_and(|[x, y]| x >= 0.0 && y >= 0.0 && x <= w && y <= h) {
+            seen = [seen[0] + area, seen[1] + 1.0];
+        }
+    }
+    match (seen, before) {
+        ([sum, count], _) | ([_, _], [sum, count]) if count > 0.0 => sum / count,
+        _ => 0.0,
+    }
+}
+
+/// How many times larger a picture is drawn to be measured, for one that will be looked at `larger` times as large.
+pub fn measured(larger: f64) -> u32 {
+    (larger.round() as u32).clamp(1, 4)
+}
+
+/// The same view on `times` as many pixels each way.
+pub fn enlarged(camera: &Camera, times: u32) -> Camera {
+    let factor = times as f32;
+    Camera {
+        focal: camera.focal.map(|f| f * factor),
+        principal: camera.principal.map(|c| c * factor),
+        size: camera.size.map(|n| n * times),
+        ..*camera
+    }
+}
+
+/// Means over squares of `times` by `times` pixels of a picture that is `size` (width, height) pixels large.
+pub fn reduced(rgb: &[[f32; 3]], size: [u32; 2], times: u32) -> Vec<[f32; 3]> {
+    let [width, times] = [size[0] as usize, times as usize];
+    let [w, h] = size.map(|n| n as usize / times);
+    let mean = |i: usize| {
+        let (x, y) = (i % w * times, i / w * times);
+        let square = (y..y + times).flat_map(|v| (x..x + times).map(move |u| rgb[v * width + u]));
+        let sum = square.fold([0.0; 3], |sum: [f32; 3], p| std::array::from_fn(|c| sum[c] + p[c]));
+        sum.map(|v| v / (times * times) as f32)
+    };
+    (0..w * h).map(mean).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn camera() -> Camera {
+        Camera {
+            rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            translation: [0.0; 3],
+            focal: [50.0, 50.0],
+            principal: [50.0, 40.0],
+            distortion: [0.0; 4],
+            size: [100, 80],
+        }
+    }
+
+    #[test]
+    fn pictures_as_large_as_the_trainings_need_nothing() {
+        assert_eq!((variance(1.0), variance(0.5)), (0.0, 0.0));
+        // Nothing of the viewer's own is left at any size.
+        assert!((variance(1e6) - (0.3 - 1.0 / 12.0)).abs() < 1e-9);
+        let before = crate::export::tests::cloud(20, 0);
+        let mut after = before.clone();
+        widen(&mut after, &[camera()], 1.0);
+        assert_eq!(before, after);
+    }
+
+    /// What a viewer draws `k` times as large, its own low-pass and a mean over squares included, is as wide as what was
+    /// trained with, in pixels of the training.
+    #[test]
+    fn a_needle_is_as_wide_as_it_was_trained() {
+        let k = 4.0;
+        let mut cloud = crate::export::tests::cloud(1, 0);
+        cloud.position[0] = [0.3, -0.2, 10.0];
+        cloud.log_scale[0] = [-30.0, -30.0, 0.0];
+        widen(&mut cloud, &[camera()], k);
+        // A pixel is a fifth of a unit wide there.
+        let in_pixels = (2.0 * f64::from(cloud.log_scale[0][0])).exp() * 25.0;
+        let seen = in_pixels + DILATION / (k * k) + 1.0 / 12.0;
+        assert!((seen - DILATION).abs() < 1e-6, "{seen}");
+        assert!((f64::from(cloud.log_scale[0][2])).abs() < 0.01, "what is wide already hardly changes");
+    }
+
+    #[test]
+    fn a_pixels_size_is_the_mean_of_those_who_see_it() {
+        let near = Camera { translation: [0.0, 0.0, -5.0], ..camera() };
+        let aside = Camera { translation: [1000.0, 0.0, 0.0], ..camera() };
+        let point = [0.0, 0.0, 10.0];
+        assert!((pixel_area(&[camera(), near, aside], point) - (0.04 + 0.01) / 2.0).abs() < 1e-9);
+        assert!((pixel_area(&[aside], point) - 0.04).abs() < 1e-9, "before it, but in no picture");
+        assert_eq!(pixel_area(&[camera()], [0.0, 0.0, -1.0]), 0.0);
+    }
+
+    #[test]
+    fn a_larger_picture_is_reduced_to_its_means() {
+        let large = enlarged(&camera(), 3);
+        assert_eq!((large.size, large.focal, large.principal), ([300, 240], [150.0; 2], [150.0, 120.0]));
+        let ramp: Vec<[f32; 3]> = (0..6 * 4).map(|i| [(i % 6) as f32, (i / 6) as f32, 1.0]).collect();
+        let small = reduced(&ramp, [6, 4], 2);
+        assert_eq!((small.len(), small[0], small[5]), (6, [0.5, 0.5, 1.0], [4.5, 2.5, 1.0]));
+    }
+}
