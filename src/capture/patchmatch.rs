@@ -130,8 +130,8 @@ struct Search<'a> {
 
 /// Weight of the guide beside the three colours.
 const GUIDE: f32 = 6.0;
-/// What a pixel of another surface counts: as much as a third of the way from black to white in one channel.
-const OTHER: f32 = 0.1;
+/// What a pixel of another surface counts: about as much as the largest difference between two things in the sun.
+const OTHER: f32 = 0.5;
 
 impl Search<'_> {
     /// Sum of squared differences of two patches over the pixels that both have, given up beyond `limit`.

@@ -3,8 +3,8 @@
 //! Inverse depth is linear over the picture of a plane. The planes around the hole are found by RANSAC (Fischler and
 //! Bolles 1981) on the inverse depths there, the largest first; what lies on none of them is the rest. Every pixel, of the
 //! hole too, then takes one of these surfaces by alpha expansion (Boykov et al. 2001): a known depth must fit, a surface
-//! must not stand before the object nor where other views look through it, and borders are short. In the hole each surface
-//! is continued, with what it was off at its border spread inwards.
+//! must not stand before the object nor where other views look through it, and borders are short. Along the
+//! object's outline they are dear, as the object hides by chance what ends there. In the hole each surface is continued, with what it was off at its border spread inwards.
 
 use rand::RngExt;
 use rand_pcg::Pcg64;
@@ -22,7 +22,7 @@ const TRIES: usize = 500;
 /// Known pixels that take part in the search.
 const SAMPLES: usize = 6000;
 /// Longer side of the grid that surfaces are chosen on, pixels.
-const SIDE: usize = 224;
+const SIDE: usize = 320;
 /// What a pixel off its surface costs at most, in thicknesses.
 const OFF: f64 = 4.0;
 /// What a pixel without a surface of its own costs: a plane that fits is preferred.
@@ -31,6 +31,8 @@ const REST: f64 = 1.5;
 const IMPOSSIBLE: f64 = 40.0;
 /// What a border costs per pixel of its length.
 const BORDER: f64 = 6.0;
+/// How many times more it costs along the object's outline: a surface that ends just there would be a coincidence.
+const COINCIDENCE: f64 = 4.0;
 /// Costs are whole numbers of this fraction.
 const UNIT: f64 = 64.0;
 
@@ -44,6 +46,8 @@ pub struct Hole<'a, F> {
     pub rays: &'a [Option<[f64; 2]>],
     /// `[pixel]` whether it is to be filled; its inverse depth is not looked at.
     pub unknown: &'a [bool],
+    /// `[pixel]` whether it lies along the object's outline.
+    pub outline: &'a [bool],
     /// What speaks against a surface of this inverse depth at the pixel (its number): from 0, nothing, to 1, it cannot be.
     pub against: F,
 }
@@ -149,6 +153,7 @@ fn labels<F: Fn(usize, f64) -> f64>(hole: &Hole<'_, F>, planes: &[Plane]) -> Vec
         }
     };
     let nodes = gw * gh;
+    let outline: Vec<bool> = (0..nodes).map(|node| hole.outline[middle(node)]).collect();
     let scale = stride as f64;
     // A node stands for stride^2 pixels, an edge of the grid for a border of stride pixels.
     let units: Vec<Vec<i64>> =
@@ -158,7 +163,7 @@ fn labels<F: Fn(usize, f64) -> f64>(hole: &Hole<'_, F>, planes: &[Plane]) -> Vec
     for _ in 0..3 {
         let before = current.clone();
         for alpha in 0..=rest {
-            expand(&mut current, alpha, &units, size);
+            expand(&mut current, alpha, &units, &outline, size);
         }
         if before == current {
             break;
@@ -201,7 +206,7 @@ fn length(dx: isize, dy: isize) -> f64 {
 }
 
 /// Every pixel keeps its label or takes `alpha`, as is cheapest: one minimum cut (Kolmogorov and Zabih 2004).
-fn expand(current: &mut [usize], alpha: usize, units: &[Vec<i64>], size @ [w, h]: [usize; 2]) {
+fn expand(current: &mut [usize], alpha: usize, units: &[Vec<i64>], outline: &[bool], size @ [w, h]: [usize; 2]) {
     let mut grid = Grid::new(size, &SHIFTS);
     // Of keeping, minus of taking alpha.
     let mut gain: Vec<i64> = (0..current.len()).map(|i| units[current[i]][i] - units[alpha][i]).collect();
@@ -212,7 +217,8 @@ fn expand(current: &mut [usize], alpha: usize, units: &[Vec<i64>], size @ [w, h]
                 continue;
             }
             let q = y as usize * w + x as usize;
-            let border = (UNIT * BORDER * length(dx, dy)) as i64;
+            let dear = if outline[p] || outline[q] { COINCIDENCE } else { 1.0 };
+            let border = (UNIT * BORDER * dear * length(dx, dy)) as i64;
             let differ = |a: usize, b: usize| if a == b { 0 } else { border };
             let (keep, take_q, take_p) =
                 (differ(current[p], current[q]), differ(current[p], alpha), differ(alpha, current[q]));
@@ -271,6 +277,18 @@ mod tests {
             .collect()
     }
 
+    /// The pixels of the hole at its border.
+    fn outline(unknown: &[bool]) -> Vec<bool> {
+        let at = |x: usize, y: usize| unknown[y.min(SIZE[1] - 1) * SIZE[0] + x.min(SIZE[0] - 1)];
+        (0..unknown.len())
+            .map(|i| {
+                let (x, y) = (i % SIZE[0], i / SIZE[0]);
+                let around = [at(x + 1, y), at(x.saturating_sub(1), y), at(x, y + 1), at(x, y.saturating_sub(1))];
+                unknown[i] && around.contains(&false)
+            })
+            .collect()
+    }
+
     /// A floor, and a table top above it that ends in the hole along a line: both go on as planes, and the border is the
     /// straight line between where it enters the hole and where it leaves it.
     #[test]
@@ -288,7 +306,15 @@ mod tests {
         let unknown: Vec<bool> =
             (0..truth.len()).map(|i| (30..80).contains(&(i % SIZE[0])) && (20..70).contains(&(i / SIZE[0]))).collect();
         let seen: Vec<f32> = truth.iter().zip(&unknown).map(|(d, u)| if *u { f32::NAN } else { *d }).collect();
-        let hole = Hole { size: SIZE, disparity: &seen, rays: &rays, unknown: &unknown, against: |_, _| 0.0 };
+        let outline = outline(&unknown);
+        let hole = Hole {
+            size: SIZE,
+            disparity: &seen,
+            rays: &rays,
+            unknown: &unknown,
+            outline: &outline,
+            against: |_, _| 0.0,
+        };
         let found = surfaces(&hole, 5);
         assert_eq!(found.planes, 2, "planes");
         let wrong = (0..truth.len()).filter(|i| unknown[*i] && (found.disparity[*i] / truth[*i] - 1.0).abs() > 0.01);
@@ -309,7 +335,8 @@ mod tests {
         let unknown: Vec<bool> =
             (0..truth.len()).map(|i| (40..80).contains(&(i % SIZE[0])) && (20..70).contains(&(i / SIZE[0]))).collect();
         let against = |i: usize, d: f64| if d > 0.4 && i % SIZE[0] >= 45 { 1.0 } else { 0.0 };
-        let hole = Hole { size: SIZE, disparity: &truth, rays: &rays, unknown: &unknown, against };
+        let outline = outline(&unknown);
+        let hole = Hole { size: SIZE, disparity: &truth, rays: &rays, unknown: &unknown, outline: &outline, against };
         let found = surfaces(&hole, 5);
         for i in (0..truth.len()).filter(|i| unknown[*i] && (40..50).contains(&(i / SIZE[0]))) {
             let expected = if i % SIZE[0] < 45 { 0.5 } else { 0.25 };
@@ -318,12 +345,43 @@ mod tests {
         }
     }
 
+    /// A table top that enters the hole from the left, between a floor above and below: it ends within the hole and not
+    /// along its outline, neither at once nor at the far side.
+    #[test]
+    fn no_surface_ends_along_the_outline() {
+        let rays = rays();
+        let table = |i: usize| i % SIZE[0] < 60 && (35..55).contains(&(i / SIZE[0]));
+        let truth: Vec<f32> = (0..rays.len()).map(|i| if table(i) { 0.5 } else { 0.25 }).collect();
+        let unknown: Vec<bool> =
+            (0..truth.len()).map(|i| (40..80).contains(&(i % SIZE[0])) && (20..70).contains(&(i / SIZE[0]))).collect();
+        let outline = outline(&unknown);
+        let hole = Hole {
+            size: SIZE,
+            disparity: &truth,
+            rays: &rays,
+            unknown: &unknown,
+            outline: &outline,
+            against: |_, _| 0.0,
+        };
+        let found = surfaces(&hole, 5);
+        let ends = (40..80).find(|x| (found.disparity[45 * SIZE[0] + x] - 0.25).abs() < 0.01);
+        assert!(ends.is_some_and(|x| (42..70).contains(&x)), "{ends:?}");
+    }
+
     #[test]
     fn nothing_known_is_no_fault() {
         let rays = rays();
         let nothing = vec![f32::NAN; rays.len()];
         let unknown = vec![true; rays.len()];
-        let hole = Hole { size: SIZE, disparity: &nothing, rays: &rays, unknown: &unknown, against: |_, _| 0.0 };
+        let outline = outline(&unknown);
+        let hole = Hole {
+            size: SIZE,
+            disparity: &nothing,
+            rays: &rays,
+            unknown: &unknown,
+            outline: &outline,
+            against: |_, _| 0.0,
+        };
         let found = surfaces(&hole, 0);
         assert_eq!(found.planes, 0);
         assert!(found.disparity.iter().all(|d| d.is_nan()));

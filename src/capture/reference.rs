@@ -657,6 +657,7 @@ fn continue_surfaces(
     let border = resample::dilate(&border, (depth::MARGIN * f64::from(width.max(height))).ceil() as u32);
     let blurred = |i: usize| border.as_raw()[i] != 0 && hole[i] == 0;
     let unknown: Vec<bool> = around.pixels.iter().map(|i| guessed[*i] || blurred(*i)).collect();
+    let outline: Vec<bool> = around.pixels.iter().map(|i| blurred(*i)).collect();
     let against = |cell: usize, d: f64| {
         let pixel = around.pixels[cell];
         let map = &others.maps[others.of];
@@ -666,7 +667,14 @@ fn continue_surfaces(
         }
         world(camera, pixel, d).map_or(1.0, |point| others.against(point))
     };
-    let hole = planes::Hole { size: around.size, disparity: &pick(disparity), rays: &rays, unknown: &unknown, against };
+    let hole = planes::Hole {
+        size: around.size,
+        disparity: &pick(disparity),
+        rays: &rays,
+        unknown: &unknown,
+        outline: &outline,
+        against,
+    };
     let found = planes::surfaces(&hole, seed);
     for (i, value) in around.pixels.iter().zip(found.disparity) {
         if guessed[*i] {

@@ -13,6 +13,7 @@ use super::shared::{self, DeviceArgs};
 use crate::config::{Settings, Source};
 use crate::export::{self, Cloud, Export, Observer, Options, gltf, low_pass, measure, ply, spz, up};
 use crate::model;
+use crate::render::widen;
 use crate::scene::{Camera, Scene, path};
 
 /// The export's folder within a run folder.
@@ -352,7 +353,7 @@ fn report(made: &Export, figures: &Figures, formats: &[Format]) {
         figures.virtual_views,
         figures.seconds
     );
-    if low_pass::variance(made.larger) > 0.0 {
+    if widen::variance(made.larger) > 0.0 {
         println!(
             "widened for pictures of {} pixels, {:.1} times the training's size; the files were drawn {} times as large",
             figures.screen,

@@ -97,6 +97,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let file = args.config.iter().cloned().map(Source::File);
     let changes = file.chain(args.set.iter().cloned().map(Source::Set)).chain(downscale).collect();
     let settings = origin.settings(changes)?;
+    let trained = origin.settings(vec![])?.scene.downscale;
+    let larger = f64::from(trained) / f64::from(settings.scene.downscale);
     let (mut anchors, mut weights) = model::files::load(&origin.model())?;
     let own = origin.scene().map(Path::new);
     let scene = args.scene.as_deref().or(own).with_context(|| {
@@ -112,7 +114,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let out = args.out.clone().unwrap_or_else(|| args.model.join("renders").join(args.views.name()));
     let background = settings.train.background.map(|channel| channel as f32);
     args.device.with_gpu(|gpu| {
-        let mut renderer = Renderer::new(gpu, &anchors, &weights, &settings.render, background)?;
+        let mut renderer = Renderer::new(gpu, &anchors, &weights, &settings.render, background)?.larger(larger);
         let style = ProgressStyle::with_template("{wide_bar} {pos}/{len} views, {eta} left")?;
         let bar = ProgressBar::new(cameras.len() as u64).with_style(style);
         for (name, camera) in &cameras {

@@ -1,24 +1,10 @@
 //! Gaussians as wide as the pixels they were trained with.
 //!
-//! In training every Gaussian is drawn with [`DILATION`] px^2 more variance (EWA splatting's low-pass), and a render is
-//! compared with pixels that are means over their squares. A Gaussian may therefore be as thin as it likes: where the
-//! pictures are small, many are needles. A viewer draws larger pictures and adds as many px^2 of its own, smaller, pixels:
-//! needles and holes would show. What is missing is added to the Gaussians themselves (as Mip-Splatting does in training, Yu et
-//! al. 2024): in px^2 of the training's pictures, drawn `k` times larger,
-//!
-//! `DILATION - 1/12 - DILATION / k^2`,
-//!
-//! 1/12 for the mean over a pixel's square, which the eye or a reduction takes, and the last for what the viewer adds. A
-//! picture of the viewer's, reduced to the training's size, is then the one that was trained.
+//! As [`crate::render::widen`], once and for all: a file's Gaussians are the same at every distance.
 
 use super::Cloud;
-use crate::math::camera::DILATION;
+use crate::render::widen::variance;
 use crate::scene::Camera;
-
-/// Variance to add for pictures `larger` times as large as the training's, in px^2 of those; 0 where they are hardly larger.
-pub fn variance(larger: f64) -> f64 {
-    (DILATION - 1.0 / 12.0 - DILATION / (larger * larger)).max(0.0)
-}
 
 /// Widens all Gaussians for pictures `larger` times as large as those of the `cameras`, which are in the cloud's axes. A
 /// pixel's size at a Gaussian is the mean over the cameras whose picture it lies in, of its square.
@@ -89,6 +75,7 @@ pub fn reduced(rgb: &[[f32; 3]], size: [u32; 2], times: u32) -> Vec<[f32; 3]> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::math::camera::DILATION;
 
     fn camera() -> Camera {
         Camera {
@@ -103,9 +90,6 @@ mod tests {
 
     #[test]
     fn pictures_as_large_as_the_trainings_need_nothing() {
-        assert_eq!((variance(1.0), variance(0.5)), (0.0, 0.0));
-        // Nothing of the viewer's own is left at any size.
-        assert!((variance(1e6) - (0.3 - 1.0 / 12.0)).abs() < 1e-9);
         let before = crate::export::tests::cloud(20, 0);
         let mut after = before.clone();
         widen(&mut after, &[camera()], 1.0);

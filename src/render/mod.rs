@@ -10,6 +10,7 @@ pub mod rasterize;
 pub mod slots;
 pub mod view;
 pub mod visible;
+pub mod widen;
 
 pub use config::Config;
 pub use method::Method;

@@ -6,6 +6,7 @@ use super::method::Method;
 use super::project::{Gaussians, Project};
 use super::rasterize::{self, Outputs, Picture, Projected};
 use super::visible::Visible;
+use super::widen;
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::model::anchors::Anchors;
 use crate::model::files;
@@ -51,6 +52,8 @@ pub struct Forward {
     pub project: Project,
     /// Tiles' lists.
     pub bin: Bin,
+    /// How many times larger the pictures are than those of the training: see [`widen`].
+    pub larger: f64,
     method: Method,
 }
 
@@ -72,6 +75,7 @@ impl Forward {
             decode: gpu.stage(stage::DECODE, || Decode::new(gpu, capacity.visible, offsets))?,
             project: gpu.stage(stage::PROJECT, || Project::new(gpu, capacity.visible, offsets))?,
             bin: gpu.stage(stage::BIN, || Bin::new(gpu, method, capacity.visible * offsets, capacity.pairs, size))?,
+            larger: 1.0,
             method,
         })
     }
@@ -121,6 +125,7 @@ impl Forward {
             visible: &self.visible.list,
         };
         self.decode.record(rec, model, &self.visible.count, camera.center());
+        widen::record(rec, &self.decode.existing, self.gaussians(), camera, self.larger);
         self.project.record(rec, &self.decode.existing, self.gaussians(), camera, near);
         self.bin.record(rec, self.projected(), camera.size, limits)
     }
@@ -175,6 +180,7 @@ pub struct Painter {
     background: [f32; 3],
     limits: Limits,
     capacity: Capacity,
+    larger: f64,
     stages: Option<(Forward, Picture)>,
 }
 
@@ -192,8 +198,15 @@ impl Painter {
             background,
             limits: Limits::new(gpu)?,
             capacity,
+            larger: 1.0,
             stages: None,
         })
+    }
+
+    /// For pictures so many times larger than those of the training.
+    #[must_use]
+    pub fn larger(self, larger: f64) -> Self {
+        Self { larger, ..self }
     }
 
     /// Renders one view; buffers grow as it needs.
@@ -223,8 +236,9 @@ impl Painter {
                     drop(old);
                     let pixels = camera.size[0] as usize * camera.size[1] as usize;
                     let offsets = model.anchors.offsets;
+                    let forward = Forward::new(&self.gpu, self.capacity, offsets, self.method, camera.size, self.cull)?;
                     (
-                        Forward::new(&self.gpu, self.capacity, offsets, self.method, camera.size, self.cull)?,
+                        Forward { larger: self.larger, ..forward },
                         Picture::new(&self.gpu, camera.size, pixels, Outputs::Transmittance)?,
                     )
                 }
@@ -287,6 +301,12 @@ impl Renderer {
         let anchors = Anchors::upload(gpu, anchors, 0)?;
         let painter = Painter::new(gpu, config, background, Capacity::guess(anchors.count))?;
         Ok(Self { painter, anchors, weights })
+    }
+
+    /// For pictures so many times larger than those of the training.
+    #[must_use]
+    pub fn larger(self, larger: f64) -> Self {
+        Self { painter: self.painter.larger(larger), ..self }
     }
 
     /// Renders one view; buffers grow as it needs.

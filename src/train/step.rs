@@ -295,7 +295,10 @@ impl Step {
     pub fn glance(&self, camera: &Camera) -> Result<Option<Rendered>, Error> {
         self.gpu.stage(stage::EVALUATION, || {
             let capacity = Capacity { anchors: self.anchors.capacity, ..self.capacity };
-            let mut painter = Painter::new(&self.gpu, &self.config.render, self.background, capacity)?;
+            let longest = |size: &[u32; 2]| f64::from(size[0].max(size[1]));
+            let trained = self.plan.sizes.iter().map(longest).fold(1.0, f64::max);
+            let painter = Painter::new(&self.gpu, &self.config.render, self.background, capacity)?;
+            let mut painter = painter.larger(longest(&camera.size) / trained);
             let model = Model { anchors: &self.anchors, weights: &self.weights.value };
             painter.render_within(model, camera, capacity.pairs.max(1 << 20).saturating_mul(4))
         })
