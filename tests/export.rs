@@ -12,7 +12,7 @@ use assert_cmd::cargo::cargo_bin_cmd;
 use gscream_vk::evaluate::psnr;
 use gscream_vk::export::activate::Static;
 use gscream_vk::export::draw::Drawer;
-use gscream_vk::export::{self, Cloud, gltf, ply, sigmoid, spz};
+use gscream_vk::export::{self, Cloud, gltf, low_pass, ply, sigmoid, spz};
 use gscream_vk::gpu::testing;
 use gscream_vk::math::harmonics::{HALF_TURN_ABOUT_X, coefficients};
 use gscream_vk::render::Config;
@@ -239,9 +239,16 @@ fn a_run_becomes_files_of_the_same_scene() {
     for file in figures["files"].as_array().expect("files") {
         assert!(file["photographs"]["mask"]["ssim"].is_f64(), "masked figures are there: {file}");
         let psnr = file["anchors"]["full"]["psnr"].as_f64().expect("a figure");
-        // Pruning and packing cost little beside the refinement itself.
+        // On larger pixels' means what was trained with points between them.
+        assert!(psnr > 30.0, "{file}");
+    }
+    // Of pictures no larger than the training's: pruning and packing cost little beside the refinement itself.
+    succeeds(folder, "export run --views 12 --steps 200 --screen 80 --out narrow");
+    for file in json(&folder.join("narrow/export.json"))["files"].as_array().expect("files") {
+        let psnr = file["anchors"]["full"]["psnr"].as_f64().expect("a figure");
         assert!(psnr > loss("refined") - 0.5, "{file}");
     }
+    four_times_as_large(folder);
     // The built-in scene's up is -y in the file: the cameras stand upright.
     for camera in figures["cameras"].as_array().expect("cameras") {
         let down = camera["rotation"][1].as_array().expect("an axis")[1].as_f64().expect("a number");
@@ -252,6 +259,31 @@ fn a_run_becomes_files_of_the_same_scene() {
     assert!(fs::read(folder.join("again/scene.ply")).expect("a file") == read("scene.ply"), "not the same bytes");
     succeeds(folder, "export run --views 2 --steps 0 --up keep --degree 1 --formats ply --out kept");
     assert_eq!(json(&folder.join("kept/export.json"))["rotation"][0], serde_json::json!([1.0, 0.0, 0.0]));
+}
+
+/// A picture four times as large shows what was trained, where Gaussians as narrow as trained show needles and holes.
+fn four_times_as_large(folder: &Path) {
+    let gpu = testing::gpu();
+    let scene = scene::load(&folder.join("scene"), &scene::Config::default()).expect("a scene");
+    let camera = scene.train[0].camera;
+    let large = camera.scaled(camera.size.map(|n| 4 * n));
+    let drawn = |out: &str, screen: u32, camera: &Camera| {
+        let options = format!("--views 12 --steps 200 --up keep --formats ply --screen {screen}");
+        succeeds(folder, &format!("export run {options} --out {out}"));
+        let cloud = ply::decode(&fs::read(folder.join(out).join("scene.ply")).expect("a file")).expect("our own file");
+        let gaussians = Static::upload(&gpu, &cloud).expect("room");
+        let mut drawer = Drawer::new(&gpu, gaussians, &Config::default(), [0.0; 3]).expect("room");
+        drawer.draw(camera).expect("a picture")
+    };
+    let trained = drawn("as_trained", 1, &camera);
+    let off = |large_picture: Vec<[f32; 3]>| {
+        let small = low_pass::reduced(&large_picture, large.size, 4);
+        let values = small.as_flattened().iter().zip(trained.as_flattened());
+        psnr(values.map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>() / (3 * small.len()) as f64)
+    };
+    let (narrow, wide) = (off(drawn("as_trained", 1, &large)), off(drawn("wide", 320, &large)));
+    println!("drawn four times as large: {narrow:.2} dB as trained, {wide:.2} dB widened");
+    assert!(wide > narrow + 3.0, "{narrow:.2} dB, {wide:.2} dB");
 }
 
 /// A file system that takes no more looks like a limit on the size of files.

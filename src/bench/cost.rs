@@ -286,6 +286,13 @@ pub const TABLE: &[Formula] = &[
         },
     },
     Formula {
+        pass: "render/widen",
+        variants: &[],
+        derivation: "per Gaussian that exists its place in the list 4, position 12, scale read and written 24 B; depth 5, three \
+                     squares, sums and roots 10 operations",
+        work: |c, _| work(40.0 * c.gaussians, 15.0 * c.gaussians, 0.0),
+    },
+    Formula {
         pass: "render/project",
         variants: &[],
         derivation: "per Gaussian that exists its place in the list 4, position 12, scale 12, rotation 16, mean 8, covariance 12, \

@@ -48,17 +48,6 @@ pub fn measured(larger: f64) -> u32 {
     (larger.round() as u32).clamp(1, 4)
 }
 
-/// The same view on `times` as many pixels each way.
-pub fn enlarged(camera: &Camera, times: u32) -> Camera {
-    let factor = times as f32;
-    Camera {
-        focal: camera.focal.map(|f| f * factor),
-        principal: camera.principal.map(|c| c * factor),
-        size: camera.size.map(|n| n * times),
-        ..*camera
-    }
-}
-
 /// Means over squares of `times` by `times` pixels of a picture that is `size` (width, height) pixels large.
 pub fn reduced(rgb: &[[f32; 3]], size: [u32; 2], times: u32) -> Vec<[f32; 3]> {
     let [width, times] = [size[0] as usize, times as usize];
@@ -124,8 +113,6 @@ mod tests {
 
     #[test]
     fn a_larger_picture_is_reduced_to_its_means() {
-        let large = enlarged(&camera(), 3);
-        assert_eq!((large.size, large.focal, large.principal), ([300, 240], [150.0; 2], [150.0, 120.0]));
         let ramp: Vec<[f32; 3]> = (0..6 * 4).map(|i| [(i % 6) as f32, (i / 6) as f32, 1.0]).collect();
         let small = reduced(&ramp, [6, 4], 2);
         assert_eq!((small.len(), small[0], small[5]), (6, [0.5, 0.5, 1.0], [4.5, 2.5, 1.0]));

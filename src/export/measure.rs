@@ -121,7 +121,7 @@ impl Yardstick {
 
     fn of_drawing(&self, drawer: &mut Drawer, times: u32) -> Result<Loss, Error> {
         let draw = |pose: &Pose| {
-            let large = low_pass::enlarged(&pose.camera, times);
+            let large = pose.camera.scaled(pose.camera.size.map(|n| n * times));
             Ok(to_rgb8(pose.camera.size, &low_pass::reduced(&drawer.draw(&large)?, large.size, times)))
         };
         let pictures: Vec<RgbImage> = self.poses.iter().map(draw).collect::<Result<_, Error>>()?;
