@@ -12,6 +12,7 @@ pub mod bench;
 pub mod capture;
 pub mod cli;
 pub mod config;
+pub mod cost;
 pub mod densify;
 pub mod evaluate;
 pub mod export;

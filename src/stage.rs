@@ -1,5 +1,7 @@
 //! The stages of a run by name: passes and buffers say which one they belong to, and `plan` lists them.
 
+use crate::losses::Term;
+
 /// Training pictures and depth priors.
 pub const PICTURES: &str = "pictures";
 /// Anchors and decoders, with the optimiser's moments.
@@ -16,12 +18,6 @@ pub const PROJECT: &str = "project";
 pub const BIN: &str = "bin";
 /// The picture.
 pub const RASTERIZE: &str = "rasterize";
-/// The colour losses.
-pub const PHOTOMETRIC: &str = "photometric";
-/// The depth's alignment and L1 loss.
-pub const DEPTH: &str = "depth";
-/// The multi-scale gradient of the depth difference.
-pub const DEPTH_GRADIENT: &str = "depth gradient";
 /// Back from the picture to the picture plane.
 pub const RASTERIZE_BACKWARD: &str = "rasterize backward";
 /// Back from the picture plane to the Gaussians.
@@ -41,26 +37,25 @@ pub const EVALUATION: &str = "evaluation";
 /// What the loop itself needs: uploads, counters, figures on their way to the host.
 pub const RUN: &str = crate::gpu::ledger::NO_STAGE;
 
-/// All, in the order of a step.
-pub const ALL: [&str; 20] = [
-    PICTURES,
-    MODEL,
-    CULL,
-    ATTENTION,
-    DECODE,
-    PROJECT,
-    BIN,
-    RASTERIZE,
-    PHOTOMETRIC,
-    DEPTH,
-    DEPTH_GRADIENT,
-    RASTERIZE_BACKWARD,
-    PROJECT_BACKWARD,
-    DECODE_BACKWARD,
-    SENTINEL,
-    STATISTICS,
-    OPTIMIZER,
-    GROWTH,
-    EVALUATION,
-    RUN,
-];
+/// Before the losses.
+const FORWARD: [&str; 8] = [PICTURES, MODEL, CULL, ATTENTION, DECODE, PROJECT, BIN, RASTERIZE];
+/// After them.
+const BACKWARD: [&str; 9] =
+    [RASTERIZE_BACKWARD, PROJECT_BACKWARD, DECODE_BACKWARD, SENTINEL, STATISTICS, OPTIMIZER, GROWTH, EVALUATION, RUN];
+
+/// All, in the order of a step; the losses' are those of [`Term::ALL`].
+pub const ALL: [&str; FORWARD.len() + Term::ALL.len() + BACKWARD.len()] = {
+    let mut all = [RUN; FORWARD.len() + Term::ALL.len() + BACKWARD.len()];
+    let mut i = 0;
+    while i < all.len() {
+        all[i] = if i < FORWARD.len() {
+            FORWARD[i]
+        } else if i < FORWARD.len() + Term::ALL.len() {
+            Term::ALL[i - FORWARD.len()].stage
+        } else {
+            BACKWARD[i - FORWARD.len() - Term::ALL.len()]
+        };
+        i += 1;
+    }
+    all
+};

@@ -7,6 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use gscream_vk::config::{Settings, Source};
 use gscream_vk::gpu::{Entry, Gpu, Options, Schedule, testing};
+use gscream_vk::losses::{depth_gradient, depth_l1};
 use gscream_vk::scene::{self, Scene};
 use gscream_vk::stage;
 use gscream_vk::train::forecast::{self, Forecast, Question, Survey};
@@ -65,17 +66,19 @@ fn rehearsed(gpu: &Gpu, scene: &Scene, settings: &Settings) -> Forecast {
 }
 
 /// Where the kernels and the buffers of optional stages show: the start of their names, and whose they are.
+const DEPTH: &str = depth_l1::TERM.stage;
+const DEPTH_GRADIENT: &str = depth_gradient::TERM.stage;
 const MARKS: [(&str, &str); 13] = [
-    ("losses/align", stage::DEPTH),
-    ("losses/depth_l1", stage::DEPTH),
-    ("losses/depth_gradient", stage::DEPTH_GRADIENT),
+    ("losses/align", DEPTH),
+    ("losses/depth_l1", DEPTH),
+    ("losses/depth_gradient", DEPTH_GRADIENT),
     ("model/attention", stage::ATTENTION),
     ("densify/statistics", stage::STATISTICS),
     ("densify/grow", stage::GROWTH),
     ("densify/prune", stage::GROWTH),
-    ("prior", stage::DEPTH),
-    ("depth_map", stage::DEPTH),
-    ("pair_depth", stage::DEPTH),
+    ("prior", DEPTH),
+    ("depth_map", DEPTH),
+    ("pair_depth", DEPTH),
     ("attention_", stage::ATTENTION),
     ("accumulated_gradient", stage::STATISTICS),
     ("candidate_flags", stage::GROWTH),
@@ -94,7 +97,7 @@ fn every_combination_has_what_it_needs_and_nothing_else() {
         assert_eq!(plan.references, Vec::from_iter(reference.then_some(3)), "{wanted:?}");
         let present = |name: &str| match name {
             stage::ATTENTION => wanted.attention && wanted.masks,
-            stage::DEPTH | stage::DEPTH_GRADIENT => wanted.priors,
+            DEPTH | DEPTH_GRADIENT => wanted.priors,
             stage::STATISTICS | stage::GROWTH => wanted.growth,
             stage::EVALUATION => wanted.tests,
             _ => true,

@@ -8,57 +8,16 @@
 //!   Addresses, loops and what padding repeats do not count. What is common to a column of pixels counts per pixel.
 //! - **exponentials**: one for each exponential or logarithm, and nothing else for those.
 //!
-//! To add a pass: a line in [`TABLE`] with its name, its variants, the derivation and the formula. A pass of a step without
-//! one fails the tests, and is shown by `bench` without a floor.
+//! To add a pass: a line in [`TABLE`] with its name, its variants, the derivation and the formula; those of the losses
+//! stand in the losses' own files. A pass of a step without one fails the tests, and is shown by `bench` without a floor.
 
-use serde::{Deserialize, Serialize};
-
-use super::counts::Counts;
-use crate::gpu::Access;
+use crate::cost::{Counts, Formula, if_so, work};
+pub use crate::cost::{Dispatch, Work};
 use crate::gpu::form::without_form;
 use crate::math::attention::WEIGHTS as ATTENTION_WEIGHTS;
 use crate::math::decoder::Layout;
 
-/// What a pass has to do.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Work {
-    /// Bytes read and written.
-    pub bytes: f64,
-    /// Operations.
-    pub operations: f64,
-    /// Exponentials and logarithms.
-    pub exponentials: f64,
-}
-
-impl std::ops::AddAssign for Work {
-    fn add_assign(&mut self, other: Self) {
-        self.bytes += other.bytes;
-        self.operations += other.operations;
-        self.exponentials += other.exponentials;
-    }
-}
-
-/// A pass as it was recorded.
-#[derive(Clone, Copy)]
-pub struct Dispatch<'a> {
-    /// `folder/stem`, or `fill`, `copy`.
-    pub name: &'a str,
-    /// The buffers' names, in the order of the bindings.
-    pub accesses: &'a [(&'static str, Access)],
-    /// Bytes of the buffer of such a name.
-    pub bytes: &'a dyn Fn(&str) -> f64,
-}
-
 impl Dispatch<'_> {
-    /// Whether a word is part of the variant's name.
-    fn is(&self, word: &str) -> bool {
-        self.name.split('_').any(|part| part == word)
-    }
-
-    fn buffer(&self, binding: usize) -> &'static str {
-        self.accesses.get(binding).map_or("", |(name, _)| *name)
-    }
-
     /// Items of a primitive, by the name of the buffer that its first binding counts them in.
     fn items(&self, c: &Counts) -> f64 {
         match self.buffer(0) {
@@ -131,33 +90,12 @@ impl Counts {
     }
 }
 
-/// A line of the table.
-pub struct Formula {
-    /// `folder/stem` of the kernel.
-    pub pass: &'static str,
-    /// Its variants that the formula is right for as well.
-    pub variants: &'static [&'static str],
-    /// How the numbers come about.
-    pub derivation: &'static str,
-    /// The numbers.
-    pub work: fn(&Counts, &Dispatch<'_>) -> Work,
-}
-
-fn work(bytes: f64, operations: f64, exponentials: f64) -> Work {
-    Work { bytes, operations, exponentials }
-}
-
-/// 1 where the pass has it.
-fn if_so(yes: bool) -> f64 {
-    f64::from(u8::from(yes))
-}
-
 /// Gaussians that overlap a pixel are read once for all of it: mean 8, conic 12, opacity 4, colour 12, depth 4 bytes.
 fn splat_bytes(with_depth: bool) -> f64 {
     36.0 + 4.0 * if_so(with_depth)
 }
 
-/// Every pass of a step.
+/// Every pass of a step but the losses'.
 pub const TABLE: &[Formula] = &[
     Formula {
         pass: "fill",
@@ -558,104 +496,6 @@ pub const TABLE: &[Formula] = &[
         },
     },
     Formula {
-        pass: "losses/frame",
-        variants: &["masked", "masked_depth"],
-        derivation: "per pixel picture 4, target 12 B, 9 operations; with masks a weight 4 B and 3, with depth the prior and three more 16 B and 9",
-        work: |c, d| {
-            let (masked, depth) = (if_so(d.is("masked")), if_so(d.is("depth")));
-            work((16.0 + 4.0 * masked + 16.0 * depth) * c.pixels, (9.0 + 3.0 * masked + 9.0 * depth) * c.pixels, 0.0)
-        },
-    },
-    Formula {
-        pass: "losses/photometric_rows",
-        variants: &["outside", "wide", "outside_wide"],
-        derivation: "per pixel rgb twice 24, moments 48 B, with weights 4; per channel difference and terms 8, window 11 x 4, \
-                     variances 10 operations",
-        work: |c, d| work((72.0 + 4.0 * if_so(d.is("outside"))) * c.pixels, 3.0 * 62.0 * c.pixels, 0.0),
-    },
-    Formula {
-        pass: "losses/photometric_columns",
-        variants: &["weighted"],
-        derivation: "per pixel moments 48, their gradient 36 B, with weights 4; per channel terms 8, window 11 x 4, SSIM and its \
-                     derivatives 48 operations",
-        work: |c, d| work((84.0 + 4.0 * if_so(d.is("weighted"))) * c.pixels, 3.0 * 100.0 * c.pixels, 0.0),
-    },
-    Formula {
-        pass: "losses/photometric_adjoint",
-        variants: &[],
-        derivation: "per pixel 36 B read and 36 written; per channel a window of 11 x 3 operations",
-        work: |c, _| work(72.0 * c.pixels, 3.0 * 33.0 * c.pixels, 0.0),
-    },
-    Formula {
-        pass: "losses/photometric_gradient",
-        variants: &["weighted", "weighted_outside", "l1", "l1_weighted"],
-        derivation: "per pixel rgb, target and gradient 36 B, 18 operations for L1; with SSIM 36 B and per channel a window of 11 x 3 \
-                     and 5 operations more; with weights 4 B",
-        work: |c, d| {
-            let ssim = if_so(!d.is("l1"));
-            let bytes = 36.0 + 36.0 * ssim + 4.0 * if_so(d.is("weighted"));
-            work(bytes * c.pixels, (18.0 + 3.0 * 38.0 * ssim) * c.pixels, 0.0)
-        },
-    },
-    Formula {
-        pass: "losses/align_means",
-        variants: &["masked"],
-        derivation: "per pixel depth and prior 8 B, with a mask 4; 6 operations",
-        work: |c, d| work((8.0 + 4.0 * if_so(d.is("masked"))) * c.pixels, 6.0 * c.pixels, 0.0),
-    },
-    Formula {
-        pass: "losses/align_moments",
-        variants: &["masked"],
-        derivation: "per pixel depth and prior 8 B, with a mask 4; 13 operations",
-        work: |c, d| work((8.0 + 4.0 * if_so(d.is("masked"))) * c.pixels, 13.0 * c.pixels, 0.0),
-    },
-    Formula {
-        pass: "losses/align_fit",
-        variants: &[],
-        derivation: "7 sums read, 11 values written: 72 B; 45 operations",
-        work: |_, _| work(72.0, 45.0, 0.0),
-    },
-    Formula {
-        pass: "losses/align_backward",
-        variants: &[],
-        derivation: "per pixel gradient and depth 8 B; 6 operations",
-        work: |c, _| work(8.0 * c.pixels, 6.0 * c.pixels, 0.0),
-    },
-    Formula {
-        pass: "losses/align_gradient",
-        variants: &["masked"],
-        derivation: "per pixel gradient, depth, prior and result 16 B, with a mask 4; 15 operations",
-        work: |c, d| work((16.0 + 4.0 * if_so(d.is("masked"))) * c.pixels, 15.0 * c.pixels, 0.0),
-    },
-    Formula {
-        pass: "losses/depth_l1",
-        variants: &["weighted"],
-        derivation: "per pixel depth, prior, difference and gradient 16 B, with weights 4; 10 operations",
-        work: |c, d| work((16.0 + 4.0 * if_so(d.is("weighted"))) * c.pixels, 10.0 * c.pixels, 0.0),
-    },
-    Formula {
-        pass: "losses/depth_gradient",
-        variants: &["masked"],
-        derivation: "per pixel difference 4 and gradient read and written 8 B, with a mask 4; 4 operations, and 26 per scale that \
-                     has the pixel (four neighbours of 4, loss 8, sum 2): 1, 1/4, 1/16, ... of all",
-        work: |c, d| {
-            let scales: f64 = (0..c.gradient_scales as i32).map(|s| 0.25f64.powi(s)).sum();
-            work((12.0 + 4.0 * if_so(d.is("masked"))) * c.pixels, (4.0 + 26.0 * scales) * c.pixels, 0.0)
-        },
-    },
-    Formula {
-        pass: "losses/depth_gradient_counts",
-        variants: &[],
-        derivation: "per pixel its mask 4 B; per scale a comparison, a selection and an addition",
-        work: |c, _| work(4.0 * c.pixels, 3.0 * c.gradient_scales * c.pixels, 0.0),
-    },
-    Formula {
-        pass: "losses/sum",
-        variants: &[],
-        derivation: "the partial sums, all that there is room for, read and added",
-        work: |_, d| work((d.bytes)(d.buffer(0)), (d.bytes)(d.buffer(0)) / 4.0, 0.0),
-    },
-    Formula {
         pass: "model/attention_select",
         variants: &[],
         derivation: "per visible anchor its number 4, position 12, mask 4, key 4, value 4 B and 72 operations (camera 21, in front 8, \
@@ -782,10 +622,15 @@ pub fn of(counts: &Counts, dispatch: &Dispatch<'_>) -> Option<Work> {
     [work.bytes, work.operations, work.exponentials].iter().all(|v| v.is_finite()).then_some(work)
 }
 
+/// Every pass of a step.
+pub fn all() -> impl Iterator<Item = &'static Formula> {
+    TABLE.iter().chain(crate::losses::costs())
+}
+
 /// The line of the table for a pass. A form for CPU drivers without a line of its own has the other form's.
 pub fn formula(name: &str) -> Option<&'static Formula> {
     let line = |name: &str| {
-        TABLE.iter().find(|f| {
+        all().find(|f| {
             name == f.pass
                 || name
                     .strip_prefix(f.pass)

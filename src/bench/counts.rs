@@ -3,98 +3,12 @@
 use std::collections::BTreeMap;
 
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 
+pub use crate::cost::Counts;
 use crate::gpu::form::without_form;
 use crate::gpu::{Entry, Schedule};
 use crate::render::bin::Tiling;
 use crate::render::method::Method;
-
-/// The step's numbers; means over its views where there are several.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Counts {
-    /// Anchors.
-    pub anchors: f64,
-    /// Gaussians per anchor.
-    pub offsets: f64,
-    /// Anchors in view.
-    pub visible: f64,
-    /// Gaussians of these that exist.
-    pub gaussians: f64,
-    /// Gaussians that touch a tile.
-    pub drawn: f64,
-    /// (Gaussian, tile) pairs.
-    pub pairs: f64,
-    /// Pairs up to where their tile ends: behind the last Gaussian that any of its pixels still sees.
-    pub evaluated: f64,
-    /// These times the pixels of their tile.
-    pub samples: f64,
-    /// Samples that changed a pixel.
-    pub blended: f64,
-    /// Pairs with such a sample; 0 in records of versions that did not count them.
-    #[serde(default)]
-    pub seen: f64,
-    /// Pixels.
-    pub pixels: f64,
-    /// Tiles.
-    pub tiles: f64,
-    /// Side of a tile, pixels.
-    pub tile_side: f64,
-    /// Tokens of each side of the attention.
-    pub tokens: f64,
-    /// Scales of the depth gradient.
-    pub gradient_scales: f64,
-}
-
-impl Counts {
-    fn fields(&mut self) -> [&mut f64; 15] {
-        let Self {
-            anchors,
-            offsets,
-            visible,
-            gaussians,
-            drawn,
-            pairs,
-            evaluated,
-            samples,
-            blended,
-            seen,
-            pixels,
-            tiles,
-            tile_side,
-            tokens,
-            gradient_scales,
-        } = self;
-        [
-            anchors,
-            offsets,
-            visible,
-            gaussians,
-            drawn,
-            pairs,
-            evaluated,
-            samples,
-            blended,
-            seen,
-            pixels,
-            tiles,
-            tile_side,
-            tokens,
-            gradient_scales,
-        ]
-    }
-
-    /// The mean of some.
-    pub fn mean(mut all: Vec<Self>) -> Self {
-        let (mut sum, number) = (Self::default(), all.len().max(1) as f64);
-        for counts in &mut all {
-            for (sum, value) in sum.fields().into_iter().zip(counts.fields()) {
-                *sum += *value / number;
-            }
-        }
-        sum
-    }
-}
 
 /// The buffers that are read back.
 pub const WANTED: [&str; 12] = [

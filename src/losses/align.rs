@@ -4,6 +4,7 @@
 //! The sums are taken in trees and in two passes, means first and moments about them: with one pass of plain moments the
 //! determinant would lose `mean^2 / variance` of its digits.
 
+use crate::cost::{Formula, if_so, work};
 use crate::gpu::kernels::losses::{
     align_backward, align_fit, align_gradient, align_gradient_masked, align_means, align_means_masked, align_moments,
     align_moments_masked,
@@ -12,6 +13,40 @@ use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::math::align::{Fit, alignable, alignable_slope, unit};
 
 use super::sum;
+
+/// What the passes have to do.
+pub(super) const COSTS: &[Formula] = &[
+    Formula {
+        pass: "losses/align_means",
+        variants: &["masked"],
+        derivation: "per pixel depth and prior 8 B, with a mask 4; 6 operations",
+        work: |c, d| work((8.0 + 4.0 * if_so(d.is("masked"))) * c.pixels, 6.0 * c.pixels, 0.0),
+    },
+    Formula {
+        pass: "losses/align_moments",
+        variants: &["masked"],
+        derivation: "per pixel depth and prior 8 B, with a mask 4; 13 operations",
+        work: |c, d| work((8.0 + 4.0 * if_so(d.is("masked"))) * c.pixels, 13.0 * c.pixels, 0.0),
+    },
+    Formula {
+        pass: "losses/align_fit",
+        variants: &[],
+        derivation: "7 sums read, 11 values written: 72 B; 45 operations",
+        work: |_, _| work(72.0, 45.0, 0.0),
+    },
+    Formula {
+        pass: "losses/align_backward",
+        variants: &[],
+        derivation: "per pixel gradient and depth 8 B; 6 operations",
+        work: |c, _| work(8.0 * c.pixels, 6.0 * c.pixels, 0.0),
+    },
+    Formula {
+        pass: "losses/align_gradient",
+        variants: &["masked"],
+        derivation: "per pixel gradient, depth, prior and result 16 B, with a mask 4; 15 operations",
+        work: |c, d| work((16.0 + 4.0 * if_so(d.is("masked"))) * c.pixels, 15.0 * c.pixels, 0.0),
+    },
+];
 
 /// Pixels of a workgroup that sums over pixels: RUN in the kernels times 64.
 const GROUP_PIXELS: usize = 8 * 64;

@@ -2,11 +2,42 @@
 //! `1 / sum(mask) sum |grad(mask d)|` over every 2^s-th pixel of every 2^s-th line, d = aligned - prior. A scale without
 //! a valid pixel counts nothing.
 
+use super::Term;
+use crate::cost::{Formula, if_so, work};
 use crate::gpu::kernels::losses::{depth_gradient, depth_gradient_counts, depth_gradient_masked};
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 
 use super::align::{groups, partial_sums, threads};
 use super::sum;
+
+/// As reports and plans know it.
+pub const TERM: Term = Term {
+    name: "depth_gradient",
+    stage: "depth gradient",
+    planned: |plan| plan.depth && plan.gradient_scales > 0,
+    left_out: &["depth gradient", "depth map, its gradient, alignment and depth losses"],
+    costs: COSTS,
+};
+
+/// What the passes have to do.
+pub(super) const COSTS: &[Formula] = &[
+    Formula {
+        pass: "losses/depth_gradient",
+        variants: &["masked"],
+        derivation: "per pixel difference 4 and gradient read and written 8 B, with a mask 4; 4 operations, and 26 per scale that \
+                     has the pixel (four neighbours of 4, loss 8, sum 2): 1, 1/4, 1/16, ... of all",
+        work: |c, d| {
+            let scales: f64 = (0..c.gradient_scales as i32).map(|s| 0.25f64.powi(s)).sum();
+            work((12.0 + 4.0 * if_so(d.is("masked"))) * c.pixels, (4.0 + 26.0 * scales) * c.pixels, 0.0)
+        },
+    },
+    Formula {
+        pass: "losses/depth_gradient_counts",
+        variants: &[],
+        derivation: "per pixel its mask 4 B; per scale a comparison, a selection and an addition",
+        work: |c, _| work(4.0 * c.pixels, 3.0 * c.gradient_scales * c.pixels, 0.0),
+    },
+];
 
 /// The kernels' largest number of scales.
 pub const MAX_SCALES: u32 = 8;

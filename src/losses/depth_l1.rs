@@ -1,12 +1,31 @@
 //! Weighted L1 between the aligned rendered depth and the prior (GScream, equation 5): `1 / (W H) sum weight |d|` with
 //! d = aligned - prior.
 
+use super::Term;
+use crate::cost::{Formula, if_so, work};
 use crate::gpu::kernels::losses::{depth_l1, depth_l1_weighted};
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::math::align::{Fit, alignable};
 
 use super::align::{Prior, groups, partial_sums, threads};
 use super::sum;
+
+/// As reports and plans know it.
+pub const TERM: Term = Term {
+    name: "depth_l1",
+    stage: "depth",
+    planned: |plan| plan.depth,
+    left_out: &["depth map, its gradient, alignment and depth losses"],
+    costs: COSTS,
+};
+
+/// What the passes have to do.
+pub(super) const COSTS: &[Formula] = &[Formula {
+    pass: "losses/depth_l1",
+    variants: &["weighted"],
+    derivation: "per pixel depth, prior, difference and gradient 16 B, with weights 4; 10 operations",
+    work: |c, d| work((16.0 + 4.0 * if_so(d.is("weighted"))) * c.pixels, 10.0 * c.pixels, 0.0),
+}];
 
 struct Inputs<'a> {
     rendered: &'a [f32],

@@ -1,7 +1,19 @@
 //! The step's photograph and what its mask says, from 8 bits per channel to the arrays that the losses read.
 
+use crate::cost::{Formula, if_so, work};
 use crate::gpu::kernels::losses::{frame, frame_masked, frame_masked_depth};
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
+
+/// What the passes have to do.
+pub(super) const COSTS: &[Formula] = &[Formula {
+    pass: "losses/frame",
+    variants: &["masked", "masked_depth"],
+    derivation: "per pixel picture 4, target 12 B, 9 operations; with masks a weight 4 B and 3, with depth the prior and three more 16 B and 9",
+    work: |c, d| {
+        let (masked, depth) = (if_so(d.is("masked")), if_so(d.is("depth")));
+        work((16.0 + 4.0 * masked + 16.0 * depth) * c.pixels, (9.0 + 3.0 * masked + 9.0 * depth) * c.pixels, 0.0)
+    },
+}];
 
 /// A word of a resident picture. `mask` is 0 outside and up to 255 inside, see [`Weights`].
 pub fn pack([r, g, b]: [u8; 3], mask: u8) -> u32 {

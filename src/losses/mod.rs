@@ -1,7 +1,7 @@
 //! What a render is compared with: the photograph, and the view's depth prior.
 //!
-//! To add a loss: one `.comp`, one `.rs` beside it, and here its module, its [`Term`] and its call in
-//! [`Losses::forward_backward`].
+//! To add a loss: one `.comp`, one `.rs` beside it with its [`Term`] (name, stage, when a run has it, what its passes have to
+//! do), and here its module, its line in [`Term::ALL`] and its call in [`Losses::compare`].
 
 pub mod align;
 pub mod config;
@@ -13,35 +13,46 @@ pub mod photometric;
 pub use config::Config;
 mod sum;
 
+use crate::cost::Formula;
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
-use crate::stage;
 
 pub use align::Quantity;
 pub use frame::{NO_PRIOR, Rectangle, Weights, pack};
 
-/// The terms of the loss, by their place in [`Losses::terms`]. Their sum is what a step minimises: each carries its weight.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Term {
-    /// L1 and SSIM of the picture.
-    Photometric,
-    /// L1 of the aligned depth.
-    DepthL1,
-    /// Multi-scale gradient of the depth difference.
-    DepthGradient,
+/// A term of the loss, as its own file declares it. Their sum is what a step minimises: each carries its weight.
+#[derive(Clone, Copy, Debug)]
+pub struct Term {
+    /// As reports spell it.
+    pub name: &'static str,
+    /// Its stage of a step; terms may share one.
+    pub stage: &'static str,
+    /// Whether a run has it.
+    pub planned: fn(&Plan) -> bool,
+    /// What a plan that leaves it out calls it, the nearest first.
+    pub left_out: &'static [&'static str],
+    /// What its passes have to do.
+    costs: &'static [Formula],
 }
 
 impl Term {
-    /// All, in their order.
-    pub const ALL: [Self; 3] = [Self::Photometric, Self::DepthL1, Self::DepthGradient];
+    /// All, by their place in [`Losses::terms`].
+    pub const ALL: [Self; 3] = [photometric::TERM, depth_l1::TERM, depth_gradient::TERM];
 
-    /// As reports spell it.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Photometric => "photometric",
-            Self::DepthL1 => "depth_l1",
-            Self::DepthGradient => "depth_gradient",
-        }
+    /// The one with this stage, the last of several.
+    pub fn of_stage(stage: &str) -> Option<Self> {
+        Self::ALL.into_iter().rfind(|term| term.stage == stage)
     }
+
+    /// Its place in [`Losses::terms`].
+    fn slot(self) -> u32 {
+        Self::ALL.iter().position(|term| term.name == self.name).expect("all are listed") as u32
+    }
+}
+
+/// What the passes of all losses have to do.
+pub fn costs() -> impl Iterator<Item = &'static Formula> {
+    let shared = [frame::COSTS, align::COSTS, sum::COSTS];
+    shared.into_iter().chain(Term::ALL.map(|term| term.costs)).flatten()
 }
 
 /// Which losses a run has: what is not planned has no pass and no buffer.
@@ -127,7 +138,7 @@ impl Losses {
     pub fn new(gpu: &Gpu, plan: &Plan) -> Result<Self, Error> {
         let Plan { size, masks, gradient_scales: scales, .. } = *plan;
         let gradient =
-            || gpu.stage(stage::DEPTH_GRADIENT, || depth_gradient::DepthGradient::new(gpu, size, scales, masks));
+            || gpu.stage(depth_gradient::TERM.stage, || depth_gradient::DepthGradient::new(gpu, size, scales, masks));
         let depth = || -> Result<Depth, Error> {
             Ok(Depth {
                 align: align::Align::new(gpu, size)?,
@@ -135,11 +146,11 @@ impl Losses {
                 gradient: if scales > 0 { Some(gradient()?) } else { None },
             })
         };
-        gpu.stage(stage::PHOTOMETRIC, || {
+        gpu.stage(photometric::TERM.stage, || {
             Ok(Self {
                 frame: frame::Frame::new(gpu, size, masks, plan.depth)?,
                 photometric: photometric::Photometric::new(gpu, size, plan.ssim_weight, plan.ssim_across_masks)?,
-                depth: if plan.depth { Some(gpu.stage(stage::DEPTH, depth)?) } else { None },
+                depth: if plan.depth { Some(gpu.stage(depth_l1::TERM.stage, depth)?) } else { None },
                 terms: gpu.buffer("losses", Term::ALL.len())?,
             })
         })
@@ -155,7 +166,7 @@ impl Losses {
         rgb: &Buffer<[f32; 3]>,
         depth: Option<&Buffer<f32>>,
     ) -> Gradients<'_> {
-        rec.stage(stage::PHOTOMETRIC);
+        rec.stage(photometric::TERM.stage);
         self.frame.forward(rec, view.picture, view.weights, view.depth.map(|d| (d.weights, d.rectangle, d.prior)));
         self.compare(rec, view.depth, rgb, depth)
     }
@@ -174,25 +185,25 @@ impl Losses {
         depth: Option<&Buffer<f32>>,
     ) -> Gradients<'_> {
         let Self { frame, photometric, depth: stages, terms } = self;
-        rec.stage(stage::PHOTOMETRIC);
+        rec.stage(photometric::TERM.stage);
         rec.zero(terms);
-        let slot = Term::Photometric as u32;
+        let slot = photometric::TERM.slot();
         let grad_rgb = photometric.forward_backward(rec, rgb, frame.target(), frame.weight(), terms, slot);
         let planned = stages.as_ref().zip(depth).zip(view);
         let grad_depth = planned.map(|((Depth { align, l1, gradient }, depth), view)| {
-            rec.stage(stage::DEPTH);
+            rec.stage(depth_l1::TERM.stage);
             let prior = align::Prior { values: view.prior, quantity: view.quantity, valid: frame.valid() };
             let fit = view.fit.unwrap_or_else(|| align.forward(rec, depth, prior));
             let weight =
                 frame.depth_weight().map_or(depth_l1::Weight::All(view.weights.outside), depth_l1::Weight::Each);
-            let slot = Term::DepthL1 as u32;
+            let slot = depth_l1::TERM.slot();
             let (difference, grad_aligned) = l1.forward_backward(rec, depth, prior, fit, weight, terms, slot);
             if let Some(gradient) = gradient.as_ref().filter(|_| view.gradient != 0.0) {
                 let valid = if view.gradient_inside { frame.given().filter(|_| view.gaps) } else { frame.valid() };
-                let slot = Term::DepthGradient as u32;
-                rec.stage(stage::DEPTH_GRADIENT);
+                let slot = depth_gradient::TERM.slot();
+                rec.stage(depth_gradient::TERM.stage);
                 gradient.forward_backward(rec, difference, grad_aligned, valid, view.gradient, terms, slot);
-                rec.stage(stage::DEPTH);
+                rec.stage(depth_l1::TERM.stage);
             }
             align.backward(rec, grad_aligned, depth, prior, fit)
         });
@@ -638,8 +649,8 @@ mod tests {
         let masks = Plan { masks: true, ..plan };
         let losses = Losses::new(&gpu, &masks).expect("buffers");
         assert!(losses.frame.weight().is_some() && losses.frame.valid().is_none());
-        let names: Vec<_> = Term::ALL.iter().map(|t| t.name()).collect();
+        let names: Vec<_> = Term::ALL.iter().map(|t| t.name).collect();
         assert_eq!(names, ["photometric", "depth_l1", "depth_gradient"]);
-        assert!(Term::ALL.iter().enumerate().all(|(i, &t)| t as usize == i));
+        assert!(Term::ALL.iter().enumerate().all(|(i, t)| t.slot() as usize == i));
     }
 }

@@ -3,6 +3,8 @@
 //!
 //! SSIM's window is separable: moments along rows, then columns; the derivatives by the moments walk back the same way.
 
+use super::Term;
+use crate::cost::{Formula, if_so, work};
 use crate::gpu::kernels::losses::{
     photometric_adjoint as adjoint, photometric_columns as columns, photometric_columns_weighted as columns_weighted,
     photometric_gradient as gradient, photometric_gradient_l1 as gradient_l1,
@@ -15,6 +17,45 @@ use crate::gpu::{Buffer, Check, Error, Form, Gpu, Recorder, Reference};
 use crate::math::ssim;
 
 use super::sum;
+
+/// As reports and plans know it.
+pub const TERM: Term =
+    Term { name: "photometric", stage: "photometric", planned: |_| true, left_out: &[], costs: COSTS };
+
+/// What the passes have to do.
+pub(super) const COSTS: &[Formula] = &[
+    Formula {
+        pass: "losses/photometric_rows",
+        variants: &["outside", "wide", "outside_wide"],
+        derivation: "per pixel rgb twice 24, moments 48 B, with weights 4; per channel difference and terms 8, window 11 x 4, \
+                     variances 10 operations",
+        work: |c, d| work((72.0 + 4.0 * if_so(d.is("outside"))) * c.pixels, 3.0 * 62.0 * c.pixels, 0.0),
+    },
+    Formula {
+        pass: "losses/photometric_columns",
+        variants: &["weighted"],
+        derivation: "per pixel moments 48, their gradient 36 B, with weights 4; per channel terms 8, window 11 x 4, SSIM and its \
+                     derivatives 48 operations",
+        work: |c, d| work((84.0 + 4.0 * if_so(d.is("weighted"))) * c.pixels, 3.0 * 100.0 * c.pixels, 0.0),
+    },
+    Formula {
+        pass: "losses/photometric_adjoint",
+        variants: &[],
+        derivation: "per pixel 36 B read and 36 written; per channel a window of 11 x 3 operations",
+        work: |c, _| work(72.0 * c.pixels, 3.0 * 33.0 * c.pixels, 0.0),
+    },
+    Formula {
+        pass: "losses/photometric_gradient",
+        variants: &["weighted", "weighted_outside", "l1", "l1_weighted"],
+        derivation: "per pixel rgb, target and gradient 36 B, 18 operations for L1; with SSIM 36 B and per channel a window of 11 x 3 \
+                     and 5 operations more; with weights 4 B",
+        work: |c, d| {
+            let ssim = if_so(!d.is("l1"));
+            let bytes = 36.0 + 36.0 * ssim + 4.0 * if_so(d.is("weighted"));
+            work(bytes * c.pixels, (18.0 + 3.0 * 38.0 * ssim) * c.pixels, 0.0)
+        },
+    },
+];
 
 /// Pixels that a thread makes along the blur's direction; RUN in the kernels.
 const RUN: usize = 8;

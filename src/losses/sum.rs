@@ -1,7 +1,16 @@
 //! Partial sums of workgroups to one number each, in a fixed order.
 
+use crate::cost::{Formula, work};
 use crate::gpu::kernels::losses::sum;
 use crate::gpu::{Buffer, Check, Recorder, Reference};
+
+/// What the passes have to do.
+pub(super) const COSTS: &[Formula] = &[Formula {
+    pass: "losses/sum",
+    variants: &[],
+    derivation: "the partial sums, all that there is room for, read and added",
+    work: |_, d| work((d.bytes)(d.buffer(0)), (d.bytes)(d.buffer(0)) / 4.0, 0.0),
+}];
 
 impl Reference for sum::Kernel {
     fn reference(host: sum::Host<'_>, push: sum::Push, (): ()) {

@@ -312,7 +312,7 @@ impl Stored {
                 seconds: f64::from_bits(self.seconds),
                 view: self.view.clone(),
                 loss: losses.iter().sum(),
-                losses: Term::ALL.iter().map(|term| term.name()).zip(losses).collect(),
+                losses: Term::ALL.iter().map(|term| term.name).zip(losses).collect(),
                 anchors,
                 visible,
                 gaussians,

@@ -294,8 +294,6 @@ impl Plan {
         let all = Steps { first: 1, last: self.iterations };
         match name {
             stage::ATTENTION => self.attention.then_some(Steps { first: settings.model.attention.start.max(1), ..all }),
-            stage::DEPTH => self.depth.then_some(all),
-            stage::DEPTH_GRADIENT => self.depth_gradient.then_some(all),
             stage::SENTINEL => self.sentinel.then_some(all),
             stage::STATISTICS => self.counted,
             stage::GROWTH => self.rounds,
@@ -304,7 +302,10 @@ impl Plan {
                 let first = if every == 0 { self.iterations } else { every.min(self.iterations) };
                 self.evaluation.then_some(Steps { first, ..all })
             }
-            _ => Some(all),
+            _ => {
+                let losses = self.losses(self.largest(), settings);
+                losses::Term::of_stage(name).is_none_or(|term| (term.planned)(&losses)).then_some(all)
+            }
         }
     }
 
@@ -313,14 +314,10 @@ impl Plan {
         let listed = |what: &str| self.left_out.iter().find(|left| left.what == what).map(|left| left.why.as_str());
         match name {
             stage::ATTENTION => listed("cross-attention"),
-            stage::DEPTH => listed("depth map, its gradient, alignment and depth losses"),
-            stage::DEPTH_GRADIENT => {
-                listed("depth gradient").or_else(|| listed("depth map, its gradient, alignment and depth losses"))
-            }
             stage::STATISTICS | stage::GROWTH => listed("statistics, growing and pruning"),
             stage::SENTINEL => listed("sentinel"),
             stage::EVALUATION => listed("evaluation"),
-            _ => None,
+            _ => losses::Term::of_stage(name)?.left_out.iter().find_map(|what| listed(what)),
         }
     }
 }

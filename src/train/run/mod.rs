@@ -451,7 +451,7 @@ impl<'a> Run<'a> {
                 seconds: session.seconds(),
                 view: self.photographs[view].name.clone(),
                 loss: values.iter().sum(),
-                losses: Term::ALL.iter().map(|t| t.name()).zip(values.iter().copied()).collect(),
+                losses: Term::ALL.iter().map(|t| t.name).zip(values.iter().copied()).collect(),
                 anchors: self.step.anchors.count,
                 visible: counters[Counter::Visible as usize],
                 gaussians: counters[Counter::Drawn as usize],
