@@ -11,6 +11,7 @@ pub mod frame;
 pub mod photometric;
 
 pub use config::Config;
+pub mod squared;
 mod sum;
 
 use crate::cost::Formula;
@@ -36,7 +37,7 @@ pub struct Term {
 
 impl Term {
     /// All, by their place in [`Losses::terms`].
-    pub const ALL: [Self; 3] = [photometric::TERM, depth_l1::TERM, depth_gradient::TERM];
+    pub const ALL: [Self; 4] = [photometric::TERM, depth_l1::TERM, depth_gradient::TERM, squared::TERM];
 
     /// The one with this stage, the last of several.
     pub fn of_stage(stage: &str) -> Option<Self> {
@@ -119,6 +120,7 @@ pub struct Gradients<'a> {
 pub struct Losses {
     frame: frame::Frame,
     photometric: photometric::Photometric,
+    squared: squared::Squared,
     depth: Option<Depth>,
     terms: Buffer<f32>,
 }
@@ -150,6 +152,7 @@ impl Losses {
             Ok(Self {
                 frame: frame::Frame::new(gpu, size, masks, plan.depth)?,
                 photometric: photometric::Photometric::new(gpu, size, plan.ssim_weight, plan.ssim_across_masks)?,
+                squared: gpu.stage(squared::TERM.stage, || squared::Squared::new(gpu, size))?,
                 depth: if plan.depth { Some(gpu.stage(depth_l1::TERM.stage, depth)?) } else { None },
                 terms: gpu.buffer("losses", Term::ALL.len())?,
             })
@@ -184,11 +187,13 @@ impl Losses {
         rgb: &Buffer<[f32; 3]>,
         depth: Option<&Buffer<f32>>,
     ) -> Gradients<'_> {
-        let Self { frame, photometric, depth: stages, terms } = self;
+        let Self { frame, photometric, squared, depth: stages, terms } = self;
         rec.stage(photometric::TERM.stage);
         rec.zero(terms);
         let slot = photometric::TERM.slot();
         let grad_rgb = photometric.forward_backward(rec, rgb, frame.target(), frame.weight(), terms, slot);
+        rec.stage(squared::TERM.stage);
+        squared.forward_backward(rec, [rgb, frame.target(), grad_rgb], terms, squared::TERM.slot());
         let planned = stages.as_ref().zip(depth).zip(view);
         let grad_depth = planned.map(|((Depth { align, l1, gradient }, depth), view)| {
             rec.stage(depth_l1::TERM.stage);
@@ -550,8 +555,8 @@ mod tests {
                     let terms = gpu.read(losses.terms()).expect("read");
                     assert!(terms[0] > 0.0, "{terms:?}");
                     let expected = with_depth && size[0] * size[1] > 17;
-                    assert!(!expected || terms[1..].iter().all(|&t| t > 0.0), "{terms:?}");
-                    assert!(with_depth || terms[1..] == [0.0, 0.0], "{terms:?}");
+                    assert!(!expected || terms[1..3].iter().all(|&t| t > 0.0), "{terms:?}");
+                    assert!(with_depth || terms[1..3] == [0.0, 0.0], "{terms:?}");
                 }
             }
         }
@@ -650,7 +655,7 @@ mod tests {
         let losses = Losses::new(&gpu, &masks).expect("buffers");
         assert!(losses.frame.weight().is_some() && losses.frame.valid().is_none());
         let names: Vec<_> = Term::ALL.iter().map(|t| t.name).collect();
-        assert_eq!(names, ["photometric", "depth_l1", "depth_gradient"]);
+        assert_eq!(names[..3], ["photometric", "depth_l1", "depth_gradient"]);
         assert!(Term::ALL.iter().enumerate().all(|(i, t)| t.slot() as usize == i));
     }
 }
