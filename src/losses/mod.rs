@@ -11,7 +11,6 @@ pub mod frame;
 pub mod photometric;
 
 pub use config::Config;
-pub mod squared;
 mod sum;
 
 use crate::cost::Formula;
@@ -37,7 +36,7 @@ pub struct Term {
 
 impl Term {
     /// All, by their place in [`Losses::terms`].
-    pub const ALL: [Self; 4] = [photometric::TERM, depth_l1::TERM, depth_gradient::TERM, squared::TERM];
+    pub const ALL: [Self; 3] = [photometric::TERM, depth_l1::TERM, depth_gradient::TERM];
 
     /// The one with this stage, the last of several.
     pub fn of_stage(stage: &str) -> Option<Self> {
@@ -120,7 +119,6 @@ pub struct Gradients<'a> {
 pub struct Losses {
     frame: frame::Frame,
     photometric: photometric::Photometric,
-    squared: squared::Squared,
     depth: Option<Depth>,
     terms: Buffer<f32>,
 }
@@ -152,7 +150,6 @@ impl Losses {
             Ok(Self {
                 frame: frame::Frame::new(gpu, size, masks, plan.depth)?,
                 photometric: photometric::Photometric::new(gpu, size, plan.ssim_weight, plan.ssim_across_masks)?,
-                squared: gpu.stage(squared::TERM.stage, || squared::Squared::new(gpu, size))?,
                 depth: if plan.depth { Some(gpu.stage(depth_l1::TERM.stage, depth)?) } else { None },
                 terms: gpu.buffer("losses", Term::ALL.len())?,
             })
@@ -187,13 +184,11 @@ impl Losses {
         rgb: &Buffer<[f32; 3]>,
         depth: Option<&Buffer<f32>>,
     ) -> Gradients<'_> {
-        let Self { frame, photometric, squared, depth: stages, terms } = self;
+        let Self { frame, photometric, depth: stages, terms } = self;
         rec.stage(photometric::TERM.stage);
         rec.zero(terms);
         let slot = photometric::TERM.slot();
         let grad_rgb = photometric.forward_backward(rec, rgb, frame.target(), frame.weight(), terms, slot);
-        rec.stage(squared::TERM.stage);
-        squared.forward_backward(rec, [rgb, frame.target(), grad_rgb], terms, squared::TERM.slot());
         let planned = stages.as_ref().zip(depth).zip(view);
         let grad_depth = planned.map(|((Depth { align, l1, gradient }, depth), view)| {
             rec.stage(depth_l1::TERM.stage);
