@@ -6,6 +6,7 @@ mod common;
 use std::collections::{BTreeMap, BTreeSet};
 
 use gscream_vk::config::{Settings, Source};
+use gscream_vk::gpu::form::without_form;
 use gscream_vk::gpu::{Entry, Gpu, Options, Schedule, testing};
 use gscream_vk::losses::{depth_gradient, depth_l1};
 use gscream_vk::scene::{self, Scene};
@@ -114,7 +115,7 @@ fn every_combination_has_what_it_needs_and_nothing_else() {
         let buffers: BTreeSet<&str> = forecast.used.values().flat_map(|u| u.buffers.keys().copied()).collect();
         for (mark, owner) in MARKS {
             let names = || passes.iter().chain(&buffers).chain(&forecast.pipelines);
-            let found = names().find(|name| name.replace("/cpu/", "/").starts_with(mark));
+            let found = names().find(|name| without_form(name).starts_with(mark));
             // Test views are drawn with their depth.
             let drawn = mark == "depth_map" && wanted.tests;
             assert_eq!(found.is_some(), present(owner) || drawn, "{wanted:?}: {mark}*: {found:?}");

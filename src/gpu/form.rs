@@ -26,7 +26,7 @@ impl Form {
 }
 
 /// A pass's name whatever its form: kernels for CPU drivers lie in the folder `cpu` of their room.
-pub(crate) fn without_form(pass: &str) -> String {
+pub fn without_form(pass: &str) -> String {
     pass.replacen("/cpu/", "/", 1)
 }
 
