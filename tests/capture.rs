@@ -226,6 +226,47 @@ fn cameras_of_nerfstudio_are_the_same() {
     }
 }
 
+/// nerfstudio's fisheyes are resampled like COLMAP's; what is neither is refused by name.
+#[test]
+fn fisheyes_of_nerfstudio_become_pinholes() {
+    let folder = capture();
+    let full = scene::load(&folder.path().join("full"), &scene::Config::default()).expect("a scene");
+    let views: Vec<(String, Camera)> = full.train.iter().map(|view| (view.name.clone(), view.camera)).collect();
+    let photos = folder.path().join("photos");
+    fs::remove_dir_all(photos.join("sparse")).expect("a folder");
+    let mut json = transforms(&views);
+    json["camera_model"] = "OPENCV_FISHEYE".into();
+    for (key, value) in [("k1", 0.02), ("k2", -0.004), ("k3", 0.001), ("k4", 0.0)] {
+        json[key] = value.into();
+    }
+    fs::write(photos.join("transforms.json"), json.to_string()).expect("a writable folder");
+    let mut request = Request::new(&photos, folder.path().join("scene"));
+    request.only = vec![Step::Poses];
+    let mut lines = Lines::default();
+    capture::prepare(&testing::gpu(), &request, &mut lines).expect("poses");
+    let said = "poses: 10 photographs were resampled from OPENCV_FISHEYE to pinholes";
+    assert!(lines.0.iter().any(|line| line == said), "{:?}", lines.0);
+    let scene = scene::load(&request.out, &scene::Config { unit: 1.0, ..Default::default() }).expect("a scene");
+    let camera = full.train[0].camera;
+    let lens = capture::lens::Pinhole::of(scene::colmap::Lens {
+        model: "OPENCV_FISHEYE",
+        focal: camera.focal.map(f64::from),
+        principal: camera.principal.map(f64::from),
+        coefficients: std::array::from_fn(|i| [0.02, -0.004, 0.001].get(i).copied().unwrap_or(0.0)),
+        size: camera.size,
+    })
+    .expect("a pinhole");
+    for (view, before) in scene.train.iter().zip(&full.train) {
+        assert_eq!(view.camera.distortion, [0.0; 4]);
+        assert!((f64::from(view.camera.focal[0]) - lens.focal[0]).abs() < 1e-4);
+        assert!(view.image == lens.photograph(&before.image) && view.image != before.image, "{}", view.name);
+    }
+    json["camera_model"] = "EQUIRECTANGULAR".into();
+    fs::write(photos.join("transforms.json"), json.to_string()).expect("a writable folder");
+    let refused = capture::prepare(&testing::gpu(), &request, &mut Lines::default()).expect_err("no lens").to_string();
+    assert!(refused.contains("camera_model is EQUIRECTANGULAR; undistort the photographs"), "{refused}");
+}
+
 // ---------------------------------------------------------------- thin evidence, other lenses
 
 /// Masks for all photographs, by the number of the view; a short fit.

@@ -85,6 +85,7 @@ struct Lens {
     k1: Option<f64>,
     k2: Option<f64>,
     k3: Option<f64>,
+    k4: Option<f64>,
     p1: Option<f64>,
     p2: Option<f64>,
 }
@@ -225,11 +226,19 @@ impl Capture {
                             another folder, with --out";
                 return Err(Error::File { path: out.to_owned(), what: what.into() });
             }
-            self.collect_resampled(&mut batch)?;
-            return Ok(batch);
+            if matches!(self.source, Source::Colmap(_)) {
+                self.collect_resampled(&mut batch)?;
+                return Ok(batch);
+            }
         }
         if !in_place || matches!(self.source, Source::Photographs(_) | Source::Transforms { .. }) {
             for (name, path) in &self.photographs {
+                if let Some(pinhole) = self.pinholes.get(name) {
+                    let picture = pinhole.photograph(&scene::photograph(path, 1)?);
+                    let from = format!("{}, resampled from {} to a pinhole", path.display(), pinhole.lens.model);
+                    batch.rgb_aside(format!("{IMAGES}/{name}.png"), &picture, from)?;
+                    continue;
+                }
                 let extension = path.extension().map_or_else(|| "png".into(), |e| e.to_string_lossy().to_lowercase());
                 let target = format!("{IMAGES}/{name}.{extension}");
                 if out.join(&target).canonicalize().ok() != path.canonicalize().ok() || !out.join(&target).exists() {
@@ -237,7 +246,8 @@ impl Capture {
                 }
             }
         }
-        for (name, path) in &self.depths {
+        // A depth map is of its photograph's pixels.
+        for (name, path) in self.depths.iter().filter(|(name, _)| !self.pinholes.contains_key(*name)) {
             let extension = path.extension().map_or_else(|| "png".into(), |e| e.to_string_lossy().to_lowercase());
             batch.copy(format!("depth/{name}.{extension}"), path, "transforms.json: depth_file_path");
         }
@@ -258,6 +268,14 @@ impl Capture {
             }
             Source::Transforms { file, transforms, names } => {
                 self.collect_transforms(file, transforms, names, &mut batch)?;
+                let lost = self.depths.keys().filter(|name| self.pinholes.contains_key(*name)).count();
+                if let Some(pinhole) = self.pinholes.values().next() {
+                    let (count, model) = (self.pinholes.len(), pinhole.lens.model);
+                    batch.notes.push(format!("{count} photographs were resampled from {model} to pinholes"));
+                }
+                if lost > 0 {
+                    batch.notes.push(format!("{lost} depth maps of resampled photographs were left out"));
+                }
             }
             Source::Photographs(folder) => self.collect_colmap(folder, &mut batch, say)?,
         }
@@ -338,7 +356,9 @@ impl Capture {
                 |what: String| Error::File { path: file.to_owned(), what: format!("frame {i} ({name}): {what}") };
             let picture = &self.photographs[name];
             let size = super::picture_size(picture)?;
-            shots.push(shot(frame, transforms.lens, name, size).map_err(refuse)?);
+            let fisheye = transforms.camera_model.as_deref() == Some("OPENCV_FISHEYE");
+            let lens = taken_with(frame.lens, transforms.lens, fisheye, size).map_err(refuse)?;
+            shots.push(shot(frame, name, &lens, self.pinholes.get(name)).map_err(refuse)?);
         }
         let (cameras, images) = model_text(&shots);
         batch.bytes(format!("{MODEL}/cameras.txt"), cameras.into_bytes(), self.origin());
@@ -454,11 +474,14 @@ fn from_transforms(folder: &Path, file: &Path) -> Result<Capture, Error> {
     let text = std::fs::read(file).map_err(|source| Error::Io { path: file.to_owned(), source })?;
     let transforms: Transforms =
         serde_json::from_slice(&text).map_err(|error| refuse(format!("not nerfstudio's transforms.json: {error}")))?;
-    if let Some(model) = transforms.camera_model.as_deref()
-        && !["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"].contains(&model)
-    {
-        return Err(refuse(format!("camera_model is {model}; undistort the photographs to OPENCV or PINHOLE first")));
-    }
+    let fisheye = match transforms.camera_model.as_deref() {
+        Some("OPENCV_FISHEYE") => true,
+        None | Some("OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL") => false,
+        Some(model) => {
+            let what = "undistort the photographs to OPENCV, OPENCV_FISHEYE or PINHOLE first";
+            return Err(refuse(format!("camera_model is {model}; {what}")));
+        }
+    };
     if transforms.frames.is_empty() {
         return Err(refuse("there are no frames".into()));
     }
@@ -481,7 +504,7 @@ fn from_transforms(folder: &Path, file: &Path) -> Result<Capture, Error> {
             refuse(format!("{} is not there; paths are read below {}", given.display(), folder.display()))
         })
     };
-    for frame in &transforms.frames {
+    for (i, frame) in transforms.frames.iter().enumerate() {
         let picture = below(&frame.file_path)?;
         let relative = picture.strip_prefix(folder).unwrap_or(&picture).to_string_lossy().into_owned();
         let name = scene::stem(relative.strip_prefix("images/").unwrap_or(&relative)).to_owned();
@@ -492,6 +515,14 @@ fn from_transforms(folder: &Path, file: &Path) -> Result<Capture, Error> {
         if let Some(path) = &frame.depth_file_path {
             capture.depths.insert(name.clone(), below(path)?);
         }
+        let wrong = |what: &str| refuse(format!("frame {i} ({name}): {what}"));
+        let lens = taken_with(frame.lens, transforms.lens, fisheye, super::picture_size(&picture)?);
+        let lens = lens.map_err(|what| wrong(&what))?;
+        if lens.projected().is_none() {
+            let pinhole =
+                Pinhole::of(lens).ok_or_else(|| wrong("its lens folds over: no pinhole shows a part of it alone"))?;
+            capture.pinholes.insert(name.clone(), pinhole);
+        }
         if capture.photographs.insert(name.clone(), picture).is_some() {
             return Err(refuse(format!("two frames show {name}")));
         }
@@ -501,30 +532,47 @@ fn from_transforms(folder: &Path, file: &Path) -> Result<Capture, Error> {
     Ok(capture)
 }
 
-/// A frame's camera: nerfstudio's poses are camera to world with OpenGL's axes (y up, z backward).
-fn shot(frame: &Frame, all: Lens, name: &str, size: [u32; 2]) -> Result<Shot, String> {
-    let own = frame.lens;
+/// The lens of a frame's photograph of this size: OPENCV's, its fisheye's, or with a third radial term FULL_OPENCV's.
+fn taken_with(own: Lens, all: Lens, fisheye: bool, size: [u32; 2]) -> Result<colmap::Lens, String> {
     let (w, h) = (f64::from(size[0]), f64::from(size[1]));
     let given = [own.w.or(all.w).unwrap_or(w), own.h.or(all.h).unwrap_or(h)];
     let angle = own.camera_angle_x.or(all.camera_angle_x).map(|angle| given[0] / (2.0 * (angle / 2.0).tan()));
     let fx = own.fl_x.or(own.fl_y).or(all.fl_x).or(all.fl_y).or(angle).ok_or("no fl_x and no camera_angle_x")?;
     let fy = own.fl_y.or(own.fl_x).or(all.fl_y).unwrap_or(fx);
     let of = |pick: fn(&Lens) -> Option<f64>| pick(&own).or_else(|| pick(&all));
-    if of(|l| l.k3).is_some_and(|k3| k3 != 0.0) {
-        return Err("k3 is not 0; undistort the photographs first".into());
-    }
+    let or_0 = |pick: fn(&Lens) -> Option<f64>| of(pick).unwrap_or(0.0);
     // Intrinsics may be those of larger photographs.
     let scale = [w / given[0], h / given[1]];
-    let parameters = [
-        fx * scale[0],
-        fy * scale[1],
-        of(|l| l.cx).unwrap_or(given[0] / 2.0) * scale[0],
-        of(|l| l.cy).unwrap_or(given[1] / 2.0) * scale[1],
-        of(|l| l.k1).unwrap_or(0.0),
-        of(|l| l.k2).unwrap_or(0.0),
-        of(|l| l.p1).unwrap_or(0.0),
-        of(|l| l.p2).unwrap_or(0.0),
-    ];
+    let [k1, k2, k3, k4] = [or_0(|l| l.k1), or_0(|l| l.k2), or_0(|l| l.k3), or_0(|l| l.k4)];
+    let [p1, p2] = [or_0(|l| l.p1), or_0(|l| l.p2)];
+    let (model, used) = match fisheye {
+        true => ("OPENCV_FISHEYE", [k1, k2, k3, k4, 0.0]),
+        false if k3 != 0.0 => ("FULL_OPENCV", [k1, k2, p1, p2, k3]),
+        false => ("OPENCV", [k1, k2, p1, p2, 0.0]),
+    };
+    let mut coefficients = [0.0; 12];
+    coefficients[..5].copy_from_slice(&used);
+    let principal = [of(|l| l.cx).unwrap_or(given[0] / 2.0), of(|l| l.cy).unwrap_or(given[1] / 2.0)];
+    Ok(colmap::Lens {
+        model,
+        focal: [fx * scale[0], fy * scale[1]],
+        principal: [principal[0] * scale[0], principal[1] * scale[1]],
+        coefficients,
+        size,
+    })
+}
+
+/// A frame's camera, with the pinhole that its photograph is resampled to: nerfstudio's poses are camera to world with
+/// OpenGL's axes (y up, z backward).
+fn shot(frame: &Frame, name: &str, lens: &colmap::Lens, pinhole: Option<&Pinhole>) -> Result<Shot, String> {
+    let [cx, cy] = lens.principal;
+    let parameters = match pinhole {
+        Some(Pinhole { focal: [fx, fy], .. }) => [*fx, *fy, cx, cy, 0.0, 0.0, 0.0, 0.0],
+        None => {
+            let ([fx, fy], [k1, k2, p1, p2, ..]) = (lens.focal, lens.coefficients);
+            [fx, fy, cx, cy, k1, k2, p1, p2]
+        }
+    };
     let rows: Vec<&Vec<f64>> = frame.transform_matrix.iter().take(3).collect();
     if rows.len() < 3 || rows.iter().any(|row| row.len() != 4 || row.iter().any(|v| !v.is_finite())) {
         return Err("transform_matrix is not 4 x 4 numbers".into());
@@ -535,7 +583,7 @@ fn shot(frame: &Frame, all: Lens, name: &str, size: [u32; 2]) -> Result<Shot, St
         return Err("transform_matrix does not hold a rotation".into());
     }
     let rotation = DQuat::from_mat3(&axes).normalize().inverse();
-    Ok(Shot { name: name.to_owned(), size, parameters, rotation, translation: -(rotation * column(3)) })
+    Ok(Shot { name: name.to_owned(), size: lens.size, parameters, rotation, translation: -(rotation * column(3)) })
 }
 
 /// `cameras.txt` and `images.txt`, a camera for each photograph.
@@ -599,6 +647,11 @@ mod tests {
         serde_json::from_str(json).unwrap()
     }
 
+    /// Of photographs of 40 x 30 pixels that need no resampling.
+    fn plain(frame: &Frame, all: Lens) -> Result<Shot, String> {
+        shot(frame, "a", &taken_with(frame.lens, all, false, [40, 30])?, None)
+    }
+
     /// A camera at (1, 2, 3) with OpenGL's axes along the world's looks along -z: what stands before it at (1, 2, 0) is at
     /// depth 3 in the middle, and what is above it in the world is above it in the picture, at a smaller row.
     #[test]
@@ -606,7 +659,7 @@ mod tests {
         let frame = frame(
             r#"{"file_path": "a.png", "transform_matrix": [[1,0,0,1],[0,1,0,2],[0,0,1,3],[0,0,0,1]], "fl_x": 50}"#,
         );
-        let shot = shot(&frame, Lens::default(), "a", [40, 30]).unwrap();
+        let shot = plain(&frame, Lens::default()).unwrap();
         let seen = |p: DVec3| shot.rotation * p + shot.translation;
         assert!((seen(dvec3(1.0, 2.0, 0.0)) - dvec3(0.0, 0.0, 3.0)).length() < 1e-12);
         assert!((seen(dvec3(1.5, 2.0, 0.0)) - dvec3(0.5, 0.0, 3.0)).length() < 1e-12);
@@ -619,25 +672,36 @@ mod tests {
         let all: Lens = serde_json::from_str(r#"{"w": 80, "h": 60, "fl_x": 100, "cx": 44, "k1": 0.1}"#).unwrap();
         let pose = "[[1,0,0,0],[0,1,0,0],[0,0,1,0]]";
         let own = frame(&format!(r#"{{"file_path": "a", "transform_matrix": {pose}, "k1": 0.2}}"#));
-        let shot_of = |frame: &Frame| shot(frame, all, "a", [40, 30]);
+        let shot_of = |frame: &Frame| plain(frame, all);
         assert_eq!(shot_of(&own).unwrap().parameters, [50.0, 50.0, 22.0, 15.0, 0.2, 0.0, 0.0, 0.0]);
         let angle: Lens = serde_json::from_str(r#"{"camera_angle_x": 1.5707963267948966}"#).unwrap();
-        assert!((shot(&own, angle, "a", [40, 30]).unwrap().parameters[0] - 20.0).abs() < 1e-12);
+        assert!((plain(&own, angle).unwrap().parameters[0] - 20.0).abs() < 1e-12);
         for (json, what) in [
             (r#"{"file_path": "a", "transform_matrix": [[1,0,0],[0,1,0],[0,0,1]]}"#, "4 x 4"),
             (r#"{"file_path": "a", "transform_matrix": [[2,0,0,0],[0,1,0,0],[0,0,1,0]]}"#, "rotation"),
-            (&format!(r#"{{"file_path": "a", "transform_matrix": {pose}, "k3": 1}}"#), "k3"),
         ] {
             assert!(shot_of(&frame(json)).unwrap_err().contains(what), "{json}");
         }
-        assert!(shot(&own, Lens::default(), "a", [40, 30]).unwrap_err().contains("fl_x"));
+        assert!(plain(&own, Lens::default()).unwrap_err().contains("fl_x"));
+    }
+
+    /// What the model calls k3 is another term in each.
+    #[test]
+    fn lenses_are_told_apart() {
+        let all: Lens = serde_json::from_str(r#"{"fl_x": 20, "k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4}"#).unwrap();
+        let of = |fisheye| taken_with(Lens::default(), all, fisheye, [40, 30]).unwrap();
+        assert_eq!((of(true).model, &of(true).coefficients[..5]), ("OPENCV_FISHEYE", &[0.1, 0.2, 0.3, 0.4, 0.0][..]));
+        assert_eq!((of(false).model, &of(false).coefficients[..5]), ("FULL_OPENCV", &[0.1, 0.2, 0.0, 0.0, 0.3][..]));
+        assert!(of(true).projected().is_none() && of(false).projected().is_none());
+        let straight = taken_with(Lens { k3: None, ..all }, Lens::default(), false, [40, 30]).unwrap();
+        assert!(straight.projected().is_some());
     }
 
     #[test]
     fn random_points_stand_before_the_cameras() {
         let pose = "[[1,0,0,0],[0,1,0,0],[0,0,1,0]]";
         let frame = frame(&format!(r#"{{"file_path": "a", "transform_matrix": {pose}, "fl_x": 40}}"#));
-        let shot = shot(&frame, Lens::default(), "a", [40, 30]).unwrap();
+        let shot = plain(&frame, Lens::default()).unwrap();
         let text = random_points(std::slice::from_ref(&shot));
         assert_eq!(text.lines().count(), RANDOM_POINTS as usize);
         for line in text.lines() {

@@ -44,6 +44,8 @@ const MOST: f32 = 0.5;
 const AWAY: f32 = 0.002;
 /// Photographs agree on a pixel if no channel of their means over 3 x 3 pixels differs by more.
 const SAME: f32 = 0.09;
+/// Views that are asked whether a surface can be there; of more, every so many.
+const ASKED: usize = 60;
 /// What speaks against a surface that something else than the object hides from all other views; 1 is a proof.
 const BURIED: f64 = 0.1;
 
@@ -283,7 +285,8 @@ impl Others<'_> {
     /// What they say against a surface at a point that the reference sees past the object: 1 if it cannot be there.
     fn against(&self, point: [f64; 3]) -> f64 {
         let (mut through, mut agree, mut hidden, mut asked) = (0u32, 0u32, 0u32, 0u32);
-        for (map, mask) in self.maps.iter().zip(self.masks) {
+        let every = self.maps.len().div_ceil(ASKED).max(1);
+        for (map, mask) in self.maps.iter().zip(self.masks).step_by(every) {
             let said = map.witness(point, HIDDEN);
             asked += u32::from(said != Witness::Silent);
             match said {
@@ -437,7 +440,7 @@ fn fill(
             format!("reference/{name}_depth.npy"),
             coarse,
             values,
-            "the fit's depth; in the hole that of the plane sweep, and a membrane where nobody looked",
+            "the fit's depth; in the hole that of the plane sweep, and of the surfaces around it where nobody looked",
         );
     }
     batch.notes.push(format!(
