@@ -682,6 +682,24 @@ fn ablate_compares_over_seeds_and_scenes() {
     assert!(psnr["mean"].is_f64() && psnr["deviation"].is_f64(), "{comparison:#}");
     assert!(comparison["differences"][0]["figures"]["psnr"]["p"].is_f64());
 
+    // Stopped before its last run, and asked again: only that is trained, and all comes to the same.
+    let runs = folder.join("runs");
+    let mut kept = read("ablation.json");
+    kept.as_array_mut().expect("rows").pop();
+    fs::write(runs.join("ablation.json"), kept.to_string()).expect("a writable folder");
+    fs::remove_dir_all(runs.join("other/priors-same/seed-1")).expect("the last run");
+    let again = succeeds(folder, &format!("{command} {few} --resume"));
+    assert_eq!(again.stderr.lines().filter(|line| line.starts_with("== ")).count(), 1, "{}", again.stderr);
+    assert!(again.stderr.contains("== other, priors-same, seed 1 8 of 8"), "{}", again.stderr);
+    // Numbers read from JSON may differ in their last bit.
+    for figure in ["psnr", "masked_ssim", "seconds"] {
+        let mean = |comparison: &serde_json::Value| comparison["variants"][0]["figures"][figure]["mean"].as_f64();
+        let (was, is) = (mean(&comparison).expect("a number"), mean(&read("comparison.json")).expect("a number"));
+        assert!((is / was - 1.0).abs() < 1e-12, "{figure}: taken as it is: {was}, {is}");
+    }
+    let other = run(folder, &format!("{command} {few} --resume --set losses.ssim_weight=0.1"));
+    assert!(other.code == 1 && other.stderr.contains("other settings"), "{}", other.stderr);
+
     let one = succeeds(folder, &format!("ablate scene --out one --only neither {few}"));
     assert!(folder.join("one/neither/run.json").is_file() && !one.stdout.contains('±'), "{}", one.stdout);
     let refused = run(folder, "ablate scene --only all");

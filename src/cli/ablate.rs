@@ -7,12 +7,12 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail, ensure};
 use atomic_write_file::AtomicWriteFile;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::eval::JudgeArgs;
 use super::report::last_part;
 use super::shared::{DeviceArgs, SYNTHETIC, SceneArgs, load_scene, with_gpu};
-use super::train::{Manner, Trained, default_folder, train};
+use super::train::{Manner, Trained, default_folder, is_begun, train, train_on};
 use super::{index, next};
 use crate::config::{Settings, SettingsArgs};
 use crate::evaluate::{Judge, Mean, Metrics, PUBLISHED_ROWS, Published, Region};
@@ -27,7 +27,8 @@ use crate::scene::Scene;
 /// attention, which changes the features in place, beside the paper's, through which gradients flow; and with both parts
 /// one `priors-NAME` for every other folder of depth priors and one `reference-NAME` for every other inpainted picture.
 ///
-/// One run after the other, each in a folder of its own. With several seeds, figures are means and standard deviations
+/// A variant has its parts whatever the preset or the settings say of them. One run after the other, each in a folder of
+/// its own; `--resume` goes on with an ablation that was stopped. With several seeds, figures are means and standard deviations
 /// over the seeds, and every two variants are compared over the same seeds by a paired t-test. With several scenes, a
 /// seed's figure is its mean over the scenes, as the paper's tables have it. Prints tables, and writes ablation.json (every
 /// run) and comparison.json (means, differences, and the published figures).
@@ -63,6 +64,11 @@ pub(super) struct Args {
     /// Folder for the runs [default: runs/SCENE-ablation]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+    /// Leave runs alone that the folder holds complete, and go on with one that was cut short
+    ///
+    /// Scenes and settings must be those that the runs began with. More seeds and variants may be asked for than before.
+    #[arg(long)]
+    resume: bool,
     #[command(flatten)]
     judge: JudgeArgs,
     #[command(flatten)]
@@ -116,8 +122,9 @@ impl Variant {
     fn settings(&self, base: &Settings, scene: &Path, seed: u64) -> Settings {
         let mut settings = base.clone();
         settings.train.seed = seed;
-        settings.losses.depth.enabled &= self.depth;
-        settings.model.attention.enabled &= self.attention;
+        // A preset may leave a part out, as the one for CPUs does with attention: here it is asked for.
+        settings.losses.depth.enabled = self.depth;
+        settings.model.attention.enabled = self.attention;
         settings.model.attention.write_back = self.write_back;
         let place = |path: &PathBuf| {
             let inside = scene.join(path);
@@ -144,7 +151,7 @@ fn named(flag: &str, text: &str) -> anyhow::Result<(String, PathBuf)> {
 }
 
 /// A run.
-#[derive(Serialize)]
+#[derive(Clone, Serialize, Deserialize)]
 struct Row {
     variant: String,
     scene: String,
@@ -153,11 +160,12 @@ struct Row {
     steps_per_second: f64,
     anchors: u32,
     metrics: Metrics,
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(skip_serializing_if = "Option::is_none", default)]
     residue: Option<f64>,
     /// Every figure by its name.
-    #[serde(skip)]
-    figures: BTreeMap<&'static str, f64>,
+    figures: BTreeMap<String, f64>,
+    /// What the figures follow.
+    protocol: String,
 }
 
 /// A column: the figure's name in JSON, its title, digits.
@@ -192,7 +200,7 @@ const COLUMNS: [Column; 22] = [
 const COMPARED: [&str; 4] = ["psnr", "masked_psnr", "masked_ssim", "outside_seen_psnr"];
 
 impl Row {
-    fn new(variant: &Variant, scene: &str, seed: u64, trained: &Trained) -> anyhow::Result<Self> {
+    fn new(variant: &Variant, scene: &str, seed: u64, trained: &Trained, judge: &Judge) -> anyhow::Result<Self> {
         let summary = &trained.summary;
         let mean = trained.report.as_ref().and_then(|r| r.mean).context("there are no test views")?;
         let steps_per_second = f64::from(summary.steps) / summary.seconds;
@@ -211,7 +219,8 @@ impl Row {
             anchors: summary.anchors,
             metrics: mean.metrics,
             residue: mean.residue,
-            figures,
+            figures: figures.into_iter().map(|(name, value)| (name.to_owned(), value)).collect(),
+            protocol: judge.protocol.describe().to_owned(),
         })
     }
 }
@@ -287,28 +296,27 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         folder.into()
     });
     let seeds: Vec<u64> = (base.train.seed..).take(args.seeds as usize).collect();
-    let pace = Pace::new(scenes.len() * seeds.len() * variants.len());
+    let mut known = Known::new(&out.join(RUNS), args.resume, scenes.len() * seeds.len() * variants.len())?;
     let rows = with_gpu(&args.device.options(), |gpu| {
         let mut rows = vec![];
         for ((scene, name), label) in scenes.iter().zip(&names).zip(&labels) {
             for seed in &seeds {
                 let place = (&*scene.scene, name.as_str(), label.as_str());
-                rows.extend(of_scene(gpu, args, &variants, &base, &judge, place, (*seed, &out, &pace, rows.len()))?);
+                rows.extend(of_scene(gpu, args, &variants, &base, &judge, place, (*seed, &out, &mut known))?);
             }
         }
         Ok(rows)
     })?;
     let last = rows.last().map(|row| folder(args, &out, &row.scene, &row.variant, row.seed));
     let comparison = compare(&variants, &rows, labels, seeds, &judge);
-    write(&out.join("ablation.json"), &rows)?;
+    write(&out.join(RUNS), &rows)?;
     write(&out.join("comparison.json"), &comparison)?;
     print!("{}", table(&comparison.variants));
     print!("{}", differences(&comparison.differences));
     if args.scenes.iter().any(|scene| scene != Path::new(SYNTHETIC)) {
         print!("{}", published());
     }
-    let files = "ablation.json and comparison.json";
-    println!("wrote {} runs, {files} in {}", rows.len(), out.display());
+    println!("wrote {} runs, {RUNS} and comparison.json in {}", rows.len(), out.display());
     if let Some(last) = last {
         next::say(&[
             (next::typed(&last.join(index::INDEX).to_string_lossy()), "is one run as a page; every run has its own"),
@@ -341,6 +349,45 @@ fn folder(args: &Args, out: &Path, label: &str, variant: &str, seed: u64) -> Pat
     folder
 }
 
+/// Every run's figures.
+const RUNS: &str = "ablation.json";
+
+/// The runs that are complete, kept in a file as they come.
+struct Known {
+    path: PathBuf,
+    rows: Vec<Row>,
+    pace: Pace,
+    /// Of this ablation, in this call or before it.
+    done: usize,
+}
+
+impl Known {
+    /// Those of an ablation that was stopped with `resume`, or none.
+    fn new(path: &Path, resume: bool, all: usize) -> anyhow::Result<Self> {
+        let rows = if resume && path.exists() {
+            let text = std::fs::read_to_string(path).with_context(|| format!("{}: cannot be read", path.display()))?;
+            serde_json::from_str(&text)
+                .with_context(|| format!("{}: holds no runs of an ablation: leave --resume out", path.display()))?
+        } else {
+            vec![]
+        };
+        Ok(Self { path: path.to_owned(), rows, pace: Pace::new(all), done: 0 })
+    }
+
+    fn find(&self, variant: &str, scene: &str, seed: u64, protocol: &str) -> Option<&Row> {
+        let alike =
+            |row: &&Row| (&*row.variant, &*row.scene, row.seed, &*row.protocol) == (variant, scene, seed, protocol);
+        self.rows.iter().find(alike)
+    }
+
+    fn add(&mut self, row: &Row) -> anyhow::Result<()> {
+        self.rows.retain(|other| (&other.variant, &other.scene, other.seed) != (&row.variant, &row.scene, row.seed));
+        self.rows.push(row.clone());
+        self.done += 1;
+        write(&self.path, &self.rows)
+    }
+}
+
 /// All variants of one scene under one seed.
 fn of_scene(
     gpu: &Gpu,
@@ -349,13 +396,21 @@ fn of_scene(
     base: &Settings,
     judge: &Judge,
     (path, name, label): (&Path, &str, &str),
-    (seed, out, pace, done): (u64, &Path, &Pace, usize),
+    (seed, out, known): (u64, &Path, &mut Known),
 ) -> anyhow::Result<Vec<Row>> {
     let mut rows = vec![];
     // Read once for all variants that read it alike.
     let mut read: Option<(Settings, Scene)> = None;
     for variant in variants {
         let settings = variant.settings(base, path, seed);
+        let folder = folder(args, out, label, &variant.name, seed);
+        let begun = args.resume && is_begun(&folder, name, &settings)?;
+        if let Some(row) = known.find(&variant.name, label, seed, judge.protocol.describe()).filter(|_| begun) {
+            rows.push(row.clone());
+            known.done += 1;
+            known.pace.skip();
+            continue;
+        }
         // The seed is that of the built-in scene, too.
         let alike = |other: &Settings| other.scene == settings.scene && other.train.seed == settings.train.seed;
         if !read.as_ref().is_some_and(|(other, _)| alike(other)) {
@@ -368,7 +423,6 @@ fn of_scene(
                 path.display()
             );
         }
-        let folder = folder(args, out, label, &variant.name, seed);
         let mut which = variant.name.clone();
         if args.scenes.len() > 1 {
             which = format!("{label}, {which}");
@@ -376,9 +430,12 @@ fn of_scene(
         if args.seeds > 1 {
             which = format!("{which}, seed {seed}");
         }
-        eprintln!("{}", format!("== {which} {}", pace.next(done + rows.len())).trim_end());
+        eprintln!("{}", format!("== {which} {}", known.pace.next(known.done)).trim_end());
+        let train = if args.resume { train_on } else { train };
         let trained = train(gpu, scene, &settings, name, &folder, &Manner::default(), judge)?;
-        rows.push(Row::new(variant, label, seed, &trained)?);
+        let row = Row::new(variant, label, seed, &trained, judge)?;
+        known.add(&row)?;
+        rows.push(row);
     }
     Ok(rows)
 }
@@ -531,6 +588,20 @@ mod tests {
         assert!(Probe::try_parse_from(["probe"]).is_err(), "a scene is needed");
     }
 
+    /// Presets for CPUs have no attention: an ablation of it would compare a variant with itself.
+    #[test]
+    fn a_variant_has_its_parts_whatever_the_preset_says() {
+        let args = args(&["s", "--preset", "lavapipe"]);
+        let base = args.settings.resolve().expect("a preset");
+        assert!(!base.model.attention.enabled, "the preset has none");
+        let parts = |v: Variant| {
+            let settings = v.settings(&base, Path::new("s"), 0);
+            (settings.losses.depth.enabled, settings.model.attention.enabled, settings.model.attention.write_back)
+        };
+        let all: Vec<_> = Variant::all(&args).expect("variants").into_iter().map(parts).collect();
+        assert_eq!(all, [(false, false, false), (true, false, false), (true, true, false), (true, true, true)]);
+    }
+
     #[test]
     fn scenes_of_one_name_are_numbered() {
         let names = ["/x/1", "/y/1", "/y/2"].map(str::to_owned);
@@ -549,7 +620,8 @@ mod tests {
             anchors: 1,
             metrics: Metrics::new(Figures { psnr, ssim: 0.5, flip: 0.5 }),
             residue: None,
-            figures: [("psnr", psnr)].into(),
+            figures: [("psnr".to_owned(), psnr)].into(),
+            protocol: String::new(),
         };
         let mut rows = vec![];
         for (seed, gain) in [(0, 1.0), (1, 2.0), (2, 3.0)] {

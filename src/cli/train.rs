@@ -140,11 +140,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         let (scene, settings) = preset::load(&given, &args.device)?;
         let name = given.name();
         let folder = args.out.clone().unwrap_or_else(|| default_folder(&name));
-        let begun = args.resume_or_start && folder.join(RECORD).exists();
+        let begun = args.resume_or_start && is_begun(&folder, &name, &settings)?;
         if begun {
-            let record = Record::read(&folder)?;
-            same_run(&folder, &record, &name, &settings)?;
-            if is_complete(&folder, &record)? {
+            if is_complete(&folder, &Record::read(&folder)?)? {
                 return Ok(());
             }
         } else if folder.join(RECORD).exists() && !args.overwrite {
@@ -167,7 +165,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         let manner = Manner { began: Some(began), board };
         eprintln!("device: {} ({})", gpu.info().name, gpu.info().driver);
         let Trained { summary, report, mut written } = if begun {
-            resume(gpu, &scene, &settings, &name, &folder, &manner)?
+            resume(gpu, &scene, &settings, &name, &folder, &manner, &Judge::default())?
         } else {
             train(gpu, &scene, &settings, &name, &folder, &manner, &Judge::default())?
         };
@@ -205,6 +203,15 @@ fn is_complete(folder: &Path, record: &Record) -> anyhow::Result<bool> {
     checkpoint::clear(folder)?;
     println!("{}: the run is complete ({steps} steps): nothing to do", folder.display());
     Ok(true)
+}
+
+/// Whether the folder holds a run; one of another scene or under other settings is refused.
+pub(super) fn is_begun(folder: &Path, name: &str, settings: &Settings) -> anyhow::Result<bool> {
+    let begun = folder.join(RECORD).exists();
+    if begun {
+        same_run(folder, &Record::read(folder)?, name, settings)?;
+    }
+    Ok(begun)
 }
 
 /// Refuses to go on with a run of another scene or under other settings than those asked for.
@@ -285,6 +292,22 @@ fn start<'a>(gpu: &'a Gpu, scene: &'a Scene, settings: &'a Settings) -> anyhow::
     Ok(run)
 }
 
+/// As [`train`], but goes on with a run that is in `folder` and not complete.
+pub(super) fn train_on(
+    gpu: &Gpu,
+    scene: &Scene,
+    settings: &Settings,
+    name: &str,
+    folder: &Path,
+    manner: &Manner,
+    judge: &Judge,
+) -> anyhow::Result<Trained> {
+    if is_begun(folder, name, settings)? && Record::read(folder)?.complete.is_none() {
+        return resume(gpu, scene, settings, name, folder, manner, judge);
+    }
+    train(gpu, scene, settings, name, folder, manner, judge)
+}
+
 /// Goes on with the run in `folder`.
 fn resume(
     gpu: &Gpu,
@@ -293,6 +316,7 @@ fn resume(
     name: &str,
     folder: &Path,
     manner: &Manner,
+    judge: &Judge,
 ) -> anyhow::Result<Trained> {
     sweep(folder);
     let mut record = Record::read(folder)?;
@@ -323,7 +347,7 @@ fn resume(
         record.write(folder)?;
     }
     let trained = finish(run, settings, folder, manner)?;
-    judged(gpu, scene, settings, (folder, record), &Judge::default(), trained)
+    judged(gpu, scene, settings, (folder, record), judge, trained)
 }
 
 /// Trains to the end and evaluates.

@@ -7,30 +7,38 @@ use std::time::{Duration, Instant};
 pub struct Pace {
     began: Instant,
     all: usize,
+    /// Of those done, how many took no time.
+    skipped: usize,
 }
 
 impl Pace {
     /// So many pieces.
     pub fn new(all: usize) -> Self {
-        Self { began: Instant::now(), all }
+        Self { began: Instant::now(), all, skipped: 0 }
+    }
+
+    /// One piece was done before; it counts among those done, and says nothing of the time.
+    pub fn skip(&mut self) {
+        self.skipped += 1;
     }
 
     /// `2 of 8, about 12 min left`, when so many pieces are done and the next begins; without the time before the first
     /// is done, and empty where there is only one.
     pub fn next(&self, done: usize) -> String {
-        place(done, self.all, self.began.elapsed())
+        place(done, self.all, self.skipped, self.began.elapsed())
     }
 }
 
-fn place(done: usize, all: usize, passed: Duration) -> String {
+fn place(done: usize, all: usize, skipped: usize, passed: Duration) -> String {
     if all < 2 {
         return String::new();
     }
     let place = format!("{} of {all}", done + 1);
-    if done == 0 {
+    let taken = done.saturating_sub(skipped);
+    if taken == 0 {
         return place;
     }
-    let left = passed.as_secs_f64() / done as f64 * all.saturating_sub(done) as f64;
+    let left = passed.as_secs_f64() / taken as f64 * all.saturating_sub(done) as f64;
     format!("{place}, about {} left", duration(left))
 }
 
@@ -49,7 +57,9 @@ mod tests {
 
     #[test]
     fn the_time_left_follows_what_is_done() {
-        let after = |done, all, seconds| place(done, all, Duration::from_secs(seconds));
+        let after = |done, all, seconds| place(done, all, 0, Duration::from_secs(seconds));
+        assert_eq!(place(5, 9, 5, Duration::from_secs(1)), "6 of 9");
+        assert_eq!(place(6, 9, 5, Duration::from_secs(10)), "7 of 9, about 30 s left");
         assert_eq!(after(0, 1, 0), "");
         assert_eq!(after(0, 4, 0), "1 of 4");
         assert_eq!(after(1, 4, 10), "2 of 4, about 30 s left");
