@@ -311,6 +311,7 @@ fn a_disk_that_fills_up_leaves_nothing() {
 }
 
 #[test]
+#[ignore = "long; .ci/run has it"]
 fn mistakes_are_one_sentence() {
     let folder = with_run(32, 4);
     let folder = folder.path();

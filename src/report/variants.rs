@@ -14,9 +14,10 @@ pub const KERNELS: &[Choice] = &[
     ("alpha from 1/1000", &["render.alpha_threshold=0.001"]),
     ("alpha from 1/64", &["render.alpha_threshold=0.015625"]),
     ("no early stop", &["render.transmittance_threshold=0.0"]),
-    ("half the tokens", &["model.attention.tokens*=0.5"]),
-    ("a quarter of the tokens", &["model.attention.tokens*=0.25"]),
-    ("attention written back", &["model.attention.write_back=true"]),
+    ("attention", &["model.attention.enabled=true"]),
+    ("half the tokens", &["model.attention.enabled=true", "model.attention.tokens*=0.5"]),
+    ("a quarter of the tokens", &["model.attention.enabled=true", "model.attention.tokens*=0.25"]),
+    ("attention written back", &["model.attention.enabled=true", "model.attention.write_back=true"]),
     ("no attention", &["model.attention.enabled=false"]),
     ("depth gradient at one scale", &["losses.depth.gradient.scales=1"]),
     ("no depth gradient", &["losses.depth.gradient.weight=0.0"]),
@@ -26,7 +27,8 @@ pub const KERNELS: &[Choice] = &[
 /// Choices of a whole training run.
 pub const TRAINING: &[Choice] = &[
     ("as set", &[]),
-    ("a quarter of the tokens", &["model.attention.tokens*=0.25"]),
+    ("attention", &["model.attention.enabled=true"]),
+    ("a quarter of the tokens", &["model.attention.enabled=true", "model.attention.tokens*=0.25"]),
     ("no attention", &["model.attention.enabled=false"]),
     ("no depth", &["losses.depth.enabled=false"]),
     ("half the resolution", &["scene.downscale*=2"]),
@@ -102,7 +104,9 @@ mod tests {
                 table.iter().map(|(name, changes)| (*name, changes.iter().map(|c| (*c).to_owned()).collect()));
             let variants = resolve(&[], &base, choices).expect("settings that exist");
             assert!(variants[0].changes.is_empty() && variants[0].settings == base);
-            assert!(variants[1..].iter().all(|variant| variant.settings != base), "{variants:#?}");
+            // What a part costs is asked with and without it, and the settings have it or not.
+            let changes = |variant: &Variant| variant.settings != base || variant.name == "no attention";
+            assert!(variants[1..].iter().all(changes), "{variants:#?}");
         }
     }
 

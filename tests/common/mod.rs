@@ -36,6 +36,7 @@ pub fn settings(iterations: u32) -> Settings {
     settings.train.eval_interval = 0;
     settings.model.voxel = 0.0;
     let attention = &mut settings.model.attention;
+    attention.enabled = true;
     (attention.start, attention.patch, attention.tokens, attention.min_tokens) = (3, 24, 64, 2);
     let densify = &mut settings.densify;
     (densify.statistics_from, densify.from, densify.until, densify.every) = (2, 4, 12, 2);
