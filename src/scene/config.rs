@@ -37,6 +37,9 @@ pub struct Config {
     /// Add points behind the depth edges of the hole, where other train cameras see what neither the reference nor any
     /// photograph shows.
     pub seed_behind_edges: bool,
+    /// Let the train masks grow by as many pixels as an inpainted picture was repainted beyond its own: the object's shadow
+    /// goes with it, and what the photographs show there. A picture that is the photograph outside its mask changes nothing.
+    pub grow_masks: bool,
     /// Let the train masks fall off over so many pixels around the object, at the training size: its antialiased edge and
     /// shadow reach beyond the mask. 0: masks are hard (GScream).
     pub rim: u32,
@@ -103,6 +106,7 @@ impl Default for Config {
             guess_reference_prior: true,
             seed_hole: true,
             seed_behind_edges: true,
+            grow_masks: false,
             rim: 1,
             whole_reference: false,
             outrank_guess: 5,

@@ -4,6 +4,7 @@
 //! - [`unit`]: lengths are counted in a unit that the scene itself gives, so that the user's unit changes nothing.
 //! - [`sparse`]: each prior is held against the points of the sparse model. One that does not follow them is not used, and
 //!   disparity becomes depth.
+//! - [`rim`]: masks grow, if asked for, by what the inpainted picture was repainted beyond them, and fall off around the object.
 //! - [`points`]: points on the object are left out, and the hole gets points from the reference view's prior, behind its
 //!   depth edges too.
 //! - [`stereo`]: a reference that shows the truth gets the depth that the test views measure, where that is asked for.
@@ -14,6 +15,7 @@
 
 mod points;
 mod reference;
+mod rim;
 mod sparse;
 mod stereo;
 mod unit;
@@ -25,6 +27,7 @@ pub use unit::footprint;
 /// Makes a scene that was read ready for training, and adds what was done to its notes.
 pub fn condition(scene: &mut Scene, config: &Config) {
     unit::normalize(scene, config.unit);
+    rim::grow_masks(scene, config.grow_masks);
     points::drop_object(scene, config.object_point_share);
     if config.truth_prior == STEREO_PRIOR {
         stereo::measure_prior(scene);
@@ -42,7 +45,7 @@ pub fn condition(scene: &mut Scene, config: &Config) {
     if config.seed_behind_edges {
         points::seed_behind_edges(scene, &depths);
     }
-    reference::soften_masks(scene, config.rim);
+    rim::soften_masks(scene, config.rim);
     if !config.whole_reference {
         reference::composite(scene);
     }

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use super::points::{lift, pixel_of};
 use super::sparse::{Sample, fit, samples};
-use crate::scene::{Prior, PriorKind, Reference, Scene, resample};
+use crate::scene::{Prior, PriorKind, Reference, Scene};
 
 /// Of each reference, the depth z of its hole \[pixel\], NaN outside it: its prior brought to the scene's depth by the points
 /// outside the mask. `None` without a prior, or without enough points.
@@ -155,21 +155,6 @@ fn plane(weighted: &[Weighted], reach: f64) -> [f64; 3] {
     let determinant = xx * yy - xy * xy;
     let slope = [(xv * yy - yv * xy) / determinant, (yv * xx - xv * xy) / determinant];
     [mv - slope[0] * mx - slope[1] * my, slope[0], slope[1]]
-}
-
-/// Lets the train masks fall off to 0 over so many pixels around the object, whose antialiased edge, shadow and glow reach
-/// beyond the mask: what is drawn there counts less the nearer it is.
-pub(super) fn soften_masks(scene: &mut Scene, rim: u32) {
-    for mask in scene.train.iter_mut().filter_map(|v| v.mask.as_mut()) {
-        let hard = mask.clone();
-        for radius in (1..=rim).rev() {
-            let value = (255.0 * (1.0 - f64::from(radius) / f64::from(rim + 1))).round() as u8;
-            let grown = resample::dilate(&hard, radius);
-            // From the outermost ring inwards: nearer rings overwrite.
-            mask.iter_mut().zip(grown.as_raw()).filter(|(_, g)| **g != 0).for_each(|(m, _)| *m = value);
-        }
-        mask.iter_mut().zip(hard.as_raw()).filter(|(_, h)| **h != 0).for_each(|(m, h)| *m = *h);
-    }
 }
 
 /// Takes the inpainted pictures in their holes and the photographs outside, mixed as the mask falls off: networks that

@@ -1,0 +1,167 @@
+//! The object's rim: its shadow, its glow and its antialiased edge reach beyond the masks.
+
+use image::{GrayImage, RgbImage};
+
+use crate::scene::{Scene, resample};
+
+/// How far beyond a mask is looked, as a share of the picture's longer side.
+const REACH: f64 = 0.025;
+/// A ring was repainted where it differs from the photograph by more than so many times what the rest of the picture does ...
+const TIMES: f64 = 2.0;
+/// ... and one level of 8 bits, which rounding alone makes.
+const LEVEL: f64 = 1.0;
+
+/// A single ring is what resampling mixes at a mask's edge.
+const FEWEST: u32 = 2;
+
+/// Says by how many pixels an inpainted picture was repainted beyond its mask, and lets all train masks `grow` by as much if
+/// asked for. Who inpaints takes the object's shadow along, in a wider mask than the one delivered; the photographs still
+/// show it there. What else they show there is lost with it.
+pub(super) fn grow_masks(scene: &mut Scene, grow: bool) {
+    let radius = |reference: &crate::scene::Reference| {
+        let view = &scene.train[reference.view];
+        Some((repainted(&reference.image, &view.image, view.mask.as_ref()?), view.name.clone()))
+    };
+    let inpainted = scene.references.iter().filter(|reference| !reference.truth);
+    let Some((radius, name)) = inpainted.filter_map(radius).max_by_key(|(radius, _)| *radius) else { return };
+    if radius < FEWEST {
+        return;
+    }
+    let found = format!("reference {name} is repainted up to {radius} pixels beyond its mask");
+    if !grow {
+        scene
+            .notes
+            .push(format!("{found}; should a shadow stay around the hole, --set scene.grow_masks=true removes it"));
+        return;
+    }
+    for mask in scene.train.iter_mut().filter_map(|v| v.mask.as_mut()) {
+        *mask = resample::dilate(mask, radius);
+    }
+    scene.notes.push(format!("{found}: all masks grow by as much (scene.grow_masks)"));
+}
+
+/// Rings around the mask, a pixel wide each, that differ from the photograph; counted up to the first that does not.
+fn repainted(painted: &RgbImage, photograph: &RgbImage, mask: &GrayImage) -> u32 {
+    let reach = (REACH * f64::from(mask.width().max(mask.height()))).ceil() as u32;
+    let apart: Vec<f64> = painted
+        .pixels()
+        .zip(photograph.pixels())
+        .map(|(p, q)| p.0.iter().zip(q.0).map(|(p, q)| f64::from(p.abs_diff(q))).sum::<f64>() / 3.0)
+        .collect();
+    // Mean over the pixels that are in the first mask and not in the second.
+    let mean = |within: &dyn Fn(usize) -> bool| {
+        let (sum, count) = apart
+            .iter()
+            .enumerate()
+            .filter(|(pixel, _)| within(*pixel))
+            .fold((0.0, 0_usize), |(sum, count), (_, apart)| (sum + apart, count + 1));
+        (count > 0).then(|| sum / count as f64)
+    };
+    let far = resample::dilate(mask, 2 * reach);
+    let Some(rest) = mean(&|pixel| far.as_raw()[pixel] == 0) else { return 0 };
+    let mut inner = mask.clone();
+    for radius in 1..=reach {
+        let outer = resample::dilate(mask, radius);
+        let ring = mean(&|pixel| outer.as_raw()[pixel] != 0 && inner.as_raw()[pixel] == 0);
+        if ring.is_none_or(|ring| ring <= TIMES * rest + LEVEL) {
+            return radius - 1;
+        }
+        inner = outer;
+    }
+    reach
+}
+
+/// Lets the train masks fall off to 0 over so many pixels around the object, whose antialiased edge, shadow and glow reach
+/// beyond the mask: what is drawn there counts less the nearer it is.
+pub(super) fn soften_masks(scene: &mut Scene, rim: u32) {
+    for mask in scene.train.iter_mut().filter_map(|v| v.mask.as_mut()) {
+        let hard = mask.clone();
+        for radius in (1..=rim).rev() {
+            let value = (255.0 * (1.0 - f64::from(radius) / f64::from(rim + 1))).round() as u8;
+            let grown = resample::dilate(&hard, radius);
+            // From the outermost ring inwards: nearer rings overwrite.
+            mask.iter_mut().zip(grown.as_raw()).filter(|(_, g)| **g != 0).for_each(|(m, _)| *m = value);
+        }
+        mask.iter_mut().zip(hard.as_raw()).filter(|(_, h)| **h != 0).for_each(|(m, h)| *m = *h);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use image::Rgb;
+
+    use super::*;
+    use crate::scene::{Config, load, synthetic};
+
+    fn scene() -> Scene {
+        let folder = tempfile::tempdir().expect("a folder");
+        let dir = folder.path().join("scene");
+        let options =
+            synthetic::Options { width: 160, height: 120, train_views: 6, test_views: 1, ..Default::default() };
+        synthetic::write(&dir, &options).expect("a scene");
+        load(&dir, &Config::default()).expect("it loads")
+    }
+
+    /// Changes the reference's pixels up to so many `beyond` the mask; `paint` gets a pixel's index and its colour.
+    fn painted(scene: &mut Scene, beyond: u32, paint: impl Fn(u32, Rgb<u8>) -> Rgb<u8>) {
+        let reference = &mut scene.references[0];
+        let mask = scene.train[reference.view].mask.as_ref().expect("a mask");
+        let wide = resample::dilate(mask, beyond);
+        for (i, (pixel, w)) in reference.image.pixels_mut().zip(wide.as_raw()).enumerate() {
+            if *w != 0 {
+                *pixel = paint(i as u32, *pixel);
+            }
+        }
+    }
+
+    #[test]
+    fn masks_grow_by_what_was_repainted() {
+        let mut scene = scene();
+        let masks: Vec<GrayImage> = scene.train.iter().map(|v| v.mask.clone().expect("a mask")).collect();
+        // The built-in reference is the photograph outside its hole.
+        let own = {
+            let reference = &scene.references[0];
+            let view = &scene.train[reference.view];
+            repainted(&reference.image, &view.image, view.mask.as_ref().expect("a mask"))
+        };
+        assert_eq!(own, 0, "nothing was repainted");
+        grow_masks(&mut scene, true);
+        assert!(
+            scene.train.iter().zip(&masks).all(|(v, m)| v.mask.as_ref() == Some(m))
+                && scene.notes.iter().all(|n| !n.contains("grow"))
+        );
+
+        // A network leaves noise everywhere, and another colour up to three pixels beyond the mask.
+        painted(&mut scene, 1000, |i, p| Rgb(p.0.map(|v| v.saturating_add((i * 7 % 5) as u8))));
+        painted(&mut scene, 3, |_, p| Rgb(p.0.map(|v| 255 - v)));
+        grow_masks(&mut scene, false);
+        assert!(scene.train.iter().zip(&masks).all(|(v, m)| v.mask.as_ref() == Some(m)), "not unless asked for");
+        assert!(scene.notes.last().is_some_and(|n| n.contains("3 pixels beyond its mask; should a shadow stay")));
+        grow_masks(&mut scene, true);
+        for (view, mask) in scene.train.iter().zip(&masks) {
+            assert_eq!(view.mask, Some(resample::dilate(mask, 3)), "{}", view.name);
+        }
+        assert!(scene.notes.last().expect("a note").contains("3 pixels beyond its mask"), "{:?}", scene.notes.last());
+    }
+
+    /// Not what a network left, but the place itself at another time.
+    #[test]
+    fn the_truth_was_not_repainted() {
+        let mut scene = scene();
+        painted(&mut scene, 3, |_, p| Rgb(p.0.map(|v| 255 - v)));
+        scene.references[0].truth = true;
+        let before = scene.train[0].mask.clone();
+        grow_masks(&mut scene, true);
+        assert_eq!(scene.train[0].mask, before);
+    }
+
+    #[test]
+    fn a_picture_of_which_nothing_is_left_tells_nothing() {
+        let white = RgbImage::from_pixel(40, 30, Rgb([255; 3]));
+        let black = RgbImage::new(40, 30);
+        assert_eq!(repainted(&white, &black, &GrayImage::from_pixel(40, 30, image::Luma([255]))), 0);
+        let mut spot = GrayImage::new(40, 30);
+        spot.put_pixel(20, 15, image::Luma([255]));
+        assert_eq!(repainted(&white, &black, &spot), 0, "it differs everywhere alike");
+    }
+}
