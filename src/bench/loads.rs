@@ -571,7 +571,7 @@ mod tests {
             return;
         }
         let mut settings = Settings::default();
-        settings.model.attention.tokens = 16;
+        (settings.model.attention.enabled, settings.model.attention.tokens) = (true, 16);
         let ceilings = crate::bench::tests::record().ceilings;
         for (pairs, size) in [(1500.0, [160, 90]), (12_000.0, [320, 180])] {
             let load = Load { anchors: 400, pairs, size };
