@@ -48,7 +48,9 @@ fn registers_and_spills_are_those_of_the_table() {
         return;
     }
     for (family, subgroup) in [("gfx1100", "64"), ("gfx1100", "32"), ("navi21", "64"), ("vega10", "64")] {
-        let arguments = ["kernels", "synthetic", "--preset", "demo", "--subgroup", subgroup, "--json"];
+        let attention = "model.attention.enabled=true";
+        let arguments =
+            ["kernels", "synthetic", "--preset", "demo", "--set", attention, "--subgroup", subgroup, "--json"];
         let output = on_null_device(family, &arguments).output().expect("it runs");
         assert!(output.status.success(), "{family}: {}", String::from_utf8_lossy(&output.stderr));
         let found: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
