@@ -698,6 +698,10 @@ fn ablate_compares_over_seeds_and_scenes() {
         let (was, is) = (mean(&comparison).expect("a number"), mean(&read("comparison.json")).expect("a number"));
         assert!((is / was - 1.0).abs() < 1e-12, "{figure}: taken as it is: {was}, {is}");
     }
+    // A part of the variants asked for again: the others' runs stay known.
+    let part = command.replace("neither,priors-same", "neither");
+    succeeds(folder, &format!("{part} {few} --resume"));
+    assert_eq!(read("ablation.json").as_array().map(Vec::len), Some(8), "no run is forgotten");
     let other = run(folder, &format!("{command} {few} --resume --set losses.ssim_weight=0.1"));
     assert!(other.code == 1 && other.stderr.contains("other settings"), "{}", other.stderr);
 

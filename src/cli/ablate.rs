@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use super::eval::JudgeArgs;
 use super::report::last_part;
 use super::shared::{DeviceArgs, SYNTHETIC, SceneArgs, load_scene, with_gpu};
-use super::train::{Manner, Trained, default_folder, is_begun, train, train_on};
+use super::train::{Manner, Trained, default_folder, is_begun, train};
 use super::{index, next};
 use crate::config::{Settings, SettingsArgs};
 use crate::evaluate::{Judge, Mean, Metrics, PUBLISHED_ROWS, Published, Region};
@@ -66,7 +66,8 @@ pub(super) struct Args {
     out: Option<PathBuf>,
     /// Leave runs alone that the folder holds complete, and go on with one that was cut short
     ///
-    /// Scenes and settings must be those that the runs began with. More seeds and variants may be asked for than before.
+    /// Scenes and settings must be those that the runs began with. Other variants may be asked for, and more seeds where
+    /// there were several.
     #[arg(long)]
     resume: bool,
     #[command(flatten)]
@@ -309,7 +310,6 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     })?;
     let last = rows.last().map(|row| folder(args, &out, &row.scene, &row.variant, row.seed));
     let comparison = compare(&variants, &rows, labels, seeds, &judge);
-    write(&out.join(RUNS), &rows)?;
     write(&out.join("comparison.json"), &comparison)?;
     print!("{}", table(&comparison.variants));
     print!("{}", differences(&comparison.differences));
@@ -431,8 +431,8 @@ fn of_scene(
             which = format!("{which}, seed {seed}");
         }
         eprintln!("{}", format!("== {which} {}", known.pace.next(known.done)).trim_end());
-        let train = if args.resume { train_on } else { train };
-        let trained = train(gpu, scene, &settings, name, &folder, &Manner::default(), judge)?;
+        let manner = Manner { go_on: begun, ..Manner::default() };
+        let trained = train(gpu, scene, &settings, name, &folder, &manner, judge)?;
         let row = Row::new(variant, label, seed, &trained, judge)?;
         known.add(&row)?;
         rows.push(row);

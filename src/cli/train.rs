@@ -162,13 +162,10 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             None => settings,
         };
         let board = args.view.map(|address| show(address, &name, &scene, &settings)).transpose()?;
-        let manner = Manner { began: Some(began), board };
+        let manner = Manner { began: Some(began), board, go_on: begun };
         eprintln!("device: {} ({})", gpu.info().name, gpu.info().driver);
-        let Trained { summary, report, mut written } = if begun {
-            resume(gpu, &scene, &settings, &name, &folder, &manner, &Judge::default())?
-        } else {
-            train(gpu, &scene, &settings, &name, &folder, &manner, &Judge::default())?
-        };
+        let Trained { summary, report, mut written } =
+            train(gpu, &scene, &settings, &name, &folder, &manner, &Judge::default())?;
         if let Some(report) = report {
             println!("{}", report.table());
         }
@@ -240,6 +237,8 @@ pub(super) struct Manner {
     pub began: Option<Instant>,
     /// Where visitors see it.
     pub board: Option<Arc<Board>>,
+    /// Goes on with a run that is in the folder and not complete, instead of replacing it.
+    pub go_on: bool,
 }
 
 /// What a finished run is.
@@ -252,7 +251,8 @@ pub(super) struct Trained {
     pub written: Vec<&'static str>,
 }
 
-/// Trains into `folder`, in place of any run that is there, and evaluates, with a progress bar on stderr.
+/// Trains into `folder`, in place of any run that is there unless it is gone on with, and evaluates, with a progress bar on
+/// stderr.
 pub(super) fn train(
     gpu: &Gpu,
     scene: &Scene,
@@ -262,6 +262,9 @@ pub(super) fn train(
     manner: &Manner,
     judge: &Judge,
 ) -> anyhow::Result<Trained> {
+    if manner.go_on && Record::read(folder)?.complete.is_none() {
+        return resume(gpu, scene, settings, name, folder, manner, judge);
+    }
     std::fs::create_dir_all(folder).with_context(|| format!("{}: cannot be made", folder.display()))?;
     let run = start(gpu, scene, settings)?;
     clear(folder)?;
@@ -290,22 +293,6 @@ fn start<'a>(gpu: &'a Gpu, scene: &'a Scene, settings: &'a Settings) -> anyhow::
         eprintln!("memory: about {mib} MiB of device memory at most, with {} anchors at the end", forecast.anchors);
     }
     Ok(run)
-}
-
-/// As [`train`], but goes on with a run that is in `folder` and not complete.
-pub(super) fn train_on(
-    gpu: &Gpu,
-    scene: &Scene,
-    settings: &Settings,
-    name: &str,
-    folder: &Path,
-    manner: &Manner,
-    judge: &Judge,
-) -> anyhow::Result<Trained> {
-    if is_begun(folder, name, settings)? && Record::read(folder)?.complete.is_none() {
-        return resume(gpu, scene, settings, name, folder, manner, judge);
-    }
-    train(gpu, scene, settings, name, folder, manner, judge)
 }
 
 /// Goes on with the run in `folder`.

@@ -68,7 +68,6 @@ fn main() {
     let arguments = Arguments::from_args();
     let cases = cases();
     let guarantees = table(&cases);
-    let is_long = |case: &Case| long::CASES.iter().any(|long| long.case == case.case);
     let trial = |case: &'static Case, form: Option<Form>| {
         let name = format!("{}: {}{}", case.stage, case.case, form.map_or("", |_| " (form of GPUs)"));
         let trial = Trial::test(name, move || {
@@ -77,11 +76,9 @@ fn main() {
             Ok(())
         });
         // Minutes: `.ci/run` has it.
-        trial.with_ignored_flag(is_long(case))
+        trial.with_ignored_flag(long::CASES.iter().any(|long| long.case == case.case))
     };
-    // The long ones begin at once, beside all others.
-    let (long, short): (Vec<_>, Vec<_>) = cases.iter().partition(|case| is_long(case));
-    let mut trials: Vec<Trial> = long.into_iter().chain(short).map(|case| trial(case, None)).collect();
+    let mut trials: Vec<Trial> = cases.iter().map(|case| trial(case, None)).collect();
     // On a CPU driver, what has a form for GPUs is tried in that form, too.
     let formed = cases.iter().filter(|case| FORMED.contains(&case.stage));
     trials.extend(formed.map(|case| trial(case, Some(Form::Gpu))));
