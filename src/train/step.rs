@@ -675,7 +675,12 @@ impl Step {
         let layout = Layout { offsets: self.anchors.offsets as usize };
         let Some(weights) = &gradients.weights else { return Ok(all) };
         let flat = self.gpu.read_range(weights, layout.weights())?;
-        let weights = files::Weights::from_device(self.anchors.offsets as usize, &flat, None);
+        let attention = self
+            .attend
+            .as_ref()
+            .map(|attend| self.gpu.read_range(&attend.grad_weights, crate::math::attention::WEIGHTS));
+        let attention = attention.transpose()?;
+        let weights = files::Weights::from_device(self.anchors.offsets as usize, &flat, attention.as_deref());
         all.extend(weights.tensors.into_iter().map(|(name, tensor)| (name, tensor.data)));
         Ok(all)
     }

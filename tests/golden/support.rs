@@ -77,6 +77,13 @@ impl Case {
         }
     }
 
+    /// A text, stored as its bytes.
+    pub fn text(&self, tensor: &str) -> String {
+        let tensors = self.tensors();
+        let view = tensors.tensor(tensor).unwrap_or_else(|e| panic!("{}: {tensor}: {e}", self.name));
+        String::from_utf8(view.data().to_vec()).unwrap_or_else(|e| panic!("{}: {tensor}: {e}", self.name))
+    }
+
     /// A tensor as float32 (inputs are float32 in the file, so nothing is lost).
     pub fn f32(&self, tensor: &str) -> Vec<f32> {
         self.f64(tensor).into_iter().map(|v| v as f32).collect()
