@@ -14,7 +14,8 @@ layout(binding = 4, scalar) buffer Root { vec4 root[]; };                  // [e
 layout(push_constant, scalar) uniform Push {
   uint offset;             // first element
   uint n;                  // elements from there
-  float rate;              // learning rate
+  vec3 rate;               // learning rate: of the first part, of the second, of the third
+  uvec2 parts;             // where the second part and the third begin
   float epsilon;           // added to the root of the corrected second moment
   float complement1;       // 1 - beta1
   float root_decay;        // 1 - sqrt(beta2)
@@ -28,7 +29,9 @@ void main() {
   if (overflow[0] != 0u) return;
   // CPU drivers load a push constant again for every lane wherever it is read in a loop.
   uint offset = push.offset, end = offset + push.n;
-  float rate = push.rate, epsilon = push.epsilon, complement1 = push.complement1;
+  vec3 rates = push.rate;
+  uvec2 parts = push.parts;
+  float epsilon = push.epsilon, complement1 = push.complement1;
   float root_decay = push.root_decay, root_complement = push.root_complement;
   float correction = push.correction, root_correction = push.root_correction;
   uint i = offset / 4u + group_index() * (gl_WorkGroupSize.x * VECTORS) + gl_LocalInvocationID.x;
@@ -45,6 +48,12 @@ void main() {
     // Largest and smallest pass over what is not a number: a lost moment or gradient must not look whole again.
     vec4 sum = a + b;
     r = mix(r, sum, equal(floatBitsToUint(sum) & 0x7f800000u, uvec4(0x7f800000u)));
+    vec4 rate = vec4(rates.x);
+    if (4u * i + 3u >= parts.x) {
+      uvec4 element = 4u * i + uvec4(0, 1, 2, 3);
+      rate = mix(rate, vec4(rates.y), greaterThanEqual(element, uvec4(parts.x)));
+      rate = mix(rate, vec4(rates.z), greaterThanEqual(element, uvec4(parts.y)));
+    }
     vec4 v = old_value - rate * ((correction * m) / (root_correction * r + epsilon));
     if (push.lazy != 0u) {
       bvec4 still = equal(g, vec4(0.0));

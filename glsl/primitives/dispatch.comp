@@ -6,6 +6,7 @@ layout(binding = 0, scalar) readonly buffer Count { uint count[]; };    // [1] i
 layout(binding = 1, scalar) writeonly buffer Groups { uint groups[]; }; // [4 * number] x, y, z of each dispatch; items after clamping
 layout(push_constant, scalar) uniform Push {
   uint capacity; // the count is clamped to this
+  uint added;    // and this is added
   uint limit;    // workgroups in x at most
   uint number;   // dispatches
   uvec3 shape0;  // items of a tile, threads per tile begun, threads of a workgroup
@@ -18,7 +19,7 @@ layout(push_constant, scalar) uniform Push {
   uvec3 shape7;
 } push;
 void main() {
-  uint i = gl_LocalInvocationID.x, n = min(count[0], push.capacity);
+  uint i = gl_LocalInvocationID.x, n = min(count[0], push.capacity) + push.added;
   if (i >= push.number) return;
   uvec3 shape = i < 4u ? i < 2u ? i == 0u ? push.shape0 : push.shape1 : i == 2u ? push.shape2 : push.shape3
                        : i < 6u ? i == 4u ? push.shape4 : push.shape5 : i == 6u ? push.shape6 : push.shape7;

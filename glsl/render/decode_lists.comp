@@ -11,14 +11,10 @@ layout(binding = 0, scalar) readonly buffer Groups { uint groups[]; };          
 layout(binding = 1, scalar) readonly buffer Listed { uint listed[]; };           // [listed_count] slots k V + v of the decoded Gaussians, ascending
 layout(binding = 2, scalar) readonly buffer ListedCount { uint listed_count[]; }; // [1]
 layout(binding = 3, scalar) writeonly buffer Segments { uint segments[]; };      // [K+2] where the list of each k begins; its end; visible anchors
-layout(binding = 4, scalar) writeonly buffer Bound { uint bound[]; };            // [1] list entries if each k's were padded to chunks
 void main() {
   uint k = thread_index(), n = groups[3], end = listed_count[0];
   if (k > OFFSETS) return;
-  if (k == 0u) {
-    segments[OFFSETS + 1u] = n;
-    bound[0] = end + OFFSETS * BLOCK;
-  }
+  if (k == 0u) segments[OFFSETS + 1u] = n;
   uint first = 0u, count = end;
   while (count > 0u) {
     uint step = count / 2u;

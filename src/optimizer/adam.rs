@@ -31,13 +31,15 @@ impl Default for Config {
 
 impl Config {
     /// What the kernel multiplies with in step `step` (counted from 1), for elements `offset .. offset + n`.
-    pub fn push(&self, step: u32, rate: f64, offset: u32, n: u32) -> adam::Push {
+    pub fn push(&self, step: u32, rates: impl Into<Rates>, offset: u32, n: u32) -> adam::Push {
+        let Rates { rate, parts } = rates.into();
         assert!(step > 0, "Adam counts steps from 1");
         let power = |beta: f64| 1.0 - beta.powf(f64::from(step));
         adam::Push {
             offset,
             n,
-            rate: rate as f32,
+            rate: rate.map(|rate| rate as f32),
+            parts,
             epsilon: self.epsilon as f32,
             complement1: (1.0 - self.beta1) as f32,
             root_decay: (1.0 - self.beta2.sqrt()) as f32,
@@ -46,6 +48,22 @@ impl Config {
             root_correction: (1.0 / power(self.beta2)).sqrt() as f32,
             lazy: self.lazy.into(),
         }
+    }
+}
+
+/// Learning rates of up to three parts of a tensor, one behind the other.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rates {
+    /// Of each part.
+    pub rate: [f64; 3],
+    /// The first elements of the second part and of the third.
+    pub parts: [u32; 2],
+}
+
+impl From<f64> for Rates {
+    /// One for the whole tensor.
+    fn from(rate: f64) -> Self {
+        Self { rate: [rate; 3], parts: [u32::MAX; 2] }
     }
 }
 
@@ -64,8 +82,8 @@ impl Reference for adam::Kernel {
         if host.overflow[0] != 0 {
             return;
         }
-        let factors = math::adam::Factors {
-            rate: push.rate.into(),
+        let factors = |rate: f32| math::adam::Factors {
+            rate: rate.into(),
             epsilon: push.epsilon.into(),
             complement1: push.complement1.into(),
             root_decay: push.root_decay.into(),
@@ -80,7 +98,8 @@ impl Reference for adam::Kernel {
                 continue;
             }
             let old = math::adam::State { value: value[i].into(), first: first[i].into(), root: root[i].into() };
-            let new = math::adam::step(old, gradient.into(), &factors);
+            let part = push.parts.iter().filter(|&&first| i >= first as usize).count();
+            let new = math::adam::step(old, gradient.into(), &factors(push.rate[part]));
             (value[i], first[i], root[i]) = (new.value as f32, new.first as f32, new.root as f32);
         }
     }
@@ -115,7 +134,7 @@ pub fn record(
     tensors: Tensors<'_>,
     overflow: &Buffer<u32>,
     (offset, n): (u32, u32),
-    (step, rate): (u32, f64),
+    (step, rates): (u32, impl Into<Rates>),
 ) {
     let Tensors { value, gradient, first, root } = tensors;
     let end = offset as usize + n as usize;
@@ -124,7 +143,7 @@ pub fn record(
     }
     let [value, gradient, first, root] = [value, gradient, first, root].map(Buffer::view::<[f32; 4]>);
     let buffers = adam::Buffers { overflow, gradient: &gradient, value: &value, first: &first, root: &root };
-    rec.run(adam::Kernel, buffers, config.push(step, rate, offset, n), threads(offset, n));
+    rec.run(adam::Kernel, buffers, config.push(step, rates, offset, n), threads(offset, n));
 }
 
 #[cfg(test)]
@@ -157,6 +176,12 @@ mod tests {
             for (step, offset, count) in [(1, 0, n), (7, n / 3, n / 2), (30_000, n / 2, n - n / 2), (2, n / 4, 0)] {
                 let push = Config::default().push(step, 0.0075, offset, count);
                 testing::assert_twin(adam::Kernel, &gpu, case(n as usize, 5), push, threads(offset, count));
+            }
+            // Parts that begin anywhere within a vector, an empty one among them.
+            for parts in [[n / 3, n / 2], [n / 3 + 1, n / 3 + 1], [n / 3 + 2, n / 3 + 3], [0, n]] {
+                let rates = Rates { rate: [0.1, 0.01, 0.001], parts };
+                let push = Config::default().push(3, rates, 0, n);
+                testing::assert_twin(adam::Kernel, &gpu, case(n as usize, 6), push, threads(0, n));
             }
         }
     }

@@ -13,7 +13,7 @@ fn shapes(push: &dispatch::Push) -> [[u32; 3]; SHAPES] {
 
 impl Reference for dispatch::Kernel {
     fn reference(host: dispatch::Host<'_>, push: dispatch::Push, (): ()) {
-        let n = host.count[0].min(push.capacity);
+        let n = host.count[0].min(push.capacity) + push.added;
         let shapes = shapes(&push).into_iter().take(push.number as usize);
         for (of, [tile, factor, group]) in host.groups.chunks_exact_mut(4).zip(shapes) {
             let groups = (n.div_ceil(tile) * factor).div_ceil(group);
@@ -68,26 +68,48 @@ pub fn record_several<const N: usize>(
     capacity: u32,
     of: [(&Groups, Shape); N],
 ) {
+    record_more(rec, count, (capacity, 0), of);
+}
+
+/// As [`record_several`], for `added` more items than there are.
+pub fn record_more<const N: usize>(
+    rec: &mut Recorder<'_>,
+    count: &Buffer<u32>,
+    (capacity, added): (u32, u32),
+    of: [(&Groups, Shape); N],
+) {
     let mut shapes = [[1, 0, 1]; SHAPES];
     for (i, (groups, Shape { tile, factor })) in of.into_iter().enumerate() {
         assert_eq!(groups.at as usize, i, "dispatches in the order in which they were made");
         shapes[i] = [tile, factor, groups.group];
     }
-    run(rec, count, &of[0].0.buffer, capacity, N as u32, shapes);
+    run(rec, count, &of[0].0.buffer, (capacity, added), N as u32, shapes);
 }
 
 fn run(
     rec: &mut Recorder<'_>,
     count: &Buffer<u32>,
     groups: &Buffer<u32>,
-    capacity: u32,
+    (capacity, added): (u32, u32),
     number: u32,
     shapes: [[u32; 3]; SHAPES],
 ) {
     let limit = rec.gpu().info().max_groups.min(65535);
     let [shape0, shape1, shape2, shape3, shape4, shape5, shape6, shape7] = shapes;
-    let push =
-        dispatch::Push { capacity, limit, number, shape0, shape1, shape2, shape3, shape4, shape5, shape6, shape7 };
+    let push = dispatch::Push {
+        capacity,
+        added,
+        limit,
+        number,
+        shape0,
+        shape1,
+        shape2,
+        shape3,
+        shape4,
+        shape5,
+        shape6,
+        shape7,
+    };
     rec.run(dispatch::Kernel, dispatch::Buffers { count, groups }, push, 1u32);
 }
 
@@ -136,7 +158,7 @@ impl Blocks {
             Count::Device(count) => {
                 let mut shapes = [[1, 0, 1]; SHAPES];
                 shapes[0] = [1, 1, self.items];
-                run(rec, count, &self.groups.buffer, self.capacity, 1, shapes);
+                run(rec, count, &self.groups.buffer, (self.capacity, 0), 1, shapes);
                 (count, self.capacity, Threads::Counted(&self.groups))
             }
             Count::Counted(count, groups) => (count, self.capacity, Threads::Counted(groups)),
@@ -152,11 +174,14 @@ mod tests {
     #[test]
     fn matches_its_twin() {
         let gpu = testing::gpu();
-        for count in [0, 1, 63, 64, 65, 4096, 5_000_000, u32::MAX] {
+        for (count, added) in
+            [0, 1, 63, 64, 65, 4096, 5_000_000, u32::MAX].into_iter().zip([0, 640, 0, 1].into_iter().cycle())
+        {
             for number in [1, 3, 8] {
                 let case = dispatch::Arrays { count: vec![count], groups: vec![u32::MAX; 4 * number as usize + 2] };
                 let push = dispatch::Push {
                     capacity: 10_000_000,
+                    added,
                     limit: 65535,
                     number,
                     shape0: [1, 3, 64],

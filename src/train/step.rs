@@ -501,6 +501,7 @@ impl Step {
         let gradient = PictureGradient { rgb: gradient.rgb, depth: gradient.depth, transmittance: None };
         rec.stage(stage::RASTERIZE_BACKWARD);
         backward.record(rec, forward.method(), forward.projected(), binned, picture, gradient);
+        self.sentinel(rec, Some(canvas.losses.terms()), losses::Term::ALL.len() as u32);
         let splats = SplatGradients {
             mean: &backward.grad_mean,
             covariance: &backward.grad_covariance,
@@ -525,12 +526,14 @@ impl Step {
         };
         rec.stage(stage::DECODE_BACKWARD);
         decode_backward.record(rec, &forward.decode, model, gaussians, to);
+        let network = Layout { offsets: anchors.offsets as usize }.weights() as u32;
+        self.sentinel(rec, gradients.weights.as_ref(), network);
         rec.stage(stage::ATTENTION);
         if let Some(((attend, attended), grad_feature)) = self.attend.as_ref().zip(attended).zip(to.feature) {
             attend.backward(rec, attended, grad_feature);
         }
         // Whatever changes the model or is gathered for it comes behind: it obeys the flag.
-        self.watch(rec, canvas.losses.terms(), attended, step);
+        self.watch(rec, attended, step);
         if let Some(statistics) = &self.statistics {
             let drawn = Drawn {
                 visible_count: &forward.visible.count,
@@ -547,9 +550,21 @@ impl Step {
         self.optimize(rec, attended, step, rates);
     }
 
-    /// Looks for values that are not finite: in the losses and the networks' gradients, into which every Gaussian's
-    /// gradients are summed, in each step; in all gradients, parameters and moments in every `sentinel_interval`-th.
-    fn watch(&self, rec: &mut Recorder<'_>, terms: &Buffer<f32>, attended: Option<Attended<'_>>, step: u32) {
+    /// Looks for values that are not finite in the first `count` of a tensor that every step looks at: the losses and the
+    /// networks' gradients, into which every Gaussian's gradients are summed. Each comes where passes wait anyway.
+    fn sentinel(&self, rec: &mut Recorder<'_>, tensor: Option<&Buffer<f32>>, count: u32) {
+        if self.config.train.sentinel_interval == 0 {
+            return;
+        }
+        if let Some(tensor) = tensor {
+            rec.stage(stage::SENTINEL);
+            finite::record(rec, tensor, count, self.limits.overflow(), None);
+        }
+    }
+
+    /// The rest of what every step looks at, the attention's gradients, and in every `sentinel_interval`-th step all
+    /// gradients, parameters and moments.
+    fn watch(&self, rec: &mut Recorder<'_>, attended: Option<Attended<'_>>, step: u32) {
         let Self { anchors, weights, .. } = self;
         let gradients = &self.stages().gradients;
         let interval = self.config.train.sentinel_interval;
@@ -559,10 +574,6 @@ impl Step {
         rec.stage(stage::SENTINEL);
         let flag = self.limits.overflow();
         let network = Layout { offsets: anchors.offsets as usize }.weights() as u32;
-        finite::record(rec, terms, losses::Term::ALL.len() as u32, flag, None);
-        if let Some(gradient) = &gradients.weights {
-            finite::record(rec, gradient, network, flag, None);
-        }
         let attention = self.attend.as_ref().zip(attended);
         if let Some((attend, attended)) = attention {
             finite::record(rec, &attend.grad_weights, attend.weights.width, flag, Some(attended.tokens()));
@@ -593,26 +604,27 @@ impl Step {
         let attention =
             attention.map(|(attend, attended)| (attend, attend.write_back(rec, attended, anchors, overflow)));
         rec.stage(stage::OPTIMIZER);
-        let mut update = |parameter: &Parameter, gradient: Option<&Buffer<f32>>, range: (u32, u32), rate: f64| {
-            let Some(gradient) = gradient.filter(|_| rate != 0.0) else { return };
+        let mut update = |parameter: &Parameter, gradient: Option<&Buffer<f32>>, count: u32, rates: adam::Rates| {
+            let Some(gradient) = gradient.filter(|_| rates.rate != [0.0; 3]) else { return };
             let tensors = Tensors { value: &parameter.value, gradient, first: &parameter.first, root: &parameter.root };
             // Networks have a gradient in every step.
             let adam = adam::Config { lazy: self.config.optimizer.lazy, ..self.adam };
-            adam::record(rec, &adam, tensors, overflow, range, (step, rate));
+            adam::record(rec, &adam, tensors, overflow, (0, count), (step, rates));
         };
-        let all = |parameter: &Parameter| (0, anchors.count * parameter.width);
         // What the release writes back it does not train any further.
         let config = &self.config.model.attention;
         let written_back = config.write_back && self.plan.attention && step >= config.start;
         let rate = if written_back { 0.0 } else { rates.feature };
-        update(&anchors.feature, gradients.feature.as_ref(), all(&anchors.feature), rate);
-        update(&anchors.offset, gradients.offset.as_ref(), all(&anchors.offset), rates.offset);
-        update(&anchors.log_scaling, gradients.log_scaling.as_ref(), all(&anchors.log_scaling), rates.log_scaling);
-        let layout = Layout { offsets: anchors.offsets as usize };
-        for (head, rate) in rates.decoders.into_iter().enumerate() {
-            let first = layout.head(head);
-            update(weights, gradients.weights.as_ref(), (first as u32, (layout.head(head + 1) - first) as u32), rate);
+        let of_anchors = [&gradients.feature, &gradients.offset, &gradients.log_scaling];
+        for ((parameter, gradient), rate) in
+            anchors.parameters().into_iter().zip(of_anchors).zip([rate, rates.offset, rates.log_scaling])
+        {
+            update(parameter, gradient.as_ref(), anchors.count * parameter.width, rate.into());
         }
+        let layout = Layout { offsets: anchors.offsets as usize };
+        let parts = [1, 2].map(|head| layout.head(head) as u32);
+        let of_decoders = adam::Rates { rate: rates.decoders, parts };
+        update(weights, gradients.weights.as_ref(), layout.weights() as u32, of_decoders);
         if let Some((attend, skip)) = attention {
             let weights = &attend.weights;
             let since = step + 1 - self.config.model.attention.start.max(1);

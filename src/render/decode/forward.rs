@@ -133,7 +133,6 @@ impl Reference for decode_lists::Kernel {
             host.segments[k as usize] = before as u32;
         }
         host.segments[offsets as usize + 1] = n;
-        host.bound[0] = end + offsets * BLOCK as u32;
     }
 }
 
@@ -206,7 +205,6 @@ pub struct Decode {
     pub existing: Slots,
     /// `[K+2]` of `decode_lists`.
     pub(super) segments: Buffer<u32>,
-    pub(super) bound: Buffer<u32>,
     pub(super) compact: Compact,
     pub(super) per_anchor: Groups,
     pub(super) per_hidden: Groups,
@@ -282,7 +280,6 @@ impl Decode {
                 groups: per_existing,
             },
             segments: gpu.buffer("segments", layout.offsets + 2)?,
-            bound: gpu.buffer("listed_bound", 1)?,
             compact: Compact::new(gpu, slots as u32)?,
             per_anchor,
             per_hidden,
@@ -312,11 +309,6 @@ impl Decode {
         &self.flags
     }
 
-    /// Most entries of the lists if each k's were padded to chunks.
-    fn most_bound(&self) -> u32 {
-        (self.capacity + BLOCK as u32) * self.layout.offsets as u32
-    }
-
     /// How many threads the passes over visible anchors have, and those over their slots.
     fn count(&self, rec: &mut Recorder<'_>, visible_count: &Buffer<u32>) {
         let (offsets, tile, lanes) = (self.layout.offsets as u32, self.tile, self.lanes);
@@ -342,7 +334,7 @@ impl Decode {
         let [center, center_low] = split(center);
         let (offsets, tile) = (self.layout.offsets as u32, self.tile);
         self.count(rec, visible_count);
-        let Self { packed, inputs, hidden, positive, opacity, flags, slot_count, existing, segments, bound, .. } = self;
+        let Self { packed, inputs, hidden, positive, opacity, flags, slot_count, existing, segments, .. } = self;
         let Slots { list: listed, count: listed_count, .. } = existing;
         let groups = &self.per_anchor.buffer;
         let pack = decode_pack::Buffers { weights: anchors.weights, groups, packed, slot_count };
@@ -367,15 +359,16 @@ impl Decode {
         let constants = decode_opacity::Constants { offsets, tile };
         rec.run_with(decode_opacity::Kernel, constants, buffers, push, &self.per_opacity);
         self.compact.record(rec, flags, listed, listed_count, self.slots());
-        let buffers = decode_lists::Buffers { groups, listed, listed_count, segments, bound };
-        rec.run_with(decode_lists::Kernel, decode_lists::Constants { offsets }, buffers, (), offsets + 1);
         let parts = if self.form == Form::Gpu { SECOND_THREADS } else { HIDDEN as u32 / UNITS };
         let shapes = [
             (&existing.groups, Shape::EACH),
             (&self.per_listed, Shape { tile, factor: 1 }),
             (&self.per_second, Shape { tile: BLOCK as u32, factor: parts }),
         ];
-        dispatch::record_several(rec, bound, self.most_bound(), shapes);
+        // As if each k's list were padded to chunks. Counted beside the list, before who reads the list waits for it.
+        dispatch::record_more(rec, listed_count, (self.capacity * offsets, BLOCK as u32 * offsets), shapes);
+        let buffers = decode_lists::Buffers { groups, listed, listed_count, segments };
+        rec.run_with(decode_lists::Kernel, decode_lists::Constants { offsets }, buffers, (), offsets + 1);
         let buffers = decode::Buffers {
             segments,
             listed,

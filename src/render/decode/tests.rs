@@ -154,7 +154,6 @@ fn kernels_match_their_twins() {
             listed: listed.clone(),
             listed_count: vec![found as u32],
             segments: vec![7; offsets + 4],
-            bound: vec![7; 2],
         };
         let constants = decode_lists::Constants { offsets: k };
         let segments = twin(decode_lists::Kernel, &gpu, constants, case, (), offsets + 1).segments;
