@@ -1,5 +1,6 @@
 //! Which accesses must wait for which: the one place barriers come from.
 
+use std::collections::HashMap;
 use std::fmt;
 
 use super::kernel::Access;
@@ -114,6 +115,36 @@ impl Hazards {
     }
 }
 
+/// For each pass, by its accesses, how many barriers must at least come before it: one more than before any earlier pass for
+/// which it has to wait.
+pub(super) fn waves<'a>(passes: impl Iterator<Item = &'a [(Id, &'static str, Access)]>) -> Vec<u32> {
+    /// The first wave for those that wait for a buffer's last write, and for its last read.
+    #[derive(Default)]
+    struct After {
+        write: u32,
+        read: u32,
+    }
+    let mut buffers: HashMap<Id, After> = HashMap::new();
+    let wave = |accesses: &'a [(Id, &'static str, Access)]| {
+        let first = |(id, _, access): &(Id, &'static str, Access)| {
+            let after = buffers.entry(*id).or_default();
+            if access.writes() { after.write.max(after.read) } else { after.write }
+        };
+        let wave = accesses.iter().map(first).max().unwrap_or(0);
+        for (id, _, access) in accesses {
+            let after = buffers.entry(*id).or_default();
+            if access.writes() {
+                after.write = after.write.max(wave + 1);
+            }
+            if access.reads() {
+                after.read = after.read.max(wave + 1);
+            }
+        }
+        wave
+    };
+    passes.map(wave).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -135,6 +166,22 @@ mod tests {
         assert!(enter(&mut h, &[(2, "b", Access::ReadWrite)]).is_empty(), "another buffer is free");
         assert_eq!(enter(&mut h, &[(2, "b", Access::ReadWrite)]), ["read after write: b (pass -> pass)"]);
         assert!(enter(&mut h, &read).is_empty(), "the barrier before covered the older write too");
+    }
+
+    #[test]
+    fn waves_keep_the_order_of_whoever_touches_the_same() {
+        let [a, b] = [|access| (1, "a", access), |access| (2, "b", access)];
+        let passes = [
+            vec![a(Access::Write)],
+            vec![a(Access::Read), b(Access::Write)],
+            vec![a(Access::Read)],
+            vec![b(Access::Read)],
+            vec![a(Access::ReadWrite)],
+            vec![(3, "c", Access::Write)],
+            vec![a(Access::Read), b(Access::ReadWrite)],
+            vec![],
+        ];
+        assert_eq!(waves(passes.iter().map(Vec::as_slice)), [0, 1, 1, 2, 2, 0, 3, 0]);
     }
 
     #[test]

@@ -10,7 +10,7 @@ use super::check::Difference;
 use super::descriptors::{Sets, with_writes};
 use super::device::{Device, Gpu, Inner, lock};
 use super::error::{Error, Named};
-use super::hazards::{Entry, Hazards, Id, Schedule};
+use super::hazards::{self, Entry, Hazards, Id, Schedule};
 use super::kernel::{Access, Interface, Reference, Scalar, Twin, with_twin};
 use super::ledger::{NO_STAGE, Rehearsal};
 use super::memory::{Buffer, Slot};
@@ -157,6 +157,16 @@ pub struct Recorder<'g> {
     differences: Option<Vec<Difference>>,
     inspection: Option<Option<NotFinite>>,
     trace: Option<Trace>,
+    /// Passes that wait to be put in order: see [`Recorder::overlapped`].
+    held: Option<Vec<Held>>,
+}
+
+/// A pass that was recorded and has no place yet.
+struct Held {
+    name: &'static str,
+    stage: &'static str,
+    accesses: Vec<(Id, &'static str, Access)>,
+    record: Box<dyn FnOnce(vk::CommandBuffer)>,
 }
 
 /// The first value that is not finite, of an inspected recording.
@@ -228,6 +238,7 @@ impl Gpu {
             differences: None,
             inspection: None,
             trace: None,
+            held: None,
         };
         recorder.begin()?;
         Ok(recorder)
@@ -294,6 +305,30 @@ impl<'g> Recorder<'g> {
     /// What is recorded from now on belongs to this stage.
     pub fn stage(&mut self, stage: &'static str) {
         self.stage = stage;
+    }
+
+    /// Records what `record` records, each pass as early as what it reads and writes allows: passes that need not wait for
+    /// one another come between the same two barriers, whoever recorded them first. Any two that touch the same buffer, one of
+    /// them to write it, keep their order, so that the result is the same. Recordings that run pass by pass keep the order of
+    /// all.
+    pub fn overlapped<T>(&mut self, record: impl FnOnce(&mut Self) -> T) -> T {
+        let pass_by_pass = self.differences.is_some()
+            || self.trace.is_some()
+            || self.inspection.is_some()
+            || self.gpu.options().serialize;
+        if pass_by_pass || self.held.is_some() {
+            return record(self);
+        }
+        self.held = Some(vec![]);
+        let result = record(self);
+        let held = self.held.take().unwrap_or_default();
+        let waves = hazards::waves(held.iter().map(|pass| pass.accesses.as_slice()));
+        let mut ordered: Vec<(u32, Held)> = waves.into_iter().zip(held).collect();
+        ordered.sort_by_key(|(wave, _)| *wave);
+        for (_, Held { name, stage, accesses, record }) in ordered {
+            self.place(name, stage, &accesses, record);
+        }
+        result
     }
 
     /// Runs kernel `K` with default constants on so many threads.
@@ -482,27 +517,29 @@ impl<'g> Recorder<'g> {
             }
             _ => vk::DescriptorSet::null(),
         };
-        self.pass(name, &accesses, |commands| {
+        let counted = match threads {
+            Threads::Counted(counted) => Some((counted.buffer.slot().raw, 16 * u64::from(counted.at))),
+            _ => None,
+        };
+        let (slots, push) = (slots.to_vec(), push.to_vec());
+        self.pass(name, &accesses, move |commands| {
             let device = &inner.device;
             // SAFETY: live handles; the layout comes from the kernel's own reflection.
             unsafe {
                 device.cmd_bind_pipeline(commands, vk::PipelineBindPoint::COMPUTE, pipeline.raw);
                 let bind_point = vk::PipelineBindPoint::COMPUTE;
                 match &inner.push_descriptor {
-                    Some(extension) => with_writes(bindings, slots, set, |writes| {
+                    Some(extension) => with_writes(bindings, &slots, set, |writes| {
                         extension.cmd_push_descriptor_set(commands, bind_point, pipeline.layout, 0, writes);
                     }),
                     None => device.cmd_bind_descriptor_sets(commands, bind_point, pipeline.layout, 0, &[set], &[]),
                 }
                 if !push.is_empty() {
-                    device.cmd_push_constants(commands, pipeline.layout, vk::ShaderStageFlags::COMPUTE, 0, push);
+                    device.cmd_push_constants(commands, pipeline.layout, vk::ShaderStageFlags::COMPUTE, 0, &push);
                 }
-                match threads {
-                    Threads::Counted(counted) => {
-                        let at = 16 * u64::from(counted.at);
-                        device.cmd_dispatch_indirect(commands, counted.buffer.slot().raw, at);
-                    }
-                    _ => device.cmd_dispatch(commands, groups[0], groups[1], groups[2]),
+                match counted {
+                    Some((counts, at)) => device.cmd_dispatch_indirect(commands, counts, at),
+                    None => device.cmd_dispatch(commands, groups[0], groups[1], groups[2]),
                 }
             }
         });
@@ -516,7 +553,7 @@ impl<'g> Recorder<'g> {
 
     fn fill_slot(&mut self, slot: Slot, word: u32) {
         let inner = self.gpu.inner().clone();
-        self.pass("fill", &[(slot.id(), slot.name, Access::Write)], |commands| {
+        self.pass("fill", &[(slot.id(), slot.name, Access::Write)], move |commands| {
             // SAFETY: a live buffer with transfer usage.
             unsafe { inner.device.cmd_fill_buffer(commands, slot.raw, 0, vk::WHOLE_SIZE, word) }
         });
@@ -536,7 +573,7 @@ impl<'g> Recorder<'g> {
         let slot = buffer.slot();
         let inner = self.gpu.inner().clone();
         let [at, bytes] = [at, len].map(|n| (n * size_of::<T>()) as u64);
-        self.pass("fill", &[(slot.id(), slot.name, Access::Write)], |commands| {
+        self.pass("fill", &[(slot.id(), slot.name, Access::Write)], move |commands| {
             // SAFETY: a live buffer with transfer usage, the range within it.
             unsafe { inner.device.cmd_fill_buffer(commands, slot.raw, at, bytes, 0) }
         });
@@ -572,17 +609,32 @@ impl<'g> Recorder<'g> {
         }
         let inner = self.gpu.inner().clone();
         let accesses = [(from.id(), from.name, Access::Read), (to.id(), to.name, Access::Write)];
-        self.pass("copy", &accesses, |commands| {
+        self.pass("copy", &accesses, move |commands| {
             let region = [vk::BufferCopy { src_offset: from_at, dst_offset: to_at, size: bytes }];
             // SAFETY: live buffers with transfer usage, regions within both.
             unsafe { inner.device.cmd_copy_buffer(commands, from.raw, to.raw, &region) }
         });
     }
 
-    /// Everything around a pass: the barrier it needs, its label, crash marker and timestamps.
+    /// Gives a pass its place: the next one, or one that is found later.
     fn pass(
         &mut self,
         name: &'static str,
+        accesses: &[(Id, &'static str, Access)],
+        record: impl FnOnce(vk::CommandBuffer) + 'static,
+    ) {
+        let stage = self.stage;
+        match &mut self.held {
+            Some(held) => held.push(Held { name, stage, accesses: accesses.to_vec(), record: Box::new(record) }),
+            None => self.place(name, stage, accesses, record),
+        }
+    }
+
+    /// Everything around a pass: the barrier it needs, its label, crash marker and timestamps.
+    fn place(
+        &mut self,
+        name: &'static str,
+        stage: &'static str,
         accesses: &[(Id, &'static str, Access)],
         record: impl FnOnce(vk::CommandBuffer),
     ) {
@@ -592,7 +644,6 @@ impl<'g> Recorder<'g> {
         if waits {
             self.schedule.entries.push(Entry::Barrier { reasons });
         }
-        let stage = self.stage;
         let listed = accesses.iter().map(|(_, buffer, access)| (*buffer, *access)).collect();
         self.schedule.entries.push(Entry::Pass { name, stage, accesses: listed });
         if let Some(rehearsal) = &self.rehearsal {
@@ -849,8 +900,51 @@ impl Drop for Submission<'_> {
 
 #[cfg(test)]
 mod tests {
+    use rand::{RngExt, SeedableRng};
+    use rand_pcg::Pcg64Mcg;
+
     use super::*;
     use crate::gpu::testing;
+
+    /// Fills and copies among a few buffers, drawn at random: overlapped they come to what they come to one by one.
+    #[test]
+    fn overlapped_passes_come_to_the_same_behind_fewer_barriers() {
+        let gpu = testing::gpu();
+        let mut saved = 0;
+        for seed in 0..40 {
+            let run = |overlapped: bool| {
+                let buffers: [Buffer<u32>; 6] =
+                    std::array::from_fn(|i| gpu.upload("words", &[i as u32; 5]).expect("room"));
+                let passes = |rec: &mut Recorder<'_>| {
+                    let mut rng = Pcg64Mcg::seed_from_u64(seed);
+                    for word in 100..130 {
+                        let [from, to] = [0, 1].map(|_| rng.random_range(0..buffers.len()));
+                        if from == to {
+                            rec.zero_range(&buffers[to], 1, 2);
+                            rec.fill(&buffers[(to + 1) % 6], word);
+                        } else {
+                            rec.copy_range(&buffers[from], 1, &buffers[to], 0, 4);
+                        }
+                    }
+                };
+                let mut rec = gpu.recorder().expect("a recorder");
+                if overlapped {
+                    rec.overlapped(passes)
+                } else {
+                    passes(&mut rec)
+                }
+                let (count, barriers) = (rec.schedule().passes(), rec.schedule().barriers());
+                rec.submit().and_then(Submission::wait).expect("the device runs it");
+                (buffers.map(|buffer| gpu.read(&buffer).expect("readable")), count, barriers)
+            };
+            let (want, count, barriers) = run(false);
+            let (got, overlapped_count, overlapped) = run(true);
+            assert_eq!((got, overlapped_count), (want, count), "seed {seed}");
+            assert!(overlapped <= barriers, "seed {seed}: {overlapped} barriers instead of {barriers}");
+            saved += barriers - overlapped;
+        }
+        assert!(saved > 40, "{saved} barriers fewer");
+    }
 
     /// Its fence was never given to the queue: waiting for it would not end.
     #[test]

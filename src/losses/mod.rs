@@ -187,8 +187,6 @@ impl Losses {
         let Self { frame, photometric, depth: stages, terms } = self;
         rec.stage(photometric::TERM.stage);
         rec.zero(terms);
-        let slot = photometric::TERM.slot();
-        let grad_rgb = photometric.forward_backward(rec, rgb, frame.target(), frame.weight(), terms, slot);
         let planned = stages.as_ref().zip(depth).zip(view);
         let grad_depth = planned.map(|((Depth { align, l1, gradient }, depth), view)| {
             rec.stage(depth_l1::TERM.stage);
@@ -207,6 +205,10 @@ impl Losses {
             }
             align.backward(rec, grad_aligned, depth, prior, fit)
         });
+        // Last: its sum is the last to be written, and the others' need not wait for it.
+        rec.stage(photometric::TERM.stage);
+        let slot = photometric::TERM.slot();
+        let grad_rgb = photometric.forward_backward(rec, rgb, frame.target(), frame.weight(), terms, slot);
         Gradients { rgb: grad_rgb, depth: grad_depth }
     }
 

@@ -390,9 +390,11 @@ impl Step {
     pub fn record(&self, rec: &mut Recorder<'_>, photograph: &Photograph, step: u32, rates: Rates) {
         let view = self.view(photograph, step);
         let compared = (&photograph.camera, view.depth.is_some());
-        self.line(rec, compared, Some(photograph), step, rates, |rec, canvas| {
-            let Canvas { picture, losses } = canvas;
-            losses.forward_backward(rec, &view, &picture.rgb, picture.depth.as_ref())
+        rec.overlapped(|rec| {
+            self.line(rec, compared, Some(photograph), step, rates, |rec, canvas| {
+                let Canvas { picture, losses } = canvas;
+                losses.forward_backward(rec, &view, &picture.rgb, picture.depth.as_ref())
+            });
         });
     }
 
@@ -405,9 +407,11 @@ impl Step {
         step: u32,
         rates: Rates,
     ) {
-        self.line(rec, (camera, depth.is_some()), None, step, rates, |rec, canvas| {
-            let Canvas { picture, losses } = canvas;
-            losses.compare(rec, depth, &picture.rgb, picture.depth.as_ref())
+        rec.overlapped(|rec| {
+            self.line(rec, (camera, depth.is_some()), None, step, rates, |rec, canvas| {
+                let Canvas { picture, losses } = canvas;
+                losses.compare(rec, depth, &picture.rgb, picture.depth.as_ref())
+            });
         });
     }
 
