@@ -93,7 +93,7 @@ fn whole(gpu: &Gpu, case: &Case) {
         assert!(prior.iter().all(|&p| p > NO_PRIOR));
         Photograph {
             name: at("picture"),
-            camera: cameras[v].clone(),
+            camera: cameras[v],
             reduction: 1,
             reference: v == 0,
             picture: gpu.upload("picture", &words).unwrap(),
