@@ -21,7 +21,8 @@ pub struct Counts {
     pub pairs: f64,
     /// Pairs up to where their tile ends: behind the last Gaussian that any of its pixels still sees.
     pub evaluated: f64,
-    /// These times the pixels of their tile.
+    /// These times the pixels of their tile; of a tile of 16 pixels a side those of its halves of eight rows that the Gaussian
+    /// reaches: a subgroup of 32 passes over the others.
     pub samples: f64,
     /// Samples that changed a pixel.
     pub blended: f64,

@@ -8,6 +8,20 @@
 // a pixel: 1e-3 absolute, 1e-4 relative.
 float support_bound(float opacity, float alpha_min) { return 2.0 * log(opacity / alpha_min) * 1.0001 + 1e-3; }
 
+// Which bands of `rows` rows of a tile, `bands` of them from `top` on (centre of the first row, px), hold a sample at which alpha
+// can reach the threshold: bit b for band b. inverse_v is the conic's 1 / V, so that |dy| <= sqrt(bound V) there. Written so that what is not a
+// number keeps a band.
+uint support_bands(float mean_y, float inverse_v, float bound, float top, uint rows, uint bands) {
+  float reach = sqrt(max(bound, 0.0) / inverse_v);
+  uint mask = 0u;
+  for (uint b = 0u; b < bands; b++) {
+    float first = top + float(b * rows), last = first + float(rows - 1u);
+    bool beyond = first - mean_y > reach || mean_y - last > reach;
+    if (!beyond) mask |= 1u << b;
+  }
+  return mask;
+}
+
 struct Support {
   float bound;
   vec3 covariance; // factored

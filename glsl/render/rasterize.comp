@@ -1,11 +1,14 @@
 #version 460
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_EXT_control_flow_attributes : require
+#extension GL_GOOGLE_include_directive : require
+#include "tiles.glsl"
 // variant color: COLOR_ONLY
 // variant depth: NO_TRANSMITTANCE
 //
 // Front-to-back blending of a tile's Gaussians (3D Gaussian Splatting, equation 3): colour, depth and transmittance.
-// 16 x 16 tiles, 64 threads of 4 pixels; Gaussians pass through shared memory. `depth` leaves transmittance out, `color`
+// 16 x 16 tiles, 64 threads of 4 pixels; Gaussians pass through shared memory. A band of four rows is 16 threads': a subgroup
+// none of whose bands a Gaussian reaches passes over it. `depth` leaves transmittance out, `color`
 // also depth.
 #ifdef COLOR_ONLY
 #define NO_TRANSMITTANCE
@@ -71,6 +74,7 @@ const uint BATCH = 64u;
 shared vec2 s_mean[BATCH];
 shared vec3 s_conic[BATCH];
 shared float s_opacity[BATCH];
+shared uint s_bands[BATCH];
 shared vec3 s_color[BATCH];
 #ifndef COLOR_ONLY
 shared float s_depth[BATCH];
@@ -79,7 +83,7 @@ shared uint s_live;
 
 void main() {
   uint tile = gl_WorkGroupID.y * push.tiles_x + gl_WorkGroupID.x;
-  uint t = gl_LocalInvocationID.x;
+  uint t = gl_LocalInvocationID.x, band = 1u << (t / TILE);
   uvec2 first = gl_WorkGroupID.xy * TILE + uvec2(t % TILE, t / TILE * ROWS);
   pixel = vec2(first) + 0.5;
   [[unroll]] for (uint r = 0u; r < ROWS; r++) {
@@ -100,6 +104,8 @@ void main() {
       s_mean[t] = mean[g];
       s_conic[t] = conic[g];
       s_opacity[t] = opacity[g];
+      float top = float(gl_WorkGroupID.y * TILE) + 0.5;
+      s_bands[t] = support_bands(s_mean[t].y, s_conic[t].z, support_bound(s_opacity[t], ALPHA_MIN), top, ROWS, TILE / ROWS);
       s_color[t] = color[g];
 #ifndef COLOR_ONLY
       s_depth[t] = depth[g];
@@ -111,11 +117,14 @@ void main() {
     barrier();
     if (s_live == 0u) break;
     uint n = min(BATCH, range.y - base);
+    for (uint k = 0u; k < n; k++) {
+      if ((s_bands[k] & band) == 0u) continue;
 #ifdef COLOR_ONLY
-    for (uint k = 0u; k < n; k++) blend(s_mean[k], s_conic[k], s_opacity[k], s_color[k], 0.0);
+      blend(s_mean[k], s_conic[k], s_opacity[k], s_color[k], 0.0);
 #else
-    for (uint k = 0u; k < n; k++) blend(s_mean[k], s_conic[k], s_opacity[k], s_color[k], s_depth[k]);
+      blend(s_mean[k], s_conic[k], s_opacity[k], s_color[k], s_depth[k]);
 #endif
+    }
     barrier();
   }
   [[unroll]] for (uint r = 0u; r < ROWS; r++) {

@@ -1,6 +1,7 @@
 #version 460
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_EXT_control_flow_attributes : require
+#extension GL_GOOGLE_include_directive : require
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_vote : require
 #extension GL_KHR_shader_subgroup_shuffle : require
@@ -25,7 +26,7 @@
 // at a time lie in shared memory, 4 are gone through together: `meet` twice leaves lane k of every four with the k-th's
 // sums over the four, further bits add the subgroup's other fours, and lanes 0 to 3 put them down. Then thread t adds what
 // the subgroups put down of Gaussian t, in their order, and writes it to the pair's own number: nothing is added
-// atomically. Every pair of the list is written, also behind the last one blended.
+// atomically. A subgroup none of whose bands of rows a Gaussian reaches has no sums of it to make. Every pair of the list is written, also behind the last one blended.
 // `depth` is for losses on colour and depth, `color` for losses on colour alone.
 #ifdef COLOR_ONLY
 #define NO_TRANSMITTANCE
@@ -124,6 +125,8 @@ Sums sums_of(vec2 m, vec3 q, float o, vec3 c, float z) {
   return s;
 }
 
+#include "tiles.glsl"
+
 void write(uint p, vec3 q, Sums s) {
   float gx = q.x * s.first.x;
   pair_mean[p] = vec2(gx, q.z * s.first.y - q.y * gx);
@@ -158,6 +161,7 @@ shared uint s_live;
 shared vec2 s_mean[BATCH];
 shared vec3 s_conic[BATCH];
 shared float s_opacity[BATCH];
+shared uint s_bands[BATCH];
 shared vec3 s_color[BATCH];
 #ifdef WITH_DEPTH
 shared float s_depth[BATCH];
@@ -167,9 +171,19 @@ shared vec3 s_second[BATCH * SUBGROUPS];
 shared vec3 s_color_sum[BATCH * SUBGROUPS];
 shared vec2 s_opacity_depth[BATCH * SUBGROUPS];
 
+// Of a Gaussian in shared memory, in lanes that all come here.
+Sums shared_sums(uint k, uint band) {
+  if (!subgroupAny((s_bands[k] & band) != 0u)) return NO_SUMS;
+#ifdef WITH_DEPTH
+  return sums_of(s_mean[k], s_conic[k], s_opacity[k], s_color[k], s_depth[k]);
+#else
+  return sums_of(s_mean[k], s_conic[k], s_opacity[k], s_color[k], 0.0);
+#endif
+}
+
 void main() {
   uint tile = gl_WorkGroupID.y * push.tiles_x + gl_WorkGroupID.x;
-  uint t = gl_LocalInvocationID.x;
+  uint t = gl_LocalInvocationID.x, band = 1u << (t / TILE);
   uvec2 first = gl_WorkGroupID.xy * TILE + uvec2(t % TILE, t / TILE * ROWS);
   pixel = vec2(first) + 0.5;
   [[unroll]] for (uint r = 0u; r < ROWS; r++) {
@@ -201,6 +215,8 @@ void main() {
       s_mean[t] = mean[g];
       s_conic[t] = conic[g];
       s_opacity[t] = some ? opacity[g] : 0.0;
+      float top = float(gl_WorkGroupID.y * TILE) + 0.5;
+      s_bands[t] = some ? support_bands(s_mean[t].y, s_conic[t].z, support_bound(s_opacity[t], ALPHA_MIN), top, ROWS, TILE / ROWS) : 0u;
       s_color[t] = color[g];
 #ifdef WITH_DEPTH
       s_depth[t] = depth[g];
@@ -209,17 +225,12 @@ void main() {
     barrier();
     if (s_live == 0u) break;
     for (uint k = 0u; k < n; k += GROUP) {
-#ifdef WITH_DEPTH
-#define SHARED_SUMS(k) sums_of(s_mean[k], s_conic[k], s_opacity[k], s_color[k], s_depth[k])
-#else
-#define SHARED_SUMS(k) sums_of(s_mean[k], s_conic[k], s_opacity[k], s_color[k], 0.0)
-#endif
       Sums s = NO_SUMS;
       if (subgroupAny(any_live())) {
-        s = SHARED_SUMS(k);
-        s = meet(s, SHARED_SUMS(k + 1u), 1u);
-        Sums b = SHARED_SUMS(k + 2u);
-        b = meet(b, SHARED_SUMS(k + 3u), 1u);
+        s = shared_sums(k, band);
+        s = meet(s, shared_sums(k + 1u, band), 1u);
+        Sums b = shared_sums(k + 2u, band);
+        b = meet(b, shared_sums(k + 3u, band), 1u);
         s = meet(s, b, 2u);
         for (uint bit = GROUP; bit < min(gl_SubgroupSize, THREADS); bit *= 2u) {
           s.first += subgroupShuffleXor(s.first, bit);

@@ -294,7 +294,7 @@ pub const TABLE: &[Formula] = &[
         pass: "render/rasterize",
         variants: &["color", "depth"],
         derivation: "per tile a range 8, per pair up to the tile's end 8, per Gaussian drawn 36, per pixel rgb 12 B; with depth \
-                     4 more per Gaussian and 8 per pixel. Per sample (pixel and pair up to the tile's end) an exponential and 25 \
+                     4 more per Gaussian and 8 per pixel. Per sample (pixel and pair up to the tile's end, in rows it reaches) an exponential and 25 \
                      operations: dy 1, across 2, power 6, alpha 2, after 2, decisions 6, weight 2, colour 3, transmittance 1; \
                      with depth 1 more",
         work: |c, d| {

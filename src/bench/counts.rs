@@ -7,6 +7,7 @@ use rayon::prelude::*;
 pub use crate::cost::Counts;
 use crate::gpu::form::without_form;
 use crate::gpu::{Entry, Schedule};
+use crate::math::tiles::{support_bands, support_bound};
 use crate::render::bin::Tiling;
 use crate::render::method::Method;
 
@@ -102,7 +103,8 @@ struct Lists<'a> {
 const MOST_SAMPLES: u64 = 1 << 29;
 
 impl Lists<'_> {
-    /// Pairs and samples up to where the tiles end, samples that changed a pixel, and pairs with such a sample.
+    /// Pairs up to where the tiles end; their samples, of wide tiles those in the halves of eight rows, 32 threads', that the
+    /// Gaussian reaches; samples that changed a pixel, and pairs with such a sample.
     fn walk(&self, tiling: Tiling, size: [u32; 2], method: Method) -> [f64; 4] {
         let [columns, rows] = tiling.grid(size);
         let tiles = columns * rows;
@@ -129,8 +131,13 @@ impl Lists<'_> {
                 pixels.push(([x as f32 + 0.5, y as f32 + 0.5], 1f32));
             }
         }
-        let all = pixels.len() as u64;
-        let (mut evaluated, mut blended, mut seen) = (0, 0, 0);
+        // Wide tiles pass over what no row of a subgroup's can see.
+        let bands = if side == 16 { 2 } else { 1 };
+        let rows = side / bands;
+        let of_band: Vec<u64> = (0..bands)
+            .map(|band| pixels.iter().filter(|(at, _)| (at[1] as u32 - row * side) / rows == band).count() as u64)
+            .collect();
+        let (mut evaluated, mut samples, mut blended, mut seen) = (0, 0, 0, 0);
         for &pair in &self.sorted[first as usize..end as usize] {
             if pixels.is_empty() {
                 break;
@@ -139,6 +146,13 @@ impl Lists<'_> {
             let before = blended;
             let slot = self.pair_slot[pair as usize] as usize;
             let (mean, conic, opacity) = (self.mean[slot], self.conic[slot], self.opacity[slot]);
+            let reached = if bands == 1 {
+                1
+            } else {
+                let bound = support_bound(opacity, method.alpha_min);
+                support_bands(mean[1], conic[2], bound, (row * side) as f32 + 0.5, rows, bands)
+            };
+            samples += of_band.iter().enumerate().filter(|(b, _)| reached >> b & 1 == 1).map(|(_, n)| n).sum::<u64>();
             pixels.retain_mut(|(at, transmittance)| {
                 let (dx, dy) = (at[0] - mean[0], at[1] - mean[1]);
                 let across = dx - conic[1] * dy;
@@ -157,7 +171,7 @@ impl Lists<'_> {
             });
             seen += u64::from(blended > before);
         }
-        [evaluated, evaluated * all, blended, seen]
+        [evaluated, samples, blended, seen]
     }
 }
 
@@ -186,6 +200,23 @@ mod tests {
         // Below the alpha threshold nothing is blended, and nothing ends.
         let faint = Lists { opacity: &[1e-3; 3], ..lists };
         assert_eq!(faint.walk(Tiling::Narrow, [9, 8], method), [4.0, 200.0, 0.0, 0.0]);
+    }
+
+    /// A Gaussian of the upper half, one of the lower and one of both.
+    #[test]
+    fn wide_tiles_count_the_halves_that_are_reached() {
+        let lists = Lists {
+            ranges: &[[0, 3], [3, 3]],
+            sorted: &[0, 1, 2],
+            pair_slot: &[0, 1, 2],
+            mean: &[[8.0, 3.0], [8.0, 13.0], [8.0, 8.0]],
+            conic: &[[1.0, 0.0, 1.0]; 3],
+            opacity: &[0.5; 3],
+        };
+        let method = Method::from(Tiling::Wide);
+        // 16 columns and 12 rows: 128 samples above, 64 below.
+        let [evaluated, samples, ..] = lists.walk(Tiling::Wide, [16, 12], method);
+        assert_eq!((evaluated, samples), (3.0, 128.0 + 64.0 + 192.0));
     }
 
     #[test]

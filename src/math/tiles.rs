@@ -73,11 +73,35 @@ impl Support {
     }
 }
 
+/// Which bands of `rows` rows of a tile, `bands` of them from `top` on (centre of the first row, px), hold a sample at which
+/// alpha can reach the threshold: bit b for band b. `inverse_v` is 1 / V of the factored covariance, px^-2; as in `tiles.glsl`.
+pub fn support_bands(mean_y: f32, inverse_v: f32, bound: f32, top: f32, rows: u32, bands: u32) -> u32 {
+    let reach = (bound.max(0.0) / inverse_v).sqrt();
+    let beyond = |band: &u32| {
+        let first = top + (band * rows) as f32;
+        first - mean_y > reach || mean_y - (first + (rows - 1) as f32) > reach
+    };
+    (0..bands).filter(|band| !beyond(band)).fold(0, |mask, band| mask | 1 << band)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::math::camera::factors;
     use proptest::prelude::*;
+
+    #[test]
+    fn bands_are_those_in_reach() {
+        // Rows 16.5 to 31.5 in four bands; sqrt(9 / 1) = 3 px reach.
+        for (mean_y, wanted) in [(5.0, 0), (13.6, 1), (17.0, 1), (21.0, 0b11), (24.0, 0b110), (34.6, 0), (34.4, 0b1000)]
+        {
+            assert_eq!(support_bands(mean_y, 1.0, 9.0, 16.5, 4, 4), wanted, "mean {mean_y}");
+        }
+        // A variance of float32's largest, or none that is known, reaches everything.
+        for inverse_v in [0.0, f32::NAN] {
+            assert_eq!(support_bands(-1e6, inverse_v, 9.0, 16.5, 4, 4), 0b1111);
+        }
+    }
 
     proptest! {
         /// No pixel that can reach the threshold lies outside the tiles found, and no tile found is far from one.
@@ -94,6 +118,8 @@ mod tests {
             let [narrow, slope, variance] = covariance;
             let size = [97u32, 83];
             let grid = size.map(|n| n.div_ceil(tile));
+            let bound = support_bound(opacity, alpha_min);
+            let bands = |row: u32| support_bands(my, 1.0 / variance, bound, (row * tile) as f32 + 0.5, 2, tile / 2);
             let found = Support::new([mx, my], covariance, (opacity, alpha_min), tile, grid).tiles([mx, my], tile, grid);
             for y in 0..grid[1] * tile {
                 for x in 0..grid[0] * tile {
@@ -103,6 +129,7 @@ mod tests {
                     if opacity * power.exp() >= alpha_min {
                         let t = y / tile * grid[0] + x / tile;
                         prop_assert!(found.contains(&t), "pixel {x},{y} of tile {t} is missed by {found:?}");
+                        prop_assert!(bands(y / tile) >> (y % tile / 2) & 1 == 1, "pixel {x},{y} is missed by its band");
                     }
                 }
             }
