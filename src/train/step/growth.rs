@@ -1,0 +1,56 @@
+//! Growing and pruning behind a step.
+
+use super::Step;
+use crate::densify;
+use crate::gpu::Error;
+use crate::stage;
+
+impl Step {
+    /// Whether anchors are grown and pruned behind this step.
+    pub fn changes_anchors(&self, step: u32) -> bool {
+        self.plan.rounds.is_some_and(|r| r.contain(step)) && step.is_multiple_of(self.config.densify.every)
+    }
+
+    /// Grows and prunes anchors behind this step, with nothing in flight; says what changed.
+    ///
+    /// # Errors
+    /// When the device has no room.
+    pub fn change_anchors(&mut self, step: u32) -> Result<String, Error> {
+        if self.statistics.is_none() {
+            return Ok(String::new());
+        }
+        self.release();
+        let gpu = self.gpu.clone();
+        let text = gpu.stage(stage::GROWTH, || self.grow_and_prune(step))?;
+        self.furnish()?;
+        Ok(text)
+    }
+
+    fn grow_and_prune(&mut self, step: u32) -> Result<String, Error> {
+        let Some(statistics) = &mut self.statistics else { return Ok(String::new()) };
+        let config = &self.config.densify;
+        let round = densify::Round { voxel: self.voxel as f32, seed: self.config.train.seed, step };
+        let before = self.anchors.count;
+        let grown = densify::grow::run(&self.gpu, &mut self.anchors, statistics, config, round)?;
+        let pruned = densify::prune::run(&self.gpu, &mut self.anchors, statistics, config)?;
+        // As large a share of the anchors is in view as before.
+        let [visible, old, new] = [self.capacity.visible, self.capacity.anchors, self.anchors.capacity].map(u64::from);
+        self.capacity.visible = (visible * new).div_ceil(old.max(1)).max(visible) as u32;
+        let mut text =
+            format!("step {step}: {} new anchors, {pruned} pruned: {before} -> {}", grown.added, self.anchors.count);
+        if grown.refused > 0 {
+            text.push_str(&format!(
+                "; {} more had no room (densify.max_anchors, or the device's memory)",
+                grown.refused
+            ));
+        }
+        if grown.beyond > 0 {
+            text.push_str(&format!(
+                "; {} Gaussians lie more than {:.0e} cells from the origin, where none grows: move the scene or raise model.voxel",
+                grown.beyond,
+                densify::grow::CELL_LIMIT
+            ));
+        }
+        Ok(text)
+    }
+}

@@ -1,0 +1,416 @@
+//! One training step, as one straight line: `Step::line`. Beside it: learning rates, how a view counts, what changes the
+//! model behind a step, and what draws and reads it.
+
+mod growth;
+mod rates;
+mod read;
+mod update;
+mod weights;
+
+pub use rates::Rates;
+
+use crate::config::Settings;
+use crate::densify::{Drawn, Statistics};
+use crate::gpu::{Buffer, Error, Gpu, Recorder};
+use crate::losses::{self, DepthView, Losses};
+use crate::math::decoder::Layout;
+use crate::model::anchors::{Anchors, Parameter};
+use crate::model::files;
+use crate::optimizer::adam;
+use crate::primitives::limit::Limits;
+use crate::render::decode::{self, DecodeBackward, GaussianGradients, WantedGradients};
+use crate::render::project::{ProjectBackward, SplatGradients};
+use crate::render::rasterize::{self, Backward, Picture, PictureGradient};
+use crate::render::view::{Capacity, Forward};
+use crate::render::{Config, Method};
+use crate::scene::Camera;
+use crate::stage;
+
+use super::attend::Attend;
+use super::photographs::Photograph;
+use super::plan::{Plan, Trained};
+
+/// Where the gradients of what is trained go, zeroed at the beginning of every step.
+struct Gradients {
+    feature: Option<Buffer<f32>>,
+    offset: Option<Buffer<f32>>,
+    log_scaling: Option<Buffer<f32>>,
+    weights: Option<Buffer<f32>>,
+}
+
+impl Gradients {
+    fn new(gpu: &Gpu, trained: Trained, anchors: &Anchors, weights: &Parameter) -> Result<Self, Error> {
+        let of = |name, parameter: &Parameter| gpu.buffer(name, parameter.value.len());
+        Ok(Self {
+            feature: trained.feature.then(|| of("grad_feature", &anchors.feature)).transpose()?,
+            offset: trained.offset.then(|| of("grad_offset", &anchors.offset)).transpose()?,
+            log_scaling: trained.log_scaling.then(|| of("grad_log_scaling", &anchors.log_scaling)).transpose()?,
+            weights: trained.decoders.then(|| of("grad_weights", weights)).transpose()?,
+        })
+    }
+}
+
+/// The stages between the anchors and the picture, both ways.
+struct Stages {
+    forward: Forward,
+    rasterize: Backward,
+    project: ProjectBackward,
+    decode: DecodeBackward,
+    gradients: Gradients,
+}
+
+impl Stages {
+    fn new(
+        gpu: &Gpu,
+        plan: &Plan,
+        capacity: Capacity,
+        anchors: &Anchors,
+        weights: &Parameter,
+        config: &Config,
+    ) -> Result<Self, Error> {
+        let (offsets, trained) = (anchors.offsets, plan.trained);
+        let method = Method::new(gpu, config)?;
+        let forward = Forward::new(gpu, capacity, offsets, method, plan.largest(), config.cull)?;
+        let slots = (capacity.visible * offsets) as usize;
+        let pairs = capacity.pairs as usize;
+        Ok(Self {
+            rasterize: gpu
+                .stage(stage::RASTERIZE_BACKWARD, || Backward::new(gpu, method, slots, pairs, plan.outputs()))?,
+            project: gpu.stage(stage::PROJECT_BACKWARD, || ProjectBackward::new(gpu, &forward.project))?,
+            decode: gpu.stage(stage::DECODE_BACKWARD, || {
+                DecodeBackward::of(gpu, &forward.decode, trained.feature, trained.decoders)
+            })?,
+            gradients: gpu.stage(stage::DECODE_BACKWARD, || Gradients::new(gpu, trained, anchors, weights))?,
+            forward,
+        })
+    }
+}
+
+/// What depends on the pictures' size.
+struct Canvas {
+    picture: Picture,
+    losses: Losses,
+}
+
+impl Canvas {
+    /// One for each size of the plan.
+    fn all(gpu: &Gpu, plan: &Plan, settings: &Settings) -> Result<Vec<Self>, Error> {
+        let canvas = |&size: &[u32; 2]| {
+            let pixels = size[0] as usize * size[1] as usize;
+            let picture = || Picture::new(gpu, size, pixels, plan.outputs());
+            Ok(Self {
+                picture: gpu.stage(stage::RASTERIZE, picture)?,
+                losses: Losses::new(gpu, &plan.losses(size, settings))?,
+            })
+        };
+        plan.sizes.iter().map(canvas).collect()
+    }
+}
+
+/// The model on the device and the stages that change it.
+pub struct Step {
+    gpu: Gpu,
+    /// The plan the stages were made for.
+    pub plan: Plan,
+    /// The anchors.
+    pub anchors: Anchors,
+    /// The decoders, flat.
+    pub weights: Parameter,
+    /// Overflow flag and counters.
+    pub limits: Limits,
+    capacity: Capacity,
+    /// Nothing while anchors change or views are drawn for their figures: those take the room.
+    stages: Option<Stages>,
+    canvases: Vec<Canvas>,
+    pub(super) statistics: Option<Statistics>,
+    pub(super) voxel: f64,
+    pub(super) attend: Option<Attend>,
+    /// Initial projections of an attention whose time has not come.
+    pub(super) attention_weights: Option<Vec<f32>>,
+    config: Settings,
+    adam: adam::Config,
+    near: f32,
+    background: [f32; 3],
+}
+
+/// Names of the decoders' arrays on the device.
+const WEIGHTS: [&str; 3] = ["weights", "weights_first", "weights_root"];
+
+impl Step {
+    /// Uploads the model and makes the stages that the plan has. `voxel` is the side of the anchors' grid, scene units.
+    ///
+    /// # Errors
+    /// When the device has no room.
+    pub fn new(
+        gpu: &Gpu,
+        plan: Plan,
+        settings: &Settings,
+        anchors: &files::Anchors,
+        weights: &files::Weights,
+        voxel: f64,
+    ) -> Result<Self, Error> {
+        let anchors = gpu.stage(stage::MODEL, || Anchors::upload(gpu, anchors, 0))?;
+        let initial = weights;
+        let flat = initial.decoders();
+        let weights = gpu.stage(stage::MODEL, || Parameter::new(gpu, WEIGHTS, flat.len() as u32, 1))?;
+        gpu.write(&weights.value, &flat)?;
+        let mut rec = gpu.recorder()?;
+        rec.zero(&weights.first);
+        rec.zero(&weights.root);
+        rec.submit()?.wait()?;
+        let capacity = Capacity::guess(anchors.capacity);
+        let stages = Stages::new(gpu, &plan, capacity, &anchors, &weights, &settings.render)?;
+        let canvases = Canvas::all(gpu, &plan, settings)?;
+        Ok(Self {
+            limits: Limits::new(gpu)?,
+            gpu: gpu.clone(),
+            anchors,
+            weights,
+            capacity,
+            stages: Some(stages),
+            canvases,
+            statistics: None,
+            voxel,
+            attend: None,
+            attention_weights: plan.attention.then(|| initial.attention()),
+            adam: adam::Config {
+                beta1: settings.optimizer.betas[0],
+                beta2: settings.optimizer.betas[1],
+                epsilon: settings.optimizer.epsilon,
+                lazy: false,
+            },
+            near: settings.render.near as f32,
+            background: settings.train.background.map(|c| c as f32),
+            config: settings.clone(),
+            plan,
+        })
+    }
+
+    /// Makes the stages anew for this capacity. Nothing of the step may be in flight.
+    ///
+    /// # Errors
+    /// When the device has no room.
+    pub fn resize(&mut self, capacity: Capacity) -> Result<(), Error> {
+        // The old stages' memory goes before the new ones' is taken.
+        self.release();
+        self.capacity = capacity;
+        self.furnish()
+    }
+
+    /// Gives back all memory that holds nothing from one step to the next.
+    fn release(&mut self) {
+        self.stages = None;
+        if let Some(attend) = &mut self.attend {
+            attend.release();
+        }
+    }
+
+    /// Takes it again, for the anchors there are now.
+    fn furnish(&mut self) -> Result<(), Error> {
+        let Self { gpu, plan, anchors, weights, config, .. } = self;
+        self.capacity.anchors = anchors.capacity;
+        self.stages = Some(Stages::new(gpu, plan, self.capacity, anchors, weights, &config.render)?);
+        if let Some(attend) = &mut self.attend {
+            gpu.stage(stage::ATTENTION, || attend.furnish(gpu, anchors.capacity))?;
+        }
+        Ok(())
+    }
+
+    fn stages(&self) -> &Stages {
+        self.stages.as_ref().expect("the stages are away only within a call")
+    }
+
+    /// Goes on with training pictures of other sizes. Nothing of the step may be in flight.
+    ///
+    /// # Errors
+    /// When the device has no room.
+    pub fn resize_pictures(&mut self, sizes: Vec<[u32; 2]>) -> Result<(), Error> {
+        self.canvases.clear();
+        self.plan.sizes = sizes;
+        self.resize(self.capacity)?;
+        self.canvases = Canvas::all(&self.gpu, &self.plan, &self.config)?;
+        Ok(())
+    }
+
+    /// What the stages have room for.
+    pub fn capacity(&self) -> Capacity {
+        self.capacity
+    }
+
+    /// The weighted loss terms of the last step by [`losses::Term`], for pictures of this size.
+    pub fn terms(&self, size: [u32; 2]) -> &Buffer<f32> {
+        self.canvas(size).losses.terms()
+    }
+
+    /// The losses for pictures of this size.
+    pub fn losses(&self, size: [u32; 2]) -> &Losses {
+        &self.canvas(size).losses
+    }
+
+    fn canvas(&self, size: [u32; 2]) -> &Canvas {
+        self.canvases
+            .iter()
+            .find(|c| c.picture.size == size)
+            .expect("the plan lists the sizes of all training pictures")
+    }
+
+    /// Records step `step` (counted from 1) on a photograph.
+    pub fn record(&self, rec: &mut Recorder<'_>, photograph: &Photograph, step: u32, rates: Rates) {
+        let view = self.view(photograph, step);
+        let compared = (&photograph.camera, view.depth.is_some());
+        rec.overlapped(|rec| {
+            self.line(rec, compared, Some(photograph), step, rates, |rec, canvas| {
+                let Canvas { picture, losses } = canvas;
+                losses.forward_backward(rec, &view, &picture.rgb, picture.depth.as_ref())
+            });
+        });
+    }
+
+    /// Records a step against the arrays that the losses' frame holds already: for tests.
+    pub fn record_prepared(
+        &self,
+        rec: &mut Recorder<'_>,
+        camera: &Camera,
+        depth: Option<DepthView<'_>>,
+        step: u32,
+        rates: Rates,
+    ) {
+        rec.overlapped(|rec| {
+            self.line(rec, (camera, depth.is_some()), None, step, rates, |rec, canvas| {
+                let Canvas { picture, losses } = canvas;
+                losses.compare(rec, depth, &picture.rgb, picture.depth.as_ref())
+            });
+        });
+    }
+
+    /// The straight line of one step.
+    fn line<'s>(
+        &'s self,
+        rec: &mut Recorder<'_>,
+        (camera, depth): (&Camera, bool),
+        photograph: Option<&Photograph>,
+        step: u32,
+        rates: Rates,
+        compare: impl FnOnce(&mut Recorder<'_>, &'s Canvas) -> losses::Gradients<'s>,
+    ) {
+        let Self { anchors, limits, near, .. } = self;
+        let Stages { forward, rasterize: backward, project: project_backward, decode: decode_backward, gradients } =
+            self.stages();
+        let canvas = self.canvas(camera.size);
+        // Depth is drawn for views alone whose depth is compared.
+        let color_alone = canvas.picture.color();
+        let picture = if depth { &canvas.picture } else { &color_alone };
+        rec.stage(stage::DECODE_BACKWARD);
+        for gradient in [&gradients.feature, &gradients.offset, &gradients.log_scaling].into_iter().flatten() {
+            rec.zero(gradient);
+        }
+        rec.stage(stage::CULL);
+        forward.visible.record(rec, anchors, camera, *near, limits);
+        // A step may be recorded again after later ones: the stage is there then, but its time has not come.
+        let attend = self.attend.as_ref().filter(|_| step >= self.config.model.attention.start);
+        rec.stage(stage::ATTENTION);
+        let (feature, attended) = match attend.zip(photograph) {
+            Some((attend, photograph)) => attend.forward(rec, anchors, &forward.visible, photograph, *near, step),
+            None => (&anchors.feature.value, None),
+        };
+        let offset = anchors.offset.value.view();
+        let model = decode::Anchors {
+            position: &anchors.position,
+            feature,
+            offset: &offset,
+            log_scaling: &anchors.log_scaling.value,
+            weights: &self.weights.value,
+            visible: &forward.visible.list,
+        };
+        rec.stage(stage::DECODE);
+        forward.decode.record(rec, model, &forward.visible.count, camera.center());
+        rec.stage(stage::PROJECT);
+        forward.project.record(rec, &forward.decode.existing, forward.gaussians(), camera, *near);
+        rec.stage(stage::BIN);
+        let binned = forward.bin.record(rec, forward.projected(), camera.size, limits);
+        rec.stage(stage::RASTERIZE);
+        rasterize::forward(rec, forward.method(), forward.projected(), binned, self.background, picture);
+
+        let gradient = compare(rec, canvas);
+
+        let gradient = PictureGradient { rgb: gradient.rgb, depth: gradient.depth, transmittance: None };
+        rec.stage(stage::RASTERIZE_BACKWARD);
+        backward.record(rec, forward.method(), forward.projected(), binned, picture, gradient);
+        self.sentinel(rec, Some(canvas.losses.terms()), losses::Term::ALL.len() as u32);
+        let splats = SplatGradients {
+            mean: &backward.grad_mean,
+            covariance: &backward.grad_covariance,
+            depth: gradient.depth.and(backward.grad_depth.as_ref()),
+        };
+        rec.stage(stage::PROJECT_BACKWARD);
+        project_backward.record(rec, binned.drawn, forward.gaussians(), splats, camera, *near);
+        let gaussians = GaussianGradients {
+            drawn: binned.tiles,
+            position: &project_backward.grad_position,
+            opacity: &backward.grad_opacity,
+            color: &backward.grad_color,
+            scale: &project_backward.grad_scale,
+            rotation: &project_backward.grad_rotation,
+        };
+        let grad_offset = gradients.offset.as_ref().map(Buffer::view);
+        let to = WantedGradients {
+            feature: gradients.feature.as_ref(),
+            offset: grad_offset.as_ref(),
+            log_scaling: gradients.log_scaling.as_ref(),
+            weights: gradients.weights.as_ref(),
+        };
+        rec.stage(stage::DECODE_BACKWARD);
+        decode_backward.record(rec, &forward.decode, model, gaussians, to);
+        let network = Layout { offsets: anchors.offsets as usize }.weights() as u32;
+        self.sentinel(rec, gradients.weights.as_ref(), network);
+        rec.stage(stage::ATTENTION);
+        if let Some(((attend, attended), grad_feature)) = self.attend.as_ref().zip(attended).zip(to.feature) {
+            attend.backward(rec, attended, grad_feature);
+        }
+        // Whatever changes the model or is gathered for it comes behind: it obeys the flag.
+        self.watch(rec, attended, step);
+        if let Some(statistics) = &self.statistics {
+            let drawn = Drawn {
+                visible_count: &forward.visible.count,
+                overflow: limits.overflow(),
+                visible: &forward.visible.list,
+                grad_mean: &backward.grad_mean,
+                tiles: forward.bin.tiles(),
+                opacity: &forward.decode.opacity,
+                size: camera.size,
+            };
+            rec.stage(stage::STATISTICS);
+            statistics.record(rec, drawn);
+        }
+        self.optimize(rec, attended, step, rates);
+    }
+
+    /// Makes the stages that begin with this step and lets go of those whose time is over.
+    ///
+    /// # Errors
+    /// When the device has no room.
+    pub fn prepare(&mut self, step: u32) -> Result<(), Error> {
+        let config = &self.config.model.attention;
+        if let Some(weights) = self.attention_weights.take_if(|_| step >= config.start) {
+            let (seed, anchors) = (self.config.train.seed, self.anchors.capacity);
+            let attend = || Attend::new(&self.gpu, config, seed, anchors, &weights);
+            self.attend = Some(self.gpu.stage(stage::ATTENTION, attend)?);
+        }
+        let counting = self.plan.counted.is_some_and(|c| c.contain(step));
+        if counting && self.statistics.is_none() {
+            let (anchors, offsets) = (self.anchors.capacity, self.anchors.offsets);
+            let touched = self.config.densify.count_touched;
+            let statistics = || Statistics::new(&self.gpu, anchors, offsets, touched);
+            self.statistics = Some(self.gpu.stage(stage::STATISTICS, statistics)?);
+        } else if !counting {
+            self.statistics = None;
+        }
+        Ok(())
+    }
+
+    /// Everything that is learnt, with its moments; the attention's projections from its first step on.
+    pub fn parameters(&self) -> Vec<&Parameter> {
+        let attention = self.attend.as_ref().map(|attend| &attend.weights);
+        self.anchors.parameters().into_iter().chain([&self.weights]).chain(attention).collect()
+    }
+}

@@ -1,0 +1,100 @@
+//! Drawing and reading the model between steps.
+
+use super::Step;
+use crate::gpu::Error;
+use crate::math::decoder::Layout;
+use crate::model::files;
+use crate::render::rasterize::Picture;
+use crate::render::view::{Capacity, Model, Painter, Rendered};
+use crate::scene::Camera;
+use crate::stage;
+
+impl Step {
+    /// Draws the model as it is now from these cameras, one after the other, and hands each picture to `look`. The step's
+    /// own stages make room meanwhile, so that nothing of the step may be in flight.
+    ///
+    /// # Errors
+    /// When the device has no room, or is lost; `look`'s own.
+    pub fn draw<'c, E: From<Error>>(
+        &mut self,
+        cameras: impl IntoIterator<Item = &'c Camera>,
+        mut look: impl FnMut(usize, Rendered) -> Result<(), E>,
+    ) -> Result<(), E> {
+        self.release();
+        let gpu = self.gpu.clone();
+        gpu.stage(stage::EVALUATION, || {
+            let mut painter = Painter::new(&gpu, &self.config.render, self.background, self.capacity)?;
+            let model = Model { anchors: &self.anchors, weights: &self.weights.value };
+            cameras.into_iter().enumerate().try_for_each(|(i, camera)| look(i, painter.render(model, camera)?))
+        })?;
+        Ok(self.furnish()?)
+    }
+
+    /// One picture of the model as it is now, in memory of its own that is freed behind it: the step stays as it is, whether
+    /// that is to be had or not. None for a camera that sees several times as much as those of training. Nothing of the step
+    /// may be in flight.
+    ///
+    /// # Errors
+    /// When the device has no room, or is lost.
+    pub fn glance(&self, camera: &Camera) -> Result<Option<Rendered>, Error> {
+        self.gpu.stage(stage::EVALUATION, || {
+            let capacity = Capacity { anchors: self.anchors.capacity, ..self.capacity };
+            let longest = |size: &[u32; 2]| f64::from(size[0].max(size[1]));
+            let trained = self.plan.sizes.iter().map(longest).fold(1.0, f64::max);
+            let painter = Painter::new(&self.gpu, &self.config.render, self.background, capacity)?;
+            let mut painter = painter.larger(longest(&camera.size) / trained);
+            let model = Model { anchors: &self.anchors, weights: &self.weights.value };
+            painter.render_within(model, camera, capacity.pairs.max(1 << 20).saturating_mul(4))
+        })
+    }
+
+    /// The gradients of the last recorded step by PyTorch's names, of what is trained: for tests.
+    ///
+    /// # Errors
+    /// Whatever the copies meet.
+    pub fn gradients(&self) -> Result<std::collections::BTreeMap<String, Vec<f32>>, Error> {
+        let mut all = std::collections::BTreeMap::new();
+        let n = self.anchors.count as usize;
+        let gradients = &self.stages().gradients;
+        for (name, buffer, width) in [
+            ("feature", gradients.feature.as_ref(), 32),
+            ("offset", gradients.offset.as_ref(), 3 * self.anchors.offsets as usize),
+            ("log_scaling", gradients.log_scaling.as_ref(), 6),
+        ] {
+            if let Some(buffer) = buffer {
+                all.insert(name.to_owned(), self.gpu.read_range(buffer, n * width)?);
+            }
+        }
+        let layout = Layout { offsets: self.anchors.offsets as usize };
+        let Some(weights) = &gradients.weights else { return Ok(all) };
+        let flat = self.gpu.read_range(weights, layout.weights())?;
+        let attention = self
+            .attend
+            .as_ref()
+            .map(|attend| self.gpu.read_range(&attend.grad_weights, crate::math::attention::WEIGHTS));
+        let attention = attention.transpose()?;
+        let weights = files::Weights::from_device(self.anchors.offsets as usize, &flat, attention.as_deref());
+        all.extend(weights.tensors.into_iter().map(|(name, tensor)| (name, tensor.data)));
+        Ok(all)
+    }
+
+    /// The rendered colour, and depth where the plan has it, of the last step.
+    pub fn picture(&self, size: [u32; 2]) -> &Picture {
+        &self.canvas(size).picture
+    }
+
+    /// The model as it is now.
+    ///
+    /// # Errors
+    /// Whatever the copies meet.
+    pub fn model(&self) -> Result<(files::Anchors, files::Weights), Error> {
+        let layout = Layout { offsets: self.anchors.offsets as usize };
+        let flat = self.gpu.read_range(&self.weights.value, layout.weights())?;
+        let attention = match (&self.attend, &self.attention_weights) {
+            (Some(attend), _) => Some(self.gpu.read_range(&attend.weights.value, crate::math::attention::WEIGHTS)?),
+            (None, initial) => initial.clone(),
+        };
+        let weights = files::Weights::from_device(layout.offsets, &flat, attention.as_deref());
+        Ok((self.anchors.read(&self.gpu)?, weights))
+    }
+}
