@@ -322,8 +322,8 @@ fn mask_findings(scene: &Scene, report: &mut Report) {
     report.mask_margin = margin(scene);
     if let Some(margin) = report.mask_margin.filter(|m| *m >= 2) {
         let message = format!(
-            "the strongest edges lie about {margin} pixels outside the masks: they may be too tight; --set \
-             scene.dilate_masks={margin} at this size"
+            "the strongest edges lie about {margin} pixels outside the masks: they may be too tight; train widens them where \
+             the other views disagree (scene.judge_rim), and --set scene.dilate_masks={margin} does at this size in any case"
         );
         report.add(Severity::Note, "masks", None, message);
     }

@@ -43,6 +43,9 @@ pub struct Config {
     /// Let the train masks fall off over so many pixels around the object, at the training size: its antialiased edge and
     /// shadow reach beyond the mask. 0: masks are hard (GScream).
     pub rim: u32,
+    /// Hold the pixels around the train masks against the other views: what disagrees with them and hangs together with the
+    /// mask counts less, or not at all. Masks that are too tight, reflections (GScream: off).
+    pub judge_rim: bool,
     /// Use the inpainted picture outside its hole too (GScream), instead of the photograph.
     pub whole_reference: bool,
     /// So many other views that see a part of the hole past the object outrank the painted picture there, fewer in
@@ -108,6 +111,7 @@ impl Default for Config {
             seed_behind_edges: true,
             grow_masks: false,
             rim: 1,
+            judge_rim: true,
             whole_reference: false,
             outrank_guess: 5,
             truth_reference: String::new(),

@@ -143,31 +143,40 @@ pub fn dilate(mask: &GrayImage, radius: u32) -> GrayImage {
     if radius == 0 {
         return mask.clone();
     }
+    let values = distances(mask, radius).into_iter().map(|d| if d <= radius { 255 } else { 0 }).collect();
+    GrayImage::from_raw(mask.width(), mask.height(), values).expect("a value per pixel")
+}
+
+/// Distance of each pixel from the nearest object pixel, rounded up to whole pixels; `reach + 1` where none is as near as
+/// `reach`.
+pub fn distances(mask: &GrayImage, reach: u32) -> Vec<u32> {
     let (w, h) = (mask.width() as usize, mask.height() as usize);
     let raw = mask.as_raw();
-    let reach = radius as usize;
+    let reach = reach as usize;
     // No object pixel in the column: out of reach.
     let far = reach + 1;
     // Vertical distance to the nearest object pixel of the same column.
-    let mut distance = vec![far; w * h];
+    let mut vertical = vec![far; w * h];
     for x in 0..w {
         let mut last = far;
         for y in 0..h {
             last = if raw[y * w + x] != 0 { 0 } else { (last + 1).min(far) };
-            distance[y * w + x] = last;
+            vertical[y * w + x] = last;
         }
         last = far;
         for y in (0..h).rev() {
             last = if raw[y * w + x] != 0 { 0 } else { (last + 1).min(far) };
-            distance[y * w + x] = distance[y * w + x].min(last);
+            vertical[y * w + x] = vertical[y * w + x].min(last);
         }
     }
-    GrayImage::from_fn(mask.width(), mask.height(), |x, y| {
-        let (x, row) = (x as usize, &distance[y as usize * w..(y as usize + 1) * w]);
+    let squares: Vec<usize> = (0..=far).map(|d| d * d).collect();
+    let distance = |pixel: usize| {
+        let (x, row) = (pixel % w, &vertical[pixel / w * w..(pixel / w + 1) * w]);
         let near = x.saturating_sub(reach)..(x + reach + 1).min(w);
-        let hit = near.into_iter().any(|u| row[u] * row[u] + u.abs_diff(x) * u.abs_diff(x) <= reach * reach);
-        image::Luma([if hit { 255 } else { 0 }])
-    })
+        let square = near.map(|u| row[u] * row[u] + u.abs_diff(x) * u.abs_diff(x)).min().unwrap_or(far * far);
+        squares.partition_point(|s| *s < square).min(far) as u32
+    };
+    (0..w * h).map(distance).collect()
 }
 
 #[cfg(test)]
@@ -241,6 +250,11 @@ mod tests {
                 let r2 = x.abs_diff(4).pow(2) + y.abs_diff(3).pow(2);
                 assert_eq!(v.0[0] == 255, r2 <= radius * radius, "radius {radius} at {x},{y}");
             }
+        }
+        let far = distances(&dot, 3);
+        for (pixel, d) in far.iter().enumerate() {
+            let exact = ((pixel % 9).abs_diff(4) as f64).hypot((pixel / 9).abs_diff(3) as f64);
+            assert_eq!(*d, (exact.ceil() as u32).min(4), "pixel {pixel}");
         }
         assert!(dilate(&GrayImage::new(4, 4), 9).as_raw().iter().all(|v| *v == 0));
     }

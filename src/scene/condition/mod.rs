@@ -5,6 +5,7 @@
 //! - [`sparse`]: each prior is held against the points of the sparse model. One that does not follow them is not used, and
 //!   disparity becomes depth.
 //! - [`rim`]: masks grow, if asked for, by what the inpainted picture was repainted beyond them, and fall off around the object.
+//! - [`judge`]: pixels around the masks that other views do not confirm are the object's too.
 //! - [`points`]: points on the object are left out, and the hole gets points from the reference view's prior, behind its
 //!   depth edges too.
 //! - [`stereo`]: a reference that shows the truth gets the depth that the test views measure, where that is asked for.
@@ -13,6 +14,7 @@
 //!
 //! Each has a setting in [`Config`], and with all of them off the capture stays as it was read.
 
+mod judge;
 mod points;
 mod reference;
 mod rim;
@@ -45,7 +47,11 @@ pub fn condition(scene: &mut Scene, config: &Config) {
     if config.seed_behind_edges {
         points::seed_behind_edges(scene, &depths);
     }
+    let rims = config.judge_rim.then(|| judge::rims(scene));
     rim::soften_masks(scene, config.rim);
+    if let Some(rims) = rims {
+        rim::raise_masks(scene, &rims);
+    }
     if !config.whole_reference {
         reference::composite(scene);
     }

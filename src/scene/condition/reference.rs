@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use super::points::{lift, pixel_of};
 use super::sparse::{Sample, fit, samples};
-use crate::scene::{Prior, PriorKind, Reference, Scene};
+use crate::scene::{Camera, Point, Prior, PriorKind, Reference, Scene};
 
 /// Of each reference, the depth z of its hole \[pixel\], NaN outside it: its prior brought to the scene's depth by the points
 /// outside the mask. `None` without a prior, or without enough points.
@@ -68,50 +68,83 @@ pub(super) fn guess_priors(scene: &mut Scene) {
     }
 }
 
-/// Depth at each pixel: a plane of inverse depth through the nearest points, weighted by their distance, by how alike the
-/// colours are and by how near the plane they are. It is smooth where the picture is, and breaks where colours break, like
-/// a surface's border. `None` with too few points.
+/// Depth at each pixel of a reference picture. `None` with too few points.
 fn guess(scene: &Scene, reference: &Reference) -> Option<Vec<f32>> {
-    let view = &scene.train[reference.view];
+    let camera = &scene.train[reference.view].camera;
     // Points in the hole as well: those on the object have been left out, the others were seen past it.
-    let samples = samples(&view.camera, &scene.points, None);
-    let neighbors = NEIGHBORS.min(samples.len() / 4);
-    if neighbors < FEWEST_NEIGHBORS {
-        return None;
+    let surroundings = Surroundings::new(camera, &reference.image, &scene.points, None)?;
+    let pixels = camera.size[0] as usize * camera.size[1] as usize;
+    Some((0..pixels).into_par_iter().map(|pixel| surroundings.depth(pixel) as f32).collect())
+}
+
+/// The points that a view sees, from which the depth of its other pixels is guessed.
+pub(super) struct Surroundings {
+    samples: Vec<Sample>,
+    /// Of each sample.
+    colors: Vec<[f64; 3]>,
+    picture: image::RgbImage,
+    neighbors: usize,
+}
+
+impl Surroundings {
+    /// Of a view with such a picture; with `outside`, of its points outside that mask. `None` with too few points.
+    pub(super) fn new(
+        camera: &Camera,
+        picture: &image::RgbImage,
+        points: &[Point],
+        outside: Option<&GrayImage>,
+    ) -> Option<Surroundings> {
+        let samples = samples(camera, points, outside);
+        let neighbors = NEIGHBORS.min(samples.len() / 4);
+        if neighbors < FEWEST_NEIGHBORS {
+            return None;
+        }
+        // Noise of single pixels tells no surfaces apart.
+        let picture = image::imageops::blur(picture, 1.0 + camera.size[0] as f32 / 250.0);
+        let mut surroundings = Surroundings { samples, colors: vec![], picture, neighbors };
+        surroundings.colors = surroundings.samples.iter().map(|s| surroundings.color(s.pixel)).collect();
+        Some(surroundings)
     }
-    let [w, h] = view.camera.size.map(|n| n as usize);
-    // Noise of single pixels tells no surfaces apart.
-    let blurred = image::imageops::blur(&reference.image, 1.0 + w as f32 / 250.0);
-    let color = |pixel: usize| -> [f64; 3] { std::array::from_fn(|c| f64::from(blurred.as_raw()[3 * pixel + c])) };
-    let at = |pixel: usize| [(pixel % w) as f64, (pixel / w) as f64];
-    let colors: Vec<[f64; 3]> = samples.iter().map(|s| color(s.pixel)).collect();
-    let guess = |pixel: usize| {
-        let (here, tint) = (at(pixel), color(pixel));
-        let mut near: Vec<(f64, usize)> = samples
+
+    fn color(&self, pixel: usize) -> [f64; 3] {
+        std::array::from_fn(|c| f64::from(self.picture.as_raw()[3 * pixel + c]))
+    }
+
+    fn place(&self, pixel: usize) -> [f64; 2] {
+        let w = self.picture.width() as usize;
+        [(pixel % w) as f64, (pixel / w) as f64]
+    }
+
+    /// Depth z at a pixel: a plane of inverse depth through the nearest points, weighted by their distance, by how alike the
+    /// colours are and by how near the plane they are. It is smooth where the picture is, and breaks where colours break,
+    /// like a surface's border.
+    pub(super) fn depth(&self, pixel: usize) -> f64 {
+        let (here, tint) = (self.place(pixel), self.color(pixel));
+        let mut near: Vec<(f64, usize)> = self
+            .samples
             .iter()
             .enumerate()
             .map(|(i, s)| {
-                let there = at(s.pixel);
+                let there = self.place(s.pixel);
                 ((there[0] - here[0]).powi(2) + (there[1] - here[1]).powi(2), i)
             })
             .collect();
-        near.select_nth_unstable_by(neighbors - 1, |a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        near.truncate(neighbors);
+        near.select_nth_unstable_by(self.neighbors - 1, |a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        near.truncate(self.neighbors);
         // One order, whatever the selection left: sums round alike everywhere.
         near.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         let reach = near.iter().fold(1.0_f64, |m, (d, _)| m.max(*d));
         let mut weighted: Vec<Weighted> = near
             .iter()
             .map(|(d, i)| {
-                let apart: f64 = (0..3).map(|c| (tint[c] - colors[*i][c]).powi(2)).sum::<f64>() / 3.0;
+                let apart: f64 = (0..3).map(|c| (tint[c] - self.colors[*i][c]).powi(2)).sum::<f64>() / 3.0;
                 let weight = (-0.5 * apart / COLOR.powi(2)).exp().max(1e-4) / (d + 0.05 * reach);
-                let there = at(samples[*i].pixel);
-                (weight, [there[0] - here[0], there[1] - here[1]], 1.0 / samples[*i].depth)
+                let there = self.place(self.samples[*i].pixel);
+                (weight, [there[0] - here[0], there[1] - here[1]], 1.0 / self.samples[*i].depth)
             })
             .collect();
-        (1.0 / robust_plane(&mut weighted, reach)) as f32
-    };
-    Some((0..w * h).into_par_iter().map(guess).collect())
+        1.0 / robust_plane(&mut weighted, reach)
+    }
 }
 
 /// Fewest samples that a plane is laid through.

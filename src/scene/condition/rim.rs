@@ -2,6 +2,7 @@
 
 use image::{GrayImage, RgbImage};
 
+use super::judge::Rims;
 use crate::scene::{Scene, resample};
 
 /// How far beyond a mask is looked, as a share of the picture's longer side.
@@ -84,6 +85,21 @@ pub(super) fn soften_masks(scene: &mut Scene, rim: u32) {
         }
         mask.iter_mut().zip(hard.as_raw()).filter(|(_, h)| **h != 0).for_each(|(m, h)| *m = *h);
     }
+}
+
+/// Raises the train masks where other views do not confirm what is around them.
+pub(super) fn raise_masks(scene: &mut Scene, rims: &Rims) {
+    for (mask, values) in scene.train.iter_mut().map(|v| v.mask.as_mut()).zip(&rims.values) {
+        let Some(mask) = mask else { continue };
+        mask.iter_mut().zip(values).for_each(|(m, v)| *m = (*m).max(*v));
+    }
+    let Some(first) = rims.shares.first() else { return };
+    scene.notes.push(format!(
+        "the masks are too tight: by what the other views see there, {:.0} % of the pixels next to them show the object, and \
+         some do up to {} pixels away; these are left out (scene.judge_rim)",
+        100.0 * first,
+        rims.shares.len()
+    ));
 }
 
 #[cfg(test)]
