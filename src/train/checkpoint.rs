@@ -351,14 +351,19 @@ impl Fingerprint {
     pub fn of(scene: &Scene) -> Self {
         let hex = |hasher: blake3::Hasher| hasher.finalize().to_hex().to_string();
         let mut parts = vec![];
-        for (set, views) in [("train view", &scene.train), ("test view", &scene.test)] {
+        let sets = [("train view", &scene.train), ("test view", &scene.test)];
+        // The photographs come first: the masks of other views depend on each of them.
+        for (set, view) in sets.iter().flat_map(|(set, views)| views.iter().map(move |view| (set, view))) {
+            let hash = blake3::hash(view.image.as_raw());
+            parts.push((format!("{set} {}", view.name), hash.to_hex().to_string()));
+        }
+        for (set, views) in sets {
             for view in views {
                 let mut hasher = blake3::Hasher::new();
                 hash_camera(&mut hasher, &view.camera);
-                hasher.update(view.image.as_raw());
                 hash_mask(&mut hasher, view.mask.as_ref());
                 hash_prior(&mut hasher, view.prior.as_ref());
-                parts.push((format!("{set} {}", view.name), hex(hasher)));
+                parts.push((format!("mask, prior or pose of {set} {}", view.name), hex(hasher)));
             }
         }
         for reference in &scene.references {
