@@ -77,7 +77,11 @@ pub(super) fn rims(scene: &Scene) -> Rims {
         };
         let reach = reach(&scene.train[at]);
         let mut values = vec![0; mask.as_raw().len()];
-        for judged in pixels.iter().flatten().filter(|j| (1..=reach as i32).contains(&j.distance)) {
+        // Single pixels are told by chance, too: they count where masks, or this one, are too tight on the whole. Around the
+        // built-in scene's right masks they cost 0.2 dB in the hole.
+        let told = !shares.is_empty() || !self::shares(pixels.iter(), reach).is_empty();
+        let around = |j: &&Judged| told && (1..=reach as i32).contains(&j.distance);
+        for judged in pixels.iter().flatten().filter(around) {
             let own = ((f64::from(judged.score) - SUSPECT) / (SURE - SUSPECT)).clamp(0.0, 1.0);
             values[judged.pixel as usize] = (255.0 * own).round() as u8;
         }
@@ -340,7 +344,7 @@ mod tests {
             // A pixel at the edge may be mixed of both.
             let grown = |at: usize, by: u32| resample::dilate(scene.train[at].mask.as_ref().expect("a mask"), by);
             let [left_out, all] = left_out(&found, |at| grown(at, 4), |at| grown(at, 1));
-            assert!(all > 8000 && 20 * left_out < all, "seed {seed}: {left_out} of {all}");
+            assert!(all > 8000 && 50 * left_out < all, "seed {seed}: {left_out} of {all}");
         }
     }
 
