@@ -13,6 +13,7 @@ use rayon::prelude::*;
 
 use super::points::{lift, pixel_of};
 use super::reference::Surroundings;
+use super::sparse::deviation;
 use super::stereo::bilinear;
 use crate::scene::{Camera, Scene, View, resample};
 
@@ -29,8 +30,6 @@ const SUSPECT: f64 = 2.0;
 const SURE: f64 = 4.0;
 /// Least standard deviation, 8-bit levels: what compression makes of a smooth surface.
 const LEAST: f64 = 3.0;
-/// That of a normal distribution over its median absolute deviation.
-const NORMAL: f64 = 1.4826;
 /// Fewest pixels that tell a share: to 0.07, a standard deviation.
 const PIXELS: usize = 50;
 /// An object that is less often suspect than its surroundings and this looks like them: nothing is told.
@@ -250,10 +249,9 @@ fn consensus(others: &[(&Camera, &RgbImage, Option<&GrayImage>)], place: [f64; 3
 
 /// The median of values, and the standard deviation that their median absolute deviation tells.
 fn median_and_deviation(values: &mut [f64]) -> [f64; 2] {
-    let middle = values.len() / 2;
-    let median = *values.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let median = *values.select_nth_unstable_by(values.len() / 2, f64::total_cmp).1;
     values.iter_mut().for_each(|v| *v = (*v - median).abs());
-    [median, NORMAL * *values.select_nth_unstable_by(middle, f64::total_cmp).1]
+    [median, deviation(values)]
 }
 
 /// What of the values above 0 hangs together with the mask, by sides or corners; the rest is another texture's.

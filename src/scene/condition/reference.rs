@@ -4,7 +4,7 @@ use image::{GrayImage, Luma};
 use rayon::prelude::*;
 
 use super::points::{lift, pixel_of};
-use super::sparse::{Sample, fit, samples};
+use super::sparse::{Sample, deviation, fit, samples};
 use crate::scene::{Camera, Point, Prior, PriorKind, Reference, Scene};
 
 /// Of each reference, the depth z of its hole \[pixel\], NaN outside it: its prior brought to the scene's depth by the points
@@ -160,9 +160,7 @@ fn robust_plane(weighted: &mut [Weighted], reach: f64) -> f64 {
     for _ in 0..ROUNDS {
         let [value, x, y] = plane(weighted, reach);
         let residual = |s: &Weighted| (s.2 - value - x * s.1[0] - y * s.1[1]).abs();
-        let mut sorted: Vec<f64> = weighted.iter().map(residual).collect();
-        let middle = sorted.len() / 2;
-        let deviation = 1.4826 * *sorted.select_nth_unstable_by(middle, f64::total_cmp).1;
+        let deviation = deviation(&mut weighted.iter().map(residual).collect::<Vec<f64>>());
         if deviation == 0.0 {
             break;
         }

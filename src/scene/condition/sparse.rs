@@ -52,6 +52,12 @@ pub(super) fn samples(camera: &Camera, points: &[Point], outside: Option<&image:
     blocks.iter_mut().filter_map(median).collect()
 }
 
+/// The standard deviation that the median of absolute residuals tells, as of a normal distribution. Reorders them; there is
+/// at least one.
+pub(super) fn deviation(residuals: &mut [f64]) -> f64 {
+    1.4826 * *residuals.select_nth_unstable_by(residuals.len() / 2, f64::total_cmp).1
+}
+
 /// `y ~ slope x + shift` with small influence of outliers: least absolute deviations by reweighting, then Tukey's biweight
 /// at 4.7 standard deviations, as the median absolute residual tells them (Huber and Ronchetti 2009, chapter 7). `None`
 /// where all x are one.
@@ -72,8 +78,7 @@ pub(super) fn robust_line(x: &[f64], y: &[f64]) -> Option<[f64; 2]> {
     let mut fit = line(&weight)?;
     for round in 0..40 {
         let residuals: Vec<f64> = x.iter().zip(y).map(|(x, y)| (y - fit[0] * x - fit[1]).abs()).collect();
-        let mut sorted = residuals.clone();
-        let scale = 1.4826 * *sorted.select_nth_unstable_by(residuals.len() / 2, f64::total_cmp).1;
+        let scale = deviation(&mut residuals.clone());
         if scale == 0.0 {
             break;
         }
