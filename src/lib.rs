@@ -7,6 +7,24 @@
 //! browser. Kernels live in `glsl/`, mirrored by path and stem in `src/`; each has a CPU twin in float64 beside the code
 //! that dispatches it. [`gpu`] is the only place that knows Vulkan; [`primitives`] are sorts, scans and sums that know
 //! nothing of splats. [`cli`] has one file per command.
+//!
+//! # Words
+//!
+//! | word | means |
+//! | --- | --- |
+//! | anchor | a point of the scene with a feature, from which the decoders make its Gaussians |
+//! | slot | the place of one Gaussian of one anchor: anchor x offsets + offset |
+//! | form | which kernels run where two exist: those for GPUs or those for CPU drivers ([`gpu::Form`]) |
+//! | tile | a square of pixels that one workgroup draws |
+//! | pair | a Gaussian and a tile that it touches |
+//! | twin | the CPU reference of a kernel, in float64, with the same bindings |
+//! | mask | the pixels of a photograph that show the object to be removed |
+//! | hole | the pixels of a picture, or the place in the scene, that the object covered |
+//! | reference | the view whose hole was inpainted, or which never had one |
+//! | prior | a depth or disparity of a picture from outside this program, known up to scale and shift |
+//! | seen | a place that another photograph shows past the object |
+//! | guessed | a place that no photograph shows |
+//! | unit | the length that counts as one in the settings, in lengths of the capture's files |
 
 pub mod bench;
 pub mod capture;

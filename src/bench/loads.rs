@@ -158,6 +158,7 @@ impl Load {
             camera: self.camera(),
             image: image.clone(),
             mask: Some(mask),
+            weight: None,
             prior: Some(prior.clone()),
             depth: None,
         };

@@ -53,9 +53,12 @@ pub struct View {
     pub camera: Camera,
     /// Stored values, 8 bits per channel.
     pub image: RgbImage,
-    /// 255 on the object, 0 elsewhere, as large as `image`. Empty masks are allowed: the object is out of view. After
-    /// [`condition`] it falls off around the object, and on the reference view is lower where other views see the hole.
+    /// 255 on the object, 0 elsewhere, as large as `image`. Empty masks are allowed: the object is out of view.
     pub mask: Option<GrayImage>,
+    /// Blend of the two loss weights of a pixel, as large as `mask`: 255 takes the weight inside the mask, 0 that outside.
+    /// [`condition`] makes it from the mask: it falls off around the object, and is lower where other views see a
+    /// reference's hole. `None` stands for the mask itself.
+    pub weight: Option<GrayImage>,
     /// Prior of `image`; never there for test views.
     pub prior: Option<Prior>,
     /// True depth z of `image`, where it is known: `[row-major pixel]`, 0 where it is not. Of test views alone: nothing is
@@ -277,6 +280,13 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
         notes.push("all train cameras stand at one place: the scene radius is taken as 1".into());
     }
     Ok(Scene { train, test, references, points: model.points, radius: radius.unwrap_or(1.0), unit: 1.0, notes })
+}
+
+impl View {
+    /// Blend of the loss weights inside and outside the mask: [`View::weight`] where there is one, else the mask.
+    pub fn blend(&self) -> Option<&GrayImage> {
+        self.weight.as_ref().or(self.mask.as_ref())
+    }
 }
 
 impl Scene {
@@ -599,7 +609,7 @@ impl Reader<'_> {
             size,
         };
         let depth = entry.depth.as_ref().map(|path| depth_map(path, picture, size)).transpose()?;
-        let view = View { name: entry.name.clone(), camera, image, mask, prior, depth };
+        let view = View { name: entry.name.clone(), camera, image, mask, weight: None, prior, depth };
         Ok(Loaded { view, calibrated: intrinsics.size, picture, stretched_mask })
     }
 }

@@ -361,7 +361,7 @@ impl Fingerprint {
             for view in views {
                 let mut hasher = blake3::Hasher::new();
                 hash_camera(&mut hasher, &view.camera);
-                hash_mask(&mut hasher, view.mask.as_ref());
+                hash_mask(&mut hasher, view.blend());
                 hash_prior(&mut hasher, view.prior.as_ref());
                 parts.push((format!("mask, prior or pose of {set} {}", view.name), hex(hasher)));
             }

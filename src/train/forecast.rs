@@ -371,6 +371,7 @@ fn resized(scene: &Scene, from: u32, to: u32) -> Scene {
             camera: view.camera.scaled(size),
             image: RgbImage::new(w, h),
             mask: view.mask.as_ref().map(|_| GrayImage::from_pixel(w, h, fill)),
+            weight: None,
             prior: view.prior.as_ref().map(|p| blank(p, size)),
             depth: None,
         }

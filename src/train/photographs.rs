@@ -1,4 +1,4 @@
-//! The training pictures on the device: 8 bits per channel, the mask in the fourth byte.
+//! The training pictures on the device: 8 bits per channel, the blend of the loss weights in the fourth byte.
 //!
 //! Reduced pictures are made as `scene.downscale` makes them: area averages of picture and prior, "any object pixel"
 //! for the mask, the camera scaled by the exact ratio of each side.
@@ -79,9 +79,9 @@ pub fn upload(gpu: &Gpu, scene: &Scene, plan: &Plan, reduction: u32) -> Result<V
         let size = reduced_size(full, reduction);
         let smaller = size != full;
         let picture = if smaller { Cow::Owned(resample::photograph(picture, size)) } else { Cow::Borrowed(picture) };
-        let mask = match &view.mask {
+        let mask = match view.blend() {
             Some(mask) if smaller => Some(Cow::Owned(resample::largest(mask, size))),
-            mask => mask.as_ref().map(Cow::Borrowed),
+            mask => mask.map(Cow::Borrowed),
         };
         let mask = mask.as_deref();
         let prior = match prior.filter(|_| plan.depth_losses(reference.is_some()).any()) {

@@ -48,9 +48,9 @@ pub fn condition(scene: &mut Scene, config: &Config) {
         points::seed_behind_edges(scene, &depths);
     }
     let rims = config.judge_rim.then(|| judge::rims(scene));
-    rim::soften_masks(scene, config.rim);
+    rim::soften(scene, config.rim);
     if let Some(rims) = rims {
-        rim::raise_masks(scene, &rims);
+        rim::raise(scene, &rims);
     }
     if !config.whole_reference {
         reference::composite(scene);

@@ -188,13 +188,13 @@ fn plane(weighted: &[Weighted], reach: f64) -> [f64; 3] {
     [mv - slope[0] * mx - slope[1] * my, slope[0], slope[1]]
 }
 
-/// Takes the inpainted pictures in their holes and the photographs outside, mixed as the mask falls off: networks that
+/// Takes the inpainted pictures in their holes and the photographs outside, mixed as the weight falls off: networks that
 /// inpaint repaint the surroundings as well, and those were photographed.
 pub(super) fn composite(scene: &mut Scene) {
     for reference in &mut scene.references {
         let view = &scene.train[reference.view];
-        let Some(mask) = &view.mask else { continue };
-        let pixels = reference.image.pixels_mut().zip(view.image.pixels()).zip(mask.as_raw());
+        let Some(weight) = view.blend() else { continue };
+        let pixels = reference.image.pixels_mut().zip(view.image.pixels()).zip(weight.as_raw());
         for ((painted, photographed), m) in pixels {
             let share = f64::from(*m) / 255.0;
             for (p, q) in painted.0.iter_mut().zip(photographed.0) {
@@ -204,8 +204,8 @@ pub(super) fn composite(scene: &mut Scene) {
     }
 }
 
-/// Lowers a reference's weight where other views see past the object: with n of `enough` views by n / `enough`, so that
-/// what was photographed outranks what was painted. Its mask says how much the picture counts; inside it stays above 0.
+/// Lowers the weight of a reference's view where other views see past the object: with n of `enough` views by n / `enough`,
+/// so that what was photographed outranks what was painted. Inside the mask it stays above 0.
 pub(super) fn outrank(scene: &mut Scene, depths: &[Option<Vec<f32>>], enough: u32) {
     let lowered: Vec<_> = scene
         .references
@@ -213,8 +213,8 @@ pub(super) fn outrank(scene: &mut Scene, depths: &[Option<Vec<f32>>], enough: u3
         .zip(depths)
         .filter_map(|(reference, depth)| Some((reference.view, outranked(scene, reference, depth.as_ref()?, enough)?)))
         .collect();
-    for (view, (mask, share)) in lowered {
-        scene.train[view].mask = Some(mask);
+    for (view, (weight, share)) in lowered {
+        scene.train[view].weight = Some(weight);
         if share > 0.0 {
             scene.notes.push(format!(
                 "{:.0} % of the hole of reference {} is seen past the object by {enough} views or more, which outrank the \
@@ -226,10 +226,10 @@ pub(super) fn outrank(scene: &mut Scene, depths: &[Option<Vec<f32>>], enough: u3
     }
 }
 
-/// The lowered mask, and the share of the hole that enough views see.
+/// The lowered weight, and the share of the hole that enough views see.
 fn outranked(scene: &Scene, reference: &Reference, depth: &[f32], enough: u32) -> Option<(GrayImage, f64)> {
     let view = &scene.train[reference.view];
-    let mask = view.mask.as_ref()?;
+    let weight = view.blend()?;
     // What another reference shows of the hole was painted too.
     let others: Vec<_> =
         scene.train.iter().enumerate().filter(|(i, _)| *i != reference.view).map(|(_, view)| view).collect();
@@ -237,7 +237,7 @@ fn outranked(scene: &Scene, reference: &Reference, depth: &[f32], enough: u32) -
         let z = depth[pixel];
         let Some(position) = z.is_finite().then(|| lift(&view.camera, pixel, f64::from(z))).flatten() else { return 0 };
         let sees = |other: &&&crate::scene::View| {
-            pixel_of(&other.camera, position).is_some_and(|p| other.mask.as_ref().is_none_or(|m| m.as_raw()[p] == 0))
+            pixel_of(&other.camera, position).is_some_and(|p| other.blend().is_none_or(|w| w.as_raw()[p] == 0))
         };
         others.iter().filter(sees).count()
     };
@@ -246,10 +246,10 @@ fn outranked(scene: &Scene, reference: &Reference, depth: &[f32], enough: u32) -
         let left = 1.0 - (n as f64 / f64::from(enough)).min(1.0);
         if m == 0 { 0 } else { (f64::from(m) * left).round().max(1.0) as u8 }
     };
-    let hole = mask.as_raw().iter().filter(|m| **m == 255).count();
-    let seen = mask.as_raw().iter().zip(&counted).filter(|(m, n)| **m == 255 && **n >= enough as usize).count();
-    let mut new = GrayImage::new(mask.width(), mask.height());
-    for ((to, m), n) in new.pixels_mut().zip(mask.as_raw()).zip(&counted) {
+    let hole = weight.as_raw().iter().filter(|w| **w == 255).count();
+    let seen = weight.as_raw().iter().zip(&counted).filter(|(w, n)| **w == 255 && **n >= enough as usize).count();
+    let mut new = GrayImage::new(weight.width(), weight.height());
+    for ((to, m), n) in new.pixels_mut().zip(weight.as_raw()).zip(&counted) {
         *to = Luma([lowered(*m, *n)]);
     }
     Some((new, seen as f64 / hole.max(1) as f64))

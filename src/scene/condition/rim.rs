@@ -72,26 +72,27 @@ fn repainted(painted: &RgbImage, photograph: &RgbImage, mask: &GrayImage) -> u32
     reach
 }
 
-/// Lets the train masks fall off to 0 over so many pixels around the object, whose antialiased edge, shadow and glow reach
-/// beyond the mask: what is drawn there counts less the nearer it is.
-pub(super) fn soften_masks(scene: &mut Scene, rim: u32) {
-    for mask in scene.train.iter_mut().filter_map(|v| v.mask.as_mut()) {
-        let hard = mask.clone();
+/// Gives each train view with a mask its [`View::weight`](crate::scene::View::weight), which falls off to 0 over `rim`
+/// pixels around the mask: the object's antialiased edge, shadow and glow reach beyond it.
+pub(super) fn soften(scene: &mut Scene, rim: u32) {
+    for view in &mut scene.train {
+        let Some(hard) = &view.mask else { continue };
+        let weight = view.weight.insert(hard.clone());
         for radius in (1..=rim).rev() {
             let value = (255.0 * (1.0 - f64::from(radius) / f64::from(rim + 1))).round() as u8;
-            let grown = resample::dilate(&hard, radius);
+            let grown = resample::dilate(hard, radius);
             // From the outermost ring inwards: nearer rings overwrite.
-            mask.iter_mut().zip(grown.as_raw()).filter(|(_, g)| **g != 0).for_each(|(m, _)| *m = value);
+            weight.iter_mut().zip(grown.as_raw()).filter(|(_, g)| **g != 0).for_each(|(w, _)| *w = value);
         }
-        mask.iter_mut().zip(hard.as_raw()).filter(|(_, h)| **h != 0).for_each(|(m, h)| *m = *h);
+        weight.iter_mut().zip(hard.as_raw()).filter(|(_, h)| **h != 0).for_each(|(w, h)| *w = *h);
     }
 }
 
-/// Raises the train masks where other views do not confirm what is around them.
-pub(super) fn raise_masks(scene: &mut Scene, rims: &Rims) {
-    for (mask, values) in scene.train.iter_mut().map(|v| v.mask.as_mut()).zip(&rims.values) {
-        let Some(mask) = mask else { continue };
-        mask.iter_mut().zip(values).for_each(|(m, v)| *m = (*m).max(*v));
+/// Raises the train views' weights where other views do not confirm what is around the masks.
+pub(super) fn raise(scene: &mut Scene, rims: &Rims) {
+    for (weight, values) in scene.train.iter_mut().map(|v| v.weight.as_mut()).zip(&rims.values) {
+        let Some(weight) = weight else { continue };
+        weight.iter_mut().zip(values).for_each(|(w, v)| *w = (*w).max(*v));
     }
     let Some(first) = rims.shares.first() else { return };
     scene.notes.push(format!(
@@ -126,6 +127,31 @@ mod tests {
         for (i, (pixel, w)) in reference.image.pixels_mut().zip(wide.as_raw()).enumerate() {
             if *w != 0 {
                 *pixel = paint(i as u32, *pixel);
+            }
+        }
+    }
+
+    /// The weight is 255 in the mask, falls off evenly over the rim and is 0 beyond; the mask stays as it was delivered.
+    #[test]
+    fn the_weight_falls_off_and_the_mask_stays() {
+        let mut scene = scene();
+        let masks: Vec<Option<GrayImage>> = scene.train.iter().map(|v| v.mask.clone()).collect();
+        scene.train[1].mask = None;
+        soften(&mut scene, 2);
+        assert_eq!(scene.train[1].weight, None, "without a mask every pixel has the weight outside");
+        for (view, mask) in scene.train.iter().zip(&masks).filter(|(view, _)| view.mask.is_some()) {
+            assert_eq!(view.mask, *mask);
+            let weight = view.blend().expect("a weight");
+            let ring = |radius: u32| resample::dilate(view.mask.as_ref().expect("a mask"), radius).into_raw();
+            let [mask, near, far] = [ring(0), ring(1), ring(2)];
+            for (pixel, value) in weight.as_raw().iter().enumerate() {
+                let expected = match [mask[pixel], near[pixel], far[pixel]] {
+                    [255, ..] => 255,
+                    [_, 255, _] => 170,
+                    [.., 255] => 85,
+                    _ => 0,
+                };
+                assert_eq!(*value, expected, "{} {pixel}", view.name);
             }
         }
     }
