@@ -279,12 +279,7 @@ pub(super) struct Device {
 
 impl Device {
     fn open(instance: &Instance, found: &Found, wanted: Wanted) -> Result<Self, Error> {
-        // SAFETY: a plain query of a live instance.
-        let families = unsafe { instance.raw.get_physical_device_queue_family_properties(found.raw) };
-        let family = families
-            .iter()
-            .position(|f| f.queue_flags.contains(vk::QueueFlags::COMPUTE))
-            .expect("a device without a compute queue is refused") as u32;
+        let family = found.family.expect("a device without a compute queue is refused");
         let priorities = [1.0];
         let queues = [vk::DeviceQueueCreateInfo::default().queue_family_index(family).queue_priorities(&priorities)];
         let mut extensions = vec![];

@@ -52,6 +52,8 @@ pub(super) struct Found {
     pub raw: vk::PhysicalDevice,
     pub info: DeviceInfo,
     pub subgroups: Subgroups,
+    /// The family whose queue is taken; a device that lacks nothing has one.
+    pub family: Option<u32>,
     pub identity: Identity,
     pub extensions: Vec<vk::ExtensionProperties>,
 }
@@ -76,12 +78,15 @@ pub(super) struct Subgroups {
 }
 
 impl Subgroups {
-    /// The driver's choice if the kernels can have it, else the nearest size that they can, if there is one. A size that
-    /// nobody can ask for must be the only one: kernels would not know which they have.
+    /// The driver's choice if the kernels can have it, else the nearest size that they can, if there is one.
+    ///
+    /// Where no size can be asked for, the driver's own is what kernels get, however many others it lists: pipelines do not
+    /// allow a varying size, their modules are older than SPIR-V 1.6, and their subgroups are asked to be full. MoltenVK on
+    /// Apple's GPUs is such a driver, with 32 of 4 to 32.
     fn usual(self) -> Option<u32> {
         let fits = |size: &u32| (LEAST_SUBGROUP..=MOST_SUBGROUP_THREADS).contains(size) && size.is_power_of_two();
         if !self.chosen {
-            return Some(self.own).filter(|size| self.least == self.most && fits(size));
+            return Some(self.own).filter(fits);
         }
         let sizes = (0..32).map(|bit| 1 << bit).filter(|size| (self.least..=self.most).contains(size));
         Some(self.own).into_iter().chain(sizes).filter(fits).min_by_key(|size| size.abs_diff(self.own))
@@ -92,15 +97,18 @@ impl Subgroups {
     /// # Errors
     /// What the device lacks.
     pub fn wanted(self, size: u32) -> Result<u32, String> {
-        let Self { least, most, chosen, .. } = self;
+        let Self { own, least, most, chosen } = self;
         if !(least..=most).contains(&size) || !size.is_power_of_two() {
             return Err(format!("subgroups of {size} threads (it has {least} to {most})"));
         }
+        if !chosen && size != own {
+            return Err(format!("a choice of its subgroups' size (they have {own} threads)"));
+        }
         let usual = Self { own: size, ..self }.usual();
-        let only = if chosen { "kernels have 4 to" } else { "its size cannot be chosen, and kernels have 4 to" };
-        usual
-            .filter(|&found| found == size)
-            .ok_or_else(|| format!("subgroups of {size} threads that kernels can use ({only} {MOST_SUBGROUP_THREADS})"))
+        usual.filter(|&found| found == size).ok_or_else(|| {
+            let kernels = format!("kernels have {LEAST_SUBGROUP} to {MOST_SUBGROUP_THREADS}");
+            format!("subgroups of {size} threads that kernels can use ({kernels})")
+        })
     }
 }
 
@@ -114,46 +122,33 @@ struct Facts {
     f13: vk::PhysicalDeviceVulkan13Features<'static>,
     /// Buffers that can be pushed; 0 without the extension.
     pushed: u32,
-    compute: bool,
-    heap_bytes: u64,
+    families: Vec<vk::QueueFamilyProperties>,
+    memory: vk::PhysicalDeviceMemoryProperties,
 }
 
-/// The devices of the instance: discrete first, CPUs last, in the loader's order within a kind.
+/// The devices of the instance: discrete first, CPUs last, within a kind those with more memory of their own first, then in
+/// the loader's order. A device whose driver does not answer is listed with what it said.
 ///
 /// # Errors
 /// When the loader cannot list them.
 pub(super) fn list(instance: &ash::Instance) -> Result<Vec<Found>, Error> {
     // SAFETY: plain queries of a live instance.
-    let mut physical = unsafe { instance.enumerate_physical_devices() }.named("listing devices")?;
-    let rank = |p: &vk::PhysicalDevice| {
-        // SAFETY: as above.
-        match unsafe { instance.get_physical_device_properties(*p) }.device_type {
-            vk::PhysicalDeviceType::DISCRETE_GPU => 0,
-            vk::PhysicalDeviceType::INTEGRATED_GPU => 1,
-            vk::PhysicalDeviceType::VIRTUAL_GPU => 2,
-            _ => 3,
-        }
-    };
-    physical.sort_by_key(rank);
-    physical.into_iter().enumerate().map(|(index, raw)| find(instance, raw, index)).collect()
+    let physical = unsafe { instance.enumerate_physical_devices() }.named("listing devices")?;
+    let mut found: Vec<(Rank, Found)> = physical.into_iter().map(|raw| find(instance, raw)).collect();
+    found.sort_by_key(|(rank, _)| *rank);
+    let numbered = found.into_iter().enumerate();
+    Ok(numbered.map(|(index, (_, found))| Found { info: DeviceInfo { index, ..found.info }, ..found }).collect())
 }
 
-fn find(instance: &ash::Instance, raw: vk::PhysicalDevice, index: usize) -> Result<Found, Error> {
+/// A device's place among others, the first the least: its kind's, then by memory.
+type Rank = (u8, std::cmp::Reverse<u64>);
+
+fn find(instance: &ash::Instance, raw: vk::PhysicalDevice) -> (Rank, Found) {
     // SAFETY: plain queries of a live instance.
     let extensions = unsafe { instance.enumerate_device_extension_properties(raw) };
-    let extensions = extensions.named("listing device extensions")?;
-    let facts = Facts::ask(instance, raw, has(&extensions, ash::khr::push_descriptor::NAME));
-    Ok(Found {
-        raw,
-        info: facts.describe(index),
-        subgroups: facts.subgroups(),
-        identity: Identity {
-            vendor: facts.core.vendor_id,
-            device: facts.core.device_id,
-            uuid: facts.core.pipeline_cache_uuid,
-        },
-        extensions,
-    })
+    let pushes = extensions.as_ref().is_ok_and(|listed| has(listed, ash::khr::push_descriptor::NAME));
+    let facts = Facts::ask(instance, raw, pushes);
+    (facts.rank(), facts.found(raw, extensions))
 }
 
 /// The device that is meant, or the first that lacks nothing.
@@ -211,8 +206,6 @@ impl Facts {
             )
         };
         let core = properties.properties;
-        let heaps = &memory.memory_heaps[..memory.memory_heap_count as usize];
-        let local = heaps.iter().filter(|h| h.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL)).map(|h| h.size).max();
         let alone = std::ptr::null_mut(); // what the chains above pointed to goes out of scope
         Self {
             core,
@@ -222,9 +215,64 @@ impl Facts {
             f12: vk::PhysicalDeviceVulkan12Features { p_next: alone, ..f12 },
             f13: vk::PhysicalDeviceVulkan13Features { p_next: alone, ..f13 },
             pushed: push.max_push_descriptors,
-            compute: families.iter().any(|f| f.queue_flags.contains(vk::QueueFlags::COMPUTE)),
-            heap_bytes: local.unwrap_or(0),
+            families,
+            memory,
         }
+    }
+
+    fn found(
+        &self,
+        raw: vk::PhysicalDevice,
+        extensions: ash::prelude::VkResult<Vec<vk::ExtensionProperties>>,
+    ) -> Found {
+        let mut info = self.describe();
+        if let Err(result) = extensions {
+            info.lacks.insert(0, format!("a driver that answers (listing its extensions: {result})"));
+        }
+        Found {
+            raw,
+            info,
+            subgroups: self.subgroups(),
+            family: self.family(),
+            identity: Identity {
+                vendor: self.core.vendor_id,
+                device: self.core.device_id,
+                uuid: self.core.pipeline_cache_uuid,
+            },
+            extensions: extensions.unwrap_or_default(),
+        }
+    }
+
+    fn rank(&self) -> Rank {
+        let kind = match self.core.device_type {
+            vk::PhysicalDeviceType::DISCRETE_GPU => 0,
+            vk::PhysicalDeviceType::INTEGRATED_GPU => 1,
+            vk::PhysicalDeviceType::VIRTUAL_GPU => 2,
+            vk::PhysicalDeviceType::CPU => 4,
+            _ => 3,
+        };
+        (kind, std::cmp::Reverse(self.heap_bytes()))
+    }
+
+    /// The family whose queue takes the work: one that computes and does not draw, where there is one. Its work keeps no
+    /// desktop waiting, and a switch between passes and fills has no state of drawing to save.
+    fn family(&self) -> Option<u32> {
+        let first = |without: vk::QueueFlags| {
+            let fits = |f: &vk::QueueFamilyProperties| {
+                let flags = f.queue_flags;
+                f.queue_count > 0 && flags.contains(vk::QueueFlags::COMPUTE) && !flags.intersects(without)
+            };
+            self.families.iter().position(fits)
+        };
+        let found = first(vk::QueueFlags::GRAPHICS).or_else(|| first(vk::QueueFlags::empty()));
+        found.map(|at| at as u32)
+    }
+
+    /// Bytes of the largest heap of its own.
+    fn heap_bytes(&self) -> u64 {
+        let heaps = &self.memory.memory_heaps[..self.memory.memory_heap_count as usize];
+        let local = heaps.iter().filter(|h| h.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL)).map(|h| h.size);
+        local.max().unwrap_or(0)
     }
 
     fn subgroups(&self) -> Subgroups {
@@ -281,11 +329,12 @@ impl Facts {
         need(limits.max_push_constants_size >= MOST_PUSH_BYTES, &format!("{MOST_PUSH_BYTES} bytes of push constants"));
         let threads = limits.max_compute_work_group_invocations.min(limits.max_compute_work_group_size[0]);
         need(threads >= MOST_THREADS, &format!("workgroups of {MOST_THREADS} threads"));
-        need(self.compute, "a compute queue");
+        need(self.family().is_some(), "a compute queue");
         lacks
     }
 
-    fn describe(&self, index: usize) -> DeviceInfo {
+    /// At position 0.
+    fn describe(&self) -> DeviceInfo {
         let Self { core, v11, v12, v13, .. } = self;
         let kind = match core.device_type {
             vk::PhysicalDeviceType::DISCRETE_GPU => "discrete",
@@ -299,9 +348,9 @@ impl Facts {
         // at 0.
         let limits =
             [u64::from(core.limits.max_storage_buffer_range), v11.max_memory_allocation_size, v13.max_buffer_size];
-        let timestamps = core.limits.timestamp_compute_and_graphics != 0;
+        let timestamps = self.family().is_some_and(|at| self.families[at as usize].timestamp_valid_bits > 0);
         DeviceInfo {
-            index,
+            index: 0,
             name: text(core.device_name_as_c_str()),
             kind,
             driver: format!("{} {}", text(v12.driver_name_as_c_str()), text(v12.driver_info_as_c_str())),
@@ -314,7 +363,7 @@ impl Facts {
             subgroup_size: self.subgroups().usual().unwrap_or(v11.subgroup_size),
             push_descriptors: self.pushed >= MOST_BUFFERS,
             max_binding_bytes: limits.into_iter().filter(|&bytes| bytes > 0).min().unwrap_or(0),
-            heap_bytes: self.heap_bytes,
+            heap_bytes: self.heap_bytes(),
             shared_bytes: core.limits.max_compute_shared_memory_size,
             max_groups: core.limits.max_compute_work_group_count[0],
             timestamp_period: if timestamps { core.limits.timestamp_period } else { 0.0 },
@@ -328,11 +377,14 @@ fn text(chars: Result<&CStr, std::ffi::FromBytesUntilNulError>) -> String {
 }
 
 #[cfg(test)]
+mod known;
+
+#[cfg(test)]
 mod tests {
     use super::*;
 
     /// A device that has just what kernels need.
-    fn plain() -> Facts {
+    pub(super) fn plain() -> Facts {
         let mut core = vk::PhysicalDeviceProperties {
             api_version: vk::API_VERSION_1_3,
             ..vk::PhysicalDeviceProperties::default()
@@ -365,9 +417,20 @@ mod tests {
                 .subgroup_size_control(true)
                 .compute_full_subgroups(true),
             pushed: 0,
-            compute: true,
-            heap_bytes: 1 << 30,
+            families: vec![vk::QueueFamilyProperties::default().queue_flags(vk::QueueFlags::COMPUTE).queue_count(1)],
+            memory: heaps(&[(1 << 30, true)]),
         }
+    }
+
+    /// Heaps of so many bytes, the device's own or not.
+    pub(super) fn heaps(heaps: &[(u64, bool)]) -> vk::PhysicalDeviceMemoryProperties {
+        let mut memory = vk::PhysicalDeviceMemoryProperties::default();
+        memory.memory_heap_count = heaps.len() as u32;
+        for (heap, &(size, local)) in memory.memory_heaps.iter_mut().zip(heaps) {
+            let local = if local { vk::MemoryHeapFlags::DEVICE_LOCAL } else { vk::MemoryHeapFlags::empty() };
+            *heap = vk::MemoryHeap::default().size(size).flags(local);
+        }
+        memory
     }
 
     #[test]
@@ -386,8 +449,8 @@ mod tests {
         assert_eq!(lacks(&|f| f.core.limits.max_compute_work_group_size[0] -= 1), threads);
         let full = format!("workgroups of {} subgroups", MOST_FULL_THREADS.div_ceil(32));
         assert_eq!(lacks(&|f| f.v13.max_compute_workgroup_subgroups -= 1), full);
-        assert_eq!(lacks(&|f| f.compute = false), "a compute queue");
-        let pushes = |pushed| Facts { pushed, ..plain() }.describe(0).push_descriptors;
+        assert_eq!(lacks(&|f| f.families.clear()), "a compute queue");
+        let pushes = |pushed| Facts { pushed, ..plain() }.describe().push_descriptors;
         assert!(pushes(MOST_BUFFERS) && !pushes(MOST_BUFFERS - 1) && !pushes(0));
     }
 
@@ -401,13 +464,57 @@ mod tests {
         assert_eq!(sizes(1, 1, 8, true).usual(), Some(4));
         assert_eq!(sizes(2, 1, 2, true).usual(), None);
         assert_eq!(sizes(32, 32, 32, false).usual(), Some(32), "the only size needs no asking");
-        assert_eq!(sizes(16, 8, 32, false).usual(), None, "nobody knows which a kernel gets");
+        assert_eq!(sizes(32, 4, 32, false).usual(), Some(32), "the driver's own is what kernels get");
+        assert_eq!(sizes(128, 64, 128, false).usual(), None);
 
         assert_eq!(sizes(64, 32, 64, true).wanted(32), Ok(32));
         assert_eq!(sizes(64, 32, 64, true).wanted(16), Err("subgroups of 16 threads (it has 32 to 64)".into()));
         let wide = sizes(64, 64, 128, true).wanted(128);
         assert_eq!(wide, Err("subgroups of 128 threads that kernels can use (kernels have 4 to 64)".into()));
         assert_eq!(sizes(32, 32, 32, false).wanted(32), Ok(32));
-        assert!(sizes(16, 8, 32, false).wanted(16).is_err());
+        assert_eq!(sizes(16, 8, 32, false).wanted(16), Ok(16));
+        let other = sizes(32, 4, 32, false).wanted(16);
+        assert_eq!(other, Err("a choice of its subgroups' size (they have 32 threads)".into()));
+    }
+
+    #[test]
+    fn a_driver_that_does_not_answer_is_listed() {
+        let failing = plain().found(vk::PhysicalDevice::null(), Err(vk::Result::ERROR_OUT_OF_HOST_MEMORY));
+        let lacks = failing.info.lacks.join("; ");
+        assert!(lacks.starts_with("a driver that answers (listing its extensions: "), "{lacks}");
+        let whole = || plain().found(vk::PhysicalDevice::null(), Ok(vec![]));
+        let at = |index, found: Found| Found { info: DeviceInfo { index, ..found.info }, ..found };
+        let chosen = choose(vec![at(0, failing), at(1, whole())], None).expect("the other one");
+        assert_eq!(chosen.info.index, 1);
+    }
+
+    #[test]
+    fn discrete_gpus_with_the_most_memory_come_first() {
+        let of = |kind, gib: u64| {
+            let core = vk::PhysicalDeviceProperties { device_type: kind, ..plain().core };
+            Facts { core, memory: heaps(&[(64 << 30, false), (gib << 30, true)]), ..plain() }.rank()
+        };
+        use vk::PhysicalDeviceType as Kind;
+        let ordered = [
+            of(Kind::DISCRETE_GPU, 24),
+            of(Kind::DISCRETE_GPU, 8),
+            of(Kind::INTEGRATED_GPU, 32),
+            of(Kind::VIRTUAL_GPU, 8),
+            of(Kind::OTHER, 8),
+            of(Kind::CPU, 256),
+        ];
+        assert!(ordered.is_sorted_by(|a, b| a < b), "{ordered:?}");
+    }
+
+    #[test]
+    fn a_queue_that_only_computes_comes_first() {
+        let family = |flags: &[vk::QueueFlags]| {
+            let family = |&flags| vk::QueueFamilyProperties::default().queue_flags(flags).queue_count(1);
+            Facts { families: flags.iter().map(family).collect(), ..plain() }.family()
+        };
+        let [draws, computes] = [vk::QueueFlags::GRAPHICS, vk::QueueFlags::COMPUTE];
+        assert_eq!(family(&[draws | computes, vk::QueueFlags::TRANSFER, computes]), Some(2));
+        assert_eq!(family(&[vk::QueueFlags::TRANSFER, draws | computes]), Some(1));
+        assert_eq!(family(&[draws, vk::QueueFlags::TRANSFER]), None);
     }
 }
