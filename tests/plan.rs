@@ -145,10 +145,9 @@ fn every_combination_has_what_it_needs_and_nothing_else() {
     }
 }
 
-/// Name, number and bytes of what is alive; command buffers keep their crash markers beyond the run.
+/// Name, number and bytes of what is alive.
 fn alive(gpu: &Gpu) -> BTreeMap<&'static str, (usize, u64)> {
-    let all = gpu.buffers().into_iter().filter(|(name, ..)| *name != "markers");
-    all.map(|(name, number, bytes)| (name, (number, bytes))).collect()
+    gpu.buffers().into_iter().map(|(name, number, bytes)| (name, (number, bytes))).collect()
 }
 
 fn record(run: &mut Run<'_>, gpu: &Gpu, step: u32) -> Schedule {
@@ -366,7 +365,7 @@ fn memory_is_as_predicted() {
         let question = Question { anchors: Some(summary.anchors), ..Question::default() };
         let verdict = forecast::forecast(&gpu, &scene, &settings, question).expect("a forecast");
         let foretold = verdict.forecast.expect("it fits");
-        // Command buffers' markers of 4 KiB each and the host's mailboxes are not of a stage.
+        // The host's mailboxes are not of a stage.
         let apart = |a: u64, b: u64| a.abs_diff(b);
         assert!(apart(foretold.start, start) <= 16 << 10, "{wanted:?}: {} foretold, {start} used", foretold.start);
         let used = summary.peak_device_bytes;

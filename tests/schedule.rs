@@ -6,7 +6,7 @@
 #[allow(dead_code)]
 mod common;
 
-use gscream_vk::gpu::{Form, Gpu, testing};
+use gscream_vk::gpu::{Command, Entry, Form, Gpu, testing};
 use gscream_vk::render::bin::Tiling;
 use gscream_vk::scene::Scene;
 use gscream_vk::train::run::Run;
@@ -57,5 +57,31 @@ fn schedules(gpu: &Gpu, form: &str) {
         ("bare", &bare, 4),
     ] {
         insta::assert_snapshot!(format!("{name}_{form}"), schedule(gpu, scene, step));
+    }
+}
+
+/// Nothing that costs the device anything is in no schedule: no fill between passes, no barrier that no hazard demands.
+#[test]
+fn the_device_is_given_what_the_schedule_says() {
+    for gpu in testing::gpu_in_both_forms() {
+        let (scene, settings) = (common::tiny(), common::settings(20));
+        let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
+        for step in [1, 4, 5] {
+            let mut rec = gpu.recorder().expect("a recorder");
+            run.record(&mut rec, step).expect("the device has room");
+            let mut submission = rec.submit().expect("the device takes it");
+            let scheduled = std::mem::take(&mut submission.schedule).entries.into_iter().map(|entry| match entry {
+                Entry::Barrier { .. } => Command::Barrier,
+                Entry::Pass { name: "fill", .. } => Command::Fill,
+                Entry::Pass { name: "copy", .. } => Command::Copy,
+                Entry::Pass { .. } => Command::Dispatch,
+            });
+            // What came before is waited for, and the host waits for what is in here.
+            let around = || std::iter::once(Command::Barrier);
+            let wanted: Vec<Command> = around().chain(scheduled).chain(around()).collect();
+            assert!(wanted.len() > 80, "step {step}: {} commands", wanted.len());
+            assert_eq!(submission.commands, wanted, "step {step}");
+            submission.wait().expect("the device runs it");
+        }
     }
 }

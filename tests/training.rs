@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use common::Watch;
 use gscream_vk::config::Settings;
 use gscream_vk::gpu::form::without_form;
-use gscream_vk::gpu::{Descriptors, Gpu, Options, testing};
+use gscream_vk::gpu::{Descriptors, Form, Gpu, Options, testing};
 use gscream_vk::losses::config::Region;
 use gscream_vk::model::files;
 use gscream_vk::render::view::{Capacity, Renderer};
@@ -102,6 +102,22 @@ fn pushed_or_as_sets_the_buffers_are_the_same() {
         train(&gpu, &scene, &settings, None)
     };
     of(Descriptors::Sets).assert_same(&of(Descriptors::Push), "sets in the place of pushing");
+}
+
+/// GPUs hand out memory with what was in it; lavapipe's is zero.
+#[test]
+fn nothing_is_read_that_nobody_wrote() {
+    let (scene, settings) = (scene_without_tests(), common::settings(13));
+    for form in Form::ALL {
+        let of = |poison| {
+            let gpu = testing::gpu_with(Options { form: Some(form), poison, ..Options::default() });
+            let buffer = gpu.buffer::<u32>("probe", 5).expect("room");
+            let new = gpu.read(&buffer).expect("readable");
+            assert_eq!(new == [0x7fa5_a5a5; 5], poison, "{new:x?}");
+            train(&gpu, &scene, &settings, None)
+        };
+        of(true).assert_same(&of(false), "on poisoned memory");
+    }
 }
 
 #[test]

@@ -24,6 +24,9 @@ pub struct DeviceArgs {
     /// Put a barrier after every pass instead of only where a hazard demands one
     #[arg(long)]
     pub serialize: bool,
+    /// Find the pass in which a device is lost: as --serialize, and every pass notes that it ended
+    #[arg(long)]
+    pub trace_faults: bool,
     /// Kernels for a GPU or for a CPU driver, for comparisons [default: the device's own kind]
     #[arg(long, value_name = "FORM", hide_possible_values = true)]
     pub form: Option<Form>,
@@ -39,6 +42,7 @@ impl DeviceArgs {
             device: self.device.clone(),
             validate: self.validate,
             serialize: self.serialize,
+            trace_faults: self.trace_faults,
             descriptors: self.descriptors,
             cache: self.cache(),
             form: self.form,

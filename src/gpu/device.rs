@@ -2,12 +2,14 @@
 
 use std::collections::HashMap;
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 use ash::vk;
 use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, Allocator, AllocatorCreateDesc};
+use rayon::iter::{IntoParallelIterator as _, ParallelIterator as _};
 
 use super::cache;
+use super::context::Context;
 use super::descriptors::Descriptors;
 use super::error::{Error, Named};
 use super::form::Form;
@@ -15,8 +17,8 @@ use super::instance::{Instance, has};
 use super::kernel::Interface;
 use super::ledger::{Ledger, Rehearsal};
 use super::physical::{self, DeviceInfo, Found};
-use super::recorder::Context;
 use super::statistics::{self, Compiled, Statistic};
+use super::witness::Case;
 
 /// Bytes that are taken from the device at once for small buffers; larger buffers get memory of their own.
 const DEVICE_BLOCK: u64 = 32 << 20;
@@ -33,10 +35,20 @@ pub struct Options {
     pub validate: bool,
     /// A barrier after every pass.
     pub serialize: bool,
+    /// A barrier after every pass, and a marker that it ended: a lost device is said to be lost in a pass.
+    pub trace_faults: bool,
     /// Leave out every barrier between passes although the schedule still lists it. For tests alone: such a recording
     /// shows that synchronisation validation would notice a lost barrier, and must never be submitted.
     #[doc(hidden)]
     pub omit_barriers: bool,
+    /// Fill every new buffer with the words of a NaN that no arithmetic makes. For tests alone: a training that reads what
+    /// nobody wrote then comes to something else.
+    #[doc(hidden)]
+    pub poison: bool,
+    /// Keep so many dispatches of every kernel and set of constants, with all that they are given: [`Gpu::take_cases`].
+    /// Passes then run one at a time. For tests alone.
+    #[doc(hidden)]
+    pub witness: usize,
     /// Timestamp queries around every pass.
     pub timestamps: bool,
     /// File of the pipeline cache; none is kept without it.
@@ -51,6 +63,13 @@ pub struct Options {
     pub form: Option<Form>,
 }
 
+impl Options {
+    /// Whether no pass begins before the last has ended.
+    pub(super) fn one_by_one(&self) -> bool {
+        self.serialize || self.trace_faults || self.witness > 0
+    }
+}
+
 /// An open device, or a rehearsal of one. Cheap to clone.
 #[derive(Clone)]
 pub struct Gpu {
@@ -58,12 +77,27 @@ pub struct Gpu {
     rehearsal: Option<Arc<Rehearsal>>,
 }
 
+/// A kernel with its constants: layouts at once, the pipeline when it is compiled.
 pub(super) struct Pipeline {
-    name: &'static str,
-    pub raw: vk::Pipeline,
+    kernel: &'static Interface,
+    constants: Vec<u8>,
     pub layout: vk::PipelineLayout,
     pub set: vk::DescriptorSetLayout,
+    made: OnceLock<Made>,
+    /// Held while the driver compiles: another thread that wants the same kernel waits for it.
+    making: Mutex<()>,
+}
+
+struct Made {
+    raw: vk::Pipeline,
     compiled: Option<Compiled>,
+}
+
+impl Pipeline {
+    /// What was compiled.
+    pub fn raw(&self) -> vk::Pipeline {
+        self.made.get().expect("a pipeline is compiled before it is used").raw
+    }
 }
 
 type PipelineKey = (&'static str, Vec<u8>);
@@ -79,6 +113,8 @@ pub(super) struct Inner {
     pub contexts: Mutex<Vec<Context>>,
     pub debug: Option<ash::ext::debug_utils::Device>,
     pub ledger: Ledger,
+    /// Dispatches that were kept.
+    pub cases: Mutex<Vec<Case>>,
     in_flight: Mutex<u32>,
     trash: Mutex<Vec<(vk::Buffer, Allocation)>>,
     pipelines: Mutex<HashMap<PipelineKey, Arc<Pipeline>>>,
@@ -175,6 +211,7 @@ impl Gpu {
             options: options.clone(),
             contexts: Mutex::default(),
             ledger: Ledger::default(),
+            cases: Mutex::default(),
             in_flight: Mutex::new(0),
             trash: Mutex::default(),
             pipelines: Mutex::default(),
@@ -223,7 +260,7 @@ impl Gpu {
         if let Some(rehearsal) = &self.rehearsal {
             return rehearsal.pipelines();
         }
-        let mut names: Vec<_> = lock(&self.inner.pipelines).values().map(|p| p.name).collect();
+        let mut names: Vec<_> = lock(&self.inner.pipelines).values().map(|p| p.kernel.name).collect();
         names.sort_unstable();
         names.dedup();
         names
@@ -335,7 +372,7 @@ impl Drop for Device {
 impl Inner {
     /// What is known of the pipelines made with statistics, in no order.
     pub(super) fn compiled(&self) -> Vec<Compiled> {
-        lock(&self.pipelines).values().filter_map(|p| p.compiled.clone()).collect()
+        lock(&self.pipelines).values().filter_map(|p| p.made.get()?.compiled.clone()).collect()
     }
 
     pub(super) fn allocate(
@@ -395,32 +432,37 @@ impl Inner {
         }
     }
 
-    /// The pipeline of a kernel with these constants, made at first use.
+    /// The pipeline of a kernel with these constants, its layouts made at first use. It is compiled by
+    /// [`Inner::compile`].
     pub(super) fn pipeline(&self, kernel: &'static Interface, constants: &[u8]) -> Result<Arc<Pipeline>, Error> {
         let key = (kernel.name, constants.to_vec());
-        // Held while the driver compiles: another thread that wants the same kernel waits for it.
         let mut pipelines = lock(&self.pipelines);
         if let Some(found) = pipelines.get(&key) {
             return Ok(found.clone());
         }
         let mut pipeline = Pipeline {
-            name: kernel.name,
-            raw: vk::Pipeline::null(),
+            kernel,
+            constants: constants.to_vec(),
             layout: vk::PipelineLayout::null(),
             set: vk::DescriptorSetLayout::null(),
-            compiled: None,
+            made: OnceLock::new(),
+            making: Mutex::new(()),
         };
-        if let Err(result) = self.compile(kernel, &mut pipeline, constants) {
+        if let Err(result) = self.lay_out(&mut pipeline) {
             self.destroy(&pipeline);
-            return Err(Error::Pipeline { kernel: kernel.name, device: self.info.name.clone(), result });
+            return Err(self.refused(kernel, result));
         }
-        self.name_object(pipeline.raw, kernel.name);
         let pipeline = Arc::new(pipeline);
         pipelines.insert(key, pipeline.clone());
         Ok(pipeline)
     }
 
-    fn compile(&self, kernel: &Interface, pipeline: &mut Pipeline, constants: &[u8]) -> Result<(), vk::Result> {
+    fn refused(&self, kernel: &Interface, result: vk::Result) -> Error {
+        Error::Pipeline { kernel: kernel.name, device: self.info.name.clone(), result }
+    }
+
+    fn lay_out(&self, pipeline: &mut Pipeline) -> Result<(), vk::Result> {
+        let kernel = pipeline.kernel;
         let bindings: Vec<_> = kernel
             .bindings
             .iter()
@@ -436,8 +478,48 @@ impl Inner {
             Some(_) => vk::DescriptorSetLayoutCreateFlags::PUSH_DESCRIPTOR_KHR,
             None => vk::DescriptorSetLayoutCreateFlags::empty(),
         };
-        let push_size = kernel.push_bytes;
-        let ranges = [vk::PushConstantRange::default().stage_flags(vk::ShaderStageFlags::COMPUTE).size(push_size)];
+        let size = kernel.push_bytes;
+        let ranges = [vk::PushConstantRange::default().stage_flags(vk::ShaderStageFlags::COMPUTE).size(size)];
+        // SAFETY: the bindings are those of the kernel's reflection; the device is live.
+        unsafe {
+            let set_info = vk::DescriptorSetLayoutCreateInfo::default().flags(set_flags).bindings(&bindings);
+            pipeline.set = self.device.create_descriptor_set_layout(&set_info, None)?;
+            let sets = [pipeline.set];
+            let mut layout_info = vk::PipelineLayoutCreateInfo::default().set_layouts(&sets);
+            if size > 0 {
+                layout_info = layout_info.push_constant_ranges(&ranges);
+            }
+            pipeline.layout = self.device.create_pipeline_layout(&layout_info, None)?;
+        }
+        Ok(())
+    }
+
+    /// Compiles these pipelines as far as they are not, on several threads.
+    pub(super) fn compile_all<'p>(&self, pipelines: impl Iterator<Item = &'p Arc<Pipeline>>) -> Result<(), Error> {
+        let mut missing: Vec<&Arc<Pipeline>> = pipelines.filter(|p| p.made.get().is_none()).collect();
+        missing.sort_by_key(|p| Arc::as_ptr(p));
+        missing.dedup_by_key(|p| Arc::as_ptr(p));
+        missing.into_par_iter().try_for_each(|pipeline| self.compile(pipeline))
+    }
+
+    /// Compiles a pipeline, once.
+    pub(super) fn compile(&self, pipeline: &Pipeline) -> Result<(), Error> {
+        if pipeline.made.get().is_some() {
+            return Ok(());
+        }
+        let _making = lock(&pipeline.making);
+        if pipeline.made.get().is_some() {
+            return Ok(());
+        }
+        let made = self.make(pipeline).map_err(|result| self.refused(pipeline.kernel, result))?;
+        self.name_object(made.raw, pipeline.kernel.name);
+        let first = pipeline.made.set(made).is_ok();
+        assert!(first, "one thread at a time makes a pipeline");
+        Ok(())
+    }
+
+    fn make(&self, pipeline: &Pipeline) -> Result<Made, vk::Result> {
+        let Pipeline { kernel, constants, layout, .. } = pipeline;
         let entries: Vec<_> = kernel
             .constants
             .iter()
@@ -446,16 +528,10 @@ impl Inner {
             .collect();
         let specialization = vk::SpecializationInfo::default().map_entries(&entries).data(constants);
         let words = ash::util::read_spv(&mut std::io::Cursor::new(kernel.spirv)).expect("build.rs wrote whole words");
+        // From SPIR-V 1.6 on a subgroup's size may vary from the driver's own without being allowed to.
+        assert!(words[1] < 0x1_0600, "{}: a kernel knows its subgroups' size", kernel.name);
         // SAFETY: the SPIR-V comes from shaderc, the layout from its reflection; all handles are live.
         unsafe {
-            let set_info = vk::DescriptorSetLayoutCreateInfo::default().flags(set_flags).bindings(&bindings);
-            pipeline.set = self.device.create_descriptor_set_layout(&set_info, None)?;
-            let sets = [pipeline.set];
-            let mut layout_info = vk::PipelineLayoutCreateInfo::default().set_layouts(&sets);
-            if push_size > 0 {
-                layout_info = layout_info.push_constant_ranges(&ranges);
-            }
-            pipeline.layout = self.device.create_pipeline_layout(&layout_info, None)?;
             let module_info = vk::ShaderModuleCreateInfo::default().code(&words);
             let module = self.device.create_shader_module(&module_info, None)?;
             let mut size = vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default()
@@ -471,7 +547,7 @@ impl Inner {
                     stage = stage.push_next(&mut size);
                 }
             }
-            let mut create = vk::ComputePipelineCreateInfo::default().layout(pipeline.layout).stage(stage);
+            let mut create = vk::ComputePipelineCreateInfo::default().layout(*layout).stage(stage);
             if self.executables.is_some() {
                 create = create.flags(vk::PipelineCreateFlags::CAPTURE_STATISTICS_KHR);
             }
@@ -479,24 +555,22 @@ impl Inner {
             let made = self.device.create_compute_pipelines(self.device.cache, &[create], None);
             let milliseconds = 1e3 * began.elapsed().as_secs_f64();
             self.device.destroy_shader_module(module, None);
-            pipeline.raw = made.map_err(|(_, result)| result)?[0];
-            if pipeline.raw == vk::Pipeline::null() {
+            let raw = made.map_err(|(_, result)| result)?[0];
+            if raw == vk::Pipeline::null() {
                 return Err(vk::Result::ERROR_UNKNOWN);
             }
-            if self.options.statistics {
-                let said: Vec<Statistic> =
-                    self.executables.as_ref().map_or_else(Vec::new, |e| statistics::of(e, pipeline));
-                let words = bytemuck::pod_collect_to_vec(constants);
-                pipeline.compiled = Some(Compiled::new(kernel.name, words, milliseconds, said));
-            }
+            let compiled = self.options.statistics.then(|| {
+                let said: Vec<Statistic> = self.executables.as_ref().map_or_else(Vec::new, |e| statistics::of(e, raw));
+                Compiled::new(kernel.name, bytemuck::pod_collect_to_vec(constants), milliseconds, said)
+            });
+            Ok(Made { raw, compiled })
         }
-        Ok(())
     }
 
     fn destroy(&self, pipeline: &Pipeline) {
         // SAFETY: nothing in flight uses it. What was never made is null, which is nothing to destroy.
         unsafe {
-            self.device.destroy_pipeline(pipeline.raw, None);
+            self.device.destroy_pipeline(pipeline.made.get().map_or(vk::Pipeline::null(), |made| made.raw), None);
             self.device.destroy_pipeline_layout(pipeline.layout, None);
             self.device.destroy_descriptor_set_layout(pipeline.set, None);
         }
@@ -531,5 +605,39 @@ impl Drop for Inner {
             self.destroy(pipeline);
         }
         drop(lock(&self.allocator).take());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc;
+    use std::time::Duration;
+
+    use super::*;
+    use crate::gpu::kernels::primitives::{dispatch, limit};
+    use crate::gpu::{Kernel as _, testing};
+
+    /// While the driver compiles one kernel, another can be compiled, and whatever is compiled can be had.
+    #[test]
+    fn compiling_keeps_nobody_waiting_who_wants_another_kernel() {
+        let gpu = testing::fresh_gpu(Options::default());
+        let slow = gpu.inner().pipeline(limit::Kernel::INTERFACE, &[]).expect("layouts");
+        let making = lock(&slow.making);
+        let (done, is_done) = mpsc::channel();
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                let inner = gpu.inner();
+                let other = inner.pipeline(dispatch::Kernel::INTERFACE, &[]).expect("layouts");
+                let again = inner.pipeline(limit::Kernel::INTERFACE, &[]).expect("layouts");
+                inner.compile_all([&other, &other].into_iter()).expect("it compiles");
+                done.send((other.made.get().is_some(), Arc::ptr_eq(&again, &slow))).expect("somebody waits");
+            });
+            let others = is_done.recv_timeout(Duration::from_secs(60));
+            drop(making);
+            assert_eq!(others, Ok((true, true)));
+        });
+        assert!(slow.made.get().is_none());
+        gpu.inner().compile(&slow).expect("it compiles");
+        assert_eq!(gpu.pipelines(), [dispatch::Kernel::NAME, limit::Kernel::NAME]);
     }
 }

@@ -75,10 +75,10 @@ pub enum Error {
         result: vk::Result,
     },
     /// The device stopped answering.
-    #[error("the device was lost; the last pass reached was {pass}")]
+    #[error("the device was lost {place}")]
     DeviceLost {
-        /// The last pass whose marker was written.
-        pass: String,
+        /// The pass, or what would tell it.
+        place: String,
     },
     /// A message of the validation layer.
     #[error("validation: {0}")]

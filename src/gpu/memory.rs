@@ -12,6 +12,9 @@ use super::error::{Error, Named};
 use super::hazards::Id;
 use super::ledger::Rehearsal;
 
+/// What new buffers hold where memory is poisoned: a NaN that no arithmetic makes, and as an integer a large one.
+const POISON: u32 = 0x7fa5_a5a5;
+
 /// A typed array on the device. Freed when it and its views are dropped, after the work in flight has ended.
 pub struct Buffer<T> {
     memory: Arc<Memory>,
@@ -292,7 +295,22 @@ impl Gpu {
         inner.ledger.open(raw.as_raw(), name, padded);
         let backing = Backing::Real { allocation: Some(allocation), gpu: inner.clone() };
         let memory = Memory { raw, bytes: padded, name, stage: self.ledger().stage(), backing };
-        Ok(Buffer { memory: Arc::new(memory), bytes, len, element: PhantomData })
+        let mut buffer = Buffer { memory: Arc::new(memory), bytes, len, element: PhantomData };
+        if inner.options.poison {
+            self.poison(&mut buffer)?;
+        }
+        Ok(buffer)
+    }
+
+    fn poison<T: bytemuck::Pod>(&self, buffer: &mut Buffer<T>) -> Result<(), Error> {
+        if let Some(bytes) = buffer.mapped_mut() {
+            bytes.chunks_exact_mut(4).for_each(|word| word.copy_from_slice(&POISON.to_ne_bytes()));
+            return Ok(());
+        }
+        let mut recorder = self.recorder()?;
+        recorder.fill_slot(buffer.slot(), POISON);
+        recorder.submit()?.wait()?;
+        Ok(())
     }
 }
 

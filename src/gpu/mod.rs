@@ -6,6 +6,8 @@
 
 mod cache;
 pub mod check;
+pub mod commands;
+mod context;
 pub mod descriptors;
 pub mod device;
 pub mod error;
@@ -20,8 +22,10 @@ pub mod recorder;
 pub mod statistics;
 pub mod testing;
 pub mod timings;
+pub mod witness;
 
 pub use check::{Check, Difference};
+pub use commands::Command;
 pub use descriptors::Descriptors;
 pub use device::{Gpu, Options};
 pub use error::Error;
@@ -34,6 +38,7 @@ pub use physical::DeviceInfo;
 pub use recorder::{Groups, NotFinite, Recorder, Submission, Threads};
 pub use statistics::{Compiled, Statistic};
 pub use timings::{Timing, Timings};
+pub use witness::Case;
 
 /// The typed interfaces of all kernels, generated from `glsl/` by `build.rs`.
 #[allow(missing_docs, clippy::all, clippy::pedantic)]

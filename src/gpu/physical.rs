@@ -424,8 +424,8 @@ mod tests {
 
     /// Heaps of so many bytes, the device's own or not.
     pub(super) fn heaps(heaps: &[(u64, bool)]) -> vk::PhysicalDeviceMemoryProperties {
-        let mut memory = vk::PhysicalDeviceMemoryProperties::default();
-        memory.memory_heap_count = heaps.len() as u32;
+        let memory_heap_count = heaps.len() as u32;
+        let mut memory = vk::PhysicalDeviceMemoryProperties { memory_heap_count, ..Default::default() };
         for (heap, &(size, local)) in memory.memory_heaps.iter_mut().zip(heaps) {
             let local = if local { vk::MemoryHeapFlags::DEVICE_LOCAL } else { vk::MemoryHeapFlags::empty() };
             *heap = vk::MemoryHeap::default().size(size).flags(local);

@@ -1,23 +1,21 @@
-//! Recording passes: barriers, labels, timestamps and crash markers come from one function.
+//! Recording passes: barriers, labels, timestamps and markers come from one function.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use ash::vk;
-use gpu_allocator::vulkan::Allocation;
 
 use super::check::Difference;
-use super::descriptors::{Sets, with_writes};
-use super::device::{Device, Gpu, Inner, lock};
+use super::commands::{Command, Commands, Dispatch, Work, Workgroups};
+use super::context::{Context, MAX_PASSES};
+use super::device::{Gpu, lock};
 use super::error::{Error, Named};
 use super::hazards::{self, Entry, Hazards, Id, Schedule};
 use super::kernel::{Access, Interface, Reference, Scalar, Twin, with_twin};
-use super::ledger::{NO_STAGE, Rehearsal};
+use super::ledger::Rehearsal;
 use super::memory::{Buffer, Slot};
 use super::timings::Timing;
-
-/// Passes of one recording that can carry a timestamp and a crash marker; later ones run without.
-const MAX_PASSES: u32 = 1024;
+use super::witness::Case;
 
 /// A kernel with what one dispatch gives it, without its types.
 #[derive(Clone, Copy)]
@@ -79,76 +77,13 @@ pub struct Groups {
     pub group: u32,
 }
 
-/// A command buffer with its pool, descriptor sets, queries and markers, used again and again. Each has a pool of its own,
-/// so that threads may record at the same time.
-pub(super) struct Context {
-    pool: vk::CommandPool,
-    commands: vk::CommandBuffer,
-    sets: Sets,
-    queries: vk::QueryPool,
-    fence: vk::Fence,
-    markers: (vk::Buffer, Allocation),
-}
-
-impl Context {
-    fn new(gpu: &Gpu) -> Result<Self, Error> {
-        // Without its Arc of the device: the device owns its contexts.
-        let markers = gpu.stage(NO_STAGE, || gpu.readback::<u32>("markers", MAX_PASSES as usize))?.into_parts();
-        let mut context = Self {
-            pool: vk::CommandPool::null(),
-            commands: vk::CommandBuffer::null(),
-            sets: Sets::default(),
-            queries: vk::QueryPool::null(),
-            fence: vk::Fence::null(),
-            markers,
-        };
-        match context.fill(&gpu.inner().device) {
-            Ok(()) => Ok(context),
-            Err(error) => {
-                // SAFETY: nothing has used it.
-                unsafe { context.destroy(gpu.inner()) };
-                Err(error)
-            }
-        }
-    }
-
-    fn fill(&mut self, device: &Device) -> Result<(), Error> {
-        let pool = vk::CommandPoolCreateInfo::default()
-            .queue_family_index(device.family)
-            .flags(vk::CommandPoolCreateFlags::RESET_COMMAND_BUFFER);
-        let queries =
-            vk::QueryPoolCreateInfo::default().query_type(vk::QueryType::TIMESTAMP).query_count(2 * MAX_PASSES);
-        // SAFETY: live device; destroyed in `destroy`.
-        unsafe {
-            self.pool = device.create_command_pool(&pool, None).named("creating a command pool")?;
-            let allocate = vk::CommandBufferAllocateInfo::default().command_pool(self.pool).command_buffer_count(1);
-            self.commands = device.allocate_command_buffers(&allocate).named("allocating a command buffer")?[0];
-            self.queries = device.create_query_pool(&queries, None).named("creating a query pool")?;
-            self.fence = device.create_fence(&vk::FenceCreateInfo::default(), None).named("creating a fence")?;
-        }
-        Ok(())
-    }
-
-    /// # Safety
-    /// Nothing in flight uses it.
-    pub(super) unsafe fn destroy(self, inner: &Inner) {
-        // SAFETY: by the caller's promise. The command buffer goes with its pool; what was never made is null.
-        unsafe {
-            inner.device.destroy_command_pool(self.pool, None);
-            self.sets.destroy(&inner.device);
-            inner.device.destroy_query_pool(self.queries, None);
-            inner.device.destroy_fence(self.fence, None);
-            inner.discard(self.markers.0, self.markers.1);
-        }
-    }
-}
-
 /// Records passes. The first error is kept and returned by [`Recorder::submit`], so that a step reads as plain lines.
 pub struct Recorder<'g> {
     gpu: &'g Gpu,
     context: Option<Context>,
     hazards: Hazards,
     schedule: Schedule,
+    noted: Vec<Command>,
     passes: Vec<&'static str>,
     stage: &'static str,
     /// In a rehearsal, in place of a context.
@@ -166,7 +101,7 @@ struct Held {
     name: &'static str,
     stage: &'static str,
     accesses: Vec<(Id, &'static str, Access)>,
-    record: Box<dyn FnOnce(vk::CommandBuffer)>,
+    work: Option<Work>,
 }
 
 /// The first value that is not finite, of an inspected recording.
@@ -200,6 +135,8 @@ pub struct Submission<'g> {
     passes: Vec<&'static str>,
     /// What was recorded.
     pub schedule: Schedule,
+    /// What the device was given for it, in this order. A submission begins with a barrier and ends with one to the host.
+    pub commands: Vec<Command>,
     /// GPU against twin, of a checked recording.
     pub differences: Vec<Difference>,
     /// The wanted buffers of a traced recording by name, as the last pass that wrote them left them.
@@ -233,6 +170,7 @@ impl Gpu {
             rehearsal,
             hazards: Hazards::default(),
             schedule: Schedule::default(),
+            noted: vec![],
             passes: vec![],
             error: None,
             differences: None,
@@ -292,10 +230,6 @@ impl Gpu {
     }
 }
 
-const SHADER: vk::PipelineStageFlags2 = vk::PipelineStageFlags2::COMPUTE_SHADER;
-const COPY: vk::PipelineStageFlags2 = vk::PipelineStageFlags2::ALL_TRANSFER;
-const INDIRECT: vk::PipelineStageFlags2 = vk::PipelineStageFlags2::DRAW_INDIRECT;
-
 impl<'g> Recorder<'g> {
     /// The device it records for.
     pub fn gpu(&self) -> &'g Gpu {
@@ -315,18 +249,26 @@ impl<'g> Recorder<'g> {
         let pass_by_pass = self.differences.is_some()
             || self.trace.is_some()
             || self.inspection.is_some()
-            || self.gpu.options().serialize;
+            || self.gpu.options().one_by_one();
         if pass_by_pass || self.held.is_some() {
             return record(self);
         }
         self.held = Some(vec![]);
         let result = record(self);
         let held = self.held.take().unwrap_or_default();
+        let made = self.gpu.inner().compile_all(held.iter().filter_map(|pass| match &pass.work {
+            Some(Work::Dispatch(dispatch)) => Some(&dispatch.pipeline),
+            _ => None,
+        }));
+        if made.is_err() {
+            self.keep(made);
+            return result;
+        }
         let waves = hazards::waves(held.iter().map(|pass| pass.accesses.as_slice()));
         let mut ordered: Vec<(u32, Held)> = waves.into_iter().zip(held).collect();
         ordered.sort_by_key(|(wave, _)| *wave);
-        for (_, Held { name, stage, accesses, record }) in ordered {
-            self.place(name, stage, &accesses, record);
+        for (_, Held { name, stage, accesses, work }) in ordered {
+            self.place(name, stage, &accesses, work.as_ref());
         }
         result
     }
@@ -386,6 +328,7 @@ impl<'g> Recorder<'g> {
             Some(Some(_)) => return Ok(()),
         }
         if self.differences.is_none() && self.trace.is_none() {
+            self.witness(call, twin, threads)?;
             return self.dispatch(call, threads);
         }
         self.flush()?;
@@ -477,10 +420,31 @@ impl<'g> Recorder<'g> {
         slots.iter().map(|slot| self.words(*slot)).collect()
     }
 
-    pub(super) fn dispatch(&mut self, call: Call<'_>, threads: Threads<'_>) -> Result<(), Error> {
+    /// Keeps a dispatch where the device was opened for it.
+    fn witness(&mut self, call: Call<'_>, twin: Twin<'_>, threads: Threads<'_>) -> Result<(), Error> {
         let Call { kernel, constants, push, slots } = call;
-        let Interface { name, group, bindings, .. } = *kernel;
-        let groups = match threads {
+        if self.rehearsal.is_some() || !self.gpu.wants_case(kernel, constants) {
+            return Ok(());
+        }
+        self.flush()?;
+        let workgroups = match threads {
+            Threads::Counted(counted) => {
+                let (all, at) = (self.gpu.read(&counted.buffer)?, 4 * counted.at as usize);
+                [all[at], all[at + 1], all[at + 2]]
+            }
+            _ => self.workgroups(kernel, threads),
+        };
+        if !workgroups.contains(&0) {
+            let case = Case::new(kernel, (constants, push), workgroups, self.download(slots)?, twin);
+            lock(&self.gpu.inner().cases).push(case);
+        }
+        Ok(())
+    }
+
+    /// Workgroups of a dispatch; one where a count on the device says how many.
+    fn workgroups(&self, kernel: &Interface, threads: Threads<'_>) -> [u32; 3] {
+        let group = kernel.group;
+        match threads {
             Threads::Line(n) => {
                 let groups = n.div_ceil(group[0].into());
                 let limit = u64::from(self.gpu.info().max_groups.min(65535));
@@ -488,10 +452,16 @@ impl<'g> Recorder<'g> {
             }
             Threads::Grid(grid) => std::array::from_fn(|i| grid[i].div_ceil(group[i])),
             Threads::Counted(counted) => {
-                assert_eq!(group, [counted.group, 1, 1], "{}: counted for groups of {}", name, counted.group);
+                assert_eq!(group, [counted.group, 1, 1], "{}: counted for groups of {}", kernel.name, counted.group);
                 [1, 1, 1]
             }
-        };
+        }
+    }
+
+    pub(super) fn dispatch(&mut self, call: Call<'_>, threads: Threads<'_>) -> Result<(), Error> {
+        let Call { kernel, constants, push, slots } = call;
+        let Interface { name, bindings, .. } = *kernel;
+        let groups = self.workgroups(kernel, threads);
         if groups.contains(&0) {
             return Ok(());
         }
@@ -500,16 +470,21 @@ impl<'g> Recorder<'g> {
         if let Threads::Counted(counted) = threads {
             accesses.push((counted.buffer.slot().id(), counted.buffer.name(), Access::Read));
         }
+        let inner = self.gpu.inner();
         if let Some(rehearsal) = &self.rehearsal {
             rehearsal.pipeline(name);
             if self.gpu.options().statistics {
-                self.gpu.inner().pipeline(kernel, constants)?;
+                let pipeline = inner.pipeline(kernel, constants)?;
+                inner.compile(&pipeline)?;
             }
-            self.pass(name, &accesses, |_| {});
+            self.pass(name, &accesses, None);
             return Ok(());
         }
-        let pipeline = self.gpu.inner().pipeline(kernel, constants)?;
-        let inner = self.gpu.inner().clone();
+        let pipeline = inner.pipeline(kernel, constants)?;
+        // Passes that are held are compiled together, on several threads.
+        if self.held.is_none() {
+            inner.compile(&pipeline)?;
+        }
         let set = match (&inner.push_descriptor, &mut self.context) {
             (None, Some(context)) => {
                 let set = context.sets.get(&inner.device, pipeline.set, bindings, slots);
@@ -517,32 +492,13 @@ impl<'g> Recorder<'g> {
             }
             _ => vk::DescriptorSet::null(),
         };
-        let counted = match threads {
-            Threads::Counted(counted) => Some((counted.buffer.slot().raw, 16 * u64::from(counted.at))),
-            _ => None,
+        let workgroups = match threads {
+            Threads::Counted(counted) => Workgroups::At(counted.buffer.slot().raw, 16 * u64::from(counted.at)),
+            _ => Workgroups::Known(groups),
         };
         let (slots, push) = (slots.to_vec(), push.to_vec());
-        self.pass(name, &accesses, move |commands| {
-            let device = &inner.device;
-            // SAFETY: live handles; the layout comes from the kernel's own reflection.
-            unsafe {
-                device.cmd_bind_pipeline(commands, vk::PipelineBindPoint::COMPUTE, pipeline.raw);
-                let bind_point = vk::PipelineBindPoint::COMPUTE;
-                match &inner.push_descriptor {
-                    Some(extension) => with_writes(bindings, &slots, set, |writes| {
-                        extension.cmd_push_descriptor_set(commands, bind_point, pipeline.layout, 0, writes);
-                    }),
-                    None => device.cmd_bind_descriptor_sets(commands, bind_point, pipeline.layout, 0, &[set], &[]),
-                }
-                if !push.is_empty() {
-                    device.cmd_push_constants(commands, pipeline.layout, vk::ShaderStageFlags::COMPUTE, 0, &push);
-                }
-                match counted {
-                    Some((counts, at)) => device.cmd_dispatch_indirect(commands, counts, at),
-                    None => device.cmd_dispatch(commands, groups[0], groups[1], groups[2]),
-                }
-            }
-        });
+        let dispatch = Dispatch { pipeline, bindings, slots, set, push, workgroups };
+        self.pass(name, &accesses, Some(Work::Dispatch(dispatch)));
         Ok(())
     }
 
@@ -551,12 +507,9 @@ impl<'g> Recorder<'g> {
         self.fill_slot(buffer.slot(), word);
     }
 
-    fn fill_slot(&mut self, slot: Slot, word: u32) {
-        let inner = self.gpu.inner().clone();
-        self.pass("fill", &[(slot.id(), slot.name, Access::Write)], move |commands| {
-            // SAFETY: a live buffer with transfer usage.
-            unsafe { inner.device.cmd_fill_buffer(commands, slot.raw, 0, vk::WHOLE_SIZE, word) }
-        });
+    pub(super) fn fill_slot(&mut self, slot: Slot, word: u32) {
+        let work = Work::Fill { to: slot.raw, at: 0, bytes: vk::WHOLE_SIZE, word };
+        self.pass("fill", &[(slot.id(), slot.name, Access::Write)], Some(work));
     }
 
     /// Sets a buffer to zero.
@@ -571,12 +524,9 @@ impl<'g> Recorder<'g> {
             return;
         }
         let slot = buffer.slot();
-        let inner = self.gpu.inner().clone();
         let [at, bytes] = [at, len].map(|n| (n * size_of::<T>()) as u64);
-        self.pass("fill", &[(slot.id(), slot.name, Access::Write)], move |commands| {
-            // SAFETY: a live buffer with transfer usage, the range within it.
-            unsafe { inner.device.cmd_fill_buffer(commands, slot.raw, at, bytes, 0) }
-        });
+        let work = Work::Fill { to: slot.raw, at, bytes, word: 0 };
+        self.pass("fill", &[(slot.id(), slot.name, Access::Write)], Some(work));
     }
 
     /// Copies the first `len` elements.
@@ -607,39 +557,30 @@ impl<'g> Recorder<'g> {
         if bytes == 0 {
             return;
         }
-        let inner = self.gpu.inner().clone();
         let accesses = [(from.id(), from.name, Access::Read), (to.id(), to.name, Access::Write)];
-        self.pass("copy", &accesses, move |commands| {
-            let region = [vk::BufferCopy { src_offset: from_at, dst_offset: to_at, size: bytes }];
-            // SAFETY: live buffers with transfer usage, regions within both.
-            unsafe { inner.device.cmd_copy_buffer(commands, from.raw, to.raw, &region) }
-        });
+        let region = vk::BufferCopy { src_offset: from_at, dst_offset: to_at, size: bytes };
+        self.pass("copy", &accesses, Some(Work::Copy { from: from.raw, to: to.raw, region }));
     }
 
-    /// Gives a pass its place: the next one, or one that is found later.
-    fn pass(
-        &mut self,
-        name: &'static str,
-        accesses: &[(Id, &'static str, Access)],
-        record: impl FnOnce(vk::CommandBuffer) + 'static,
-    ) {
+    /// Gives a pass its place: the next one, or one that is found later. A pass of a rehearsal has no work.
+    fn pass(&mut self, name: &'static str, accesses: &[(Id, &'static str, Access)], work: Option<Work>) {
         let stage = self.stage;
         match &mut self.held {
-            Some(held) => held.push(Held { name, stage, accesses: accesses.to_vec(), record: Box::new(record) }),
-            None => self.place(name, stage, accesses, record),
+            Some(held) => held.push(Held { name, stage, accesses: accesses.to_vec(), work }),
+            None => self.place(name, stage, accesses, work.as_ref()),
         }
     }
 
-    /// Everything around a pass: the barrier it needs, its label, crash marker and timestamps.
+    /// Everything around a pass: the barrier it needs, its label, marker and timestamps.
     fn place(
         &mut self,
         name: &'static str,
         stage: &'static str,
         accesses: &[(Id, &'static str, Access)],
-        record: impl FnOnce(vk::CommandBuffer),
+        work: Option<&Work>,
     ) {
         let inner = self.gpu.inner();
-        let reasons = self.hazards.enter(name, accesses, inner.options.serialize);
+        let reasons = self.hazards.enter(name, accesses, inner.options.one_by_one());
         let waits = !reasons.is_empty();
         if waits {
             self.schedule.entries.push(Entry::Barrier { reasons });
@@ -651,37 +592,25 @@ impl<'g> Recorder<'g> {
             return;
         }
         let context = self.context.as_ref().expect("a recorder has its context until it is submitted");
-        let commands = context.commands;
+        let mut commands = Commands { inner, raw: context.commands, noted: &mut self.noted };
         if waits && !inner.options.omit_barriers {
-            barrier(inner, commands);
+            commands.barrier();
         }
         let index = self.passes.len() as u32;
         let tracked = index < MAX_PASSES;
         let timed = tracked && inner.options.timestamps && inner.info.timestamp_period > 0.0;
-        let label = |text: &'static str| std::ffi::CString::new(text).unwrap_or_default();
-        // SAFETY: a command buffer in recording; markers are written each at an offset of its own.
-        unsafe {
-            if let Some(debug) = &inner.debug {
-                let label = label(name);
-                let info = vk::DebugUtilsLabelEXT::default().label_name(&label);
-                debug.cmd_begin_debug_utils_label(commands, &info);
-            }
-            if tracked {
-                let at = 4 * u64::from(index);
-                inner.device.cmd_fill_buffer(commands, context.markers.0, at, 4, 1);
-            }
-            let all = vk::PipelineStageFlags2::ALL_COMMANDS;
-            if timed {
-                inner.device.cmd_write_timestamp2(commands, all, context.queries, 2 * index);
-            }
-            record(commands);
-            if timed {
-                inner.device.cmd_write_timestamp2(commands, all, context.queries, 2 * index + 1);
-            }
-            if let Some(debug) = &inner.debug {
-                debug.cmd_end_debug_utils_label(commands);
-            }
+        commands.begin_label(name);
+        if timed {
+            commands.timestamp(context.queries, 2 * index);
         }
+        commands.work(work.expect("a pass of a rehearsal ended above"));
+        if timed {
+            commands.timestamp(context.queries, 2 * index + 1);
+        }
+        if let Some((markers, _)) = context.markers.as_ref().filter(|_| tracked) {
+            commands.marker(*markers, index);
+        }
+        commands.end_label();
         self.passes.push(name);
     }
 
@@ -696,13 +625,17 @@ impl<'g> Recorder<'g> {
         unsafe {
             context.sets.recycle(&inner.device).named("recycling descriptor sets")?;
             inner.device.begin_command_buffer(context.commands, &info).named("beginning a command buffer")?;
-            if inner.options.timestamps {
-                inner.device.cmd_reset_query_pool(context.commands, context.queries, 0, 2 * MAX_PASSES);
-            }
-            inner.device.cmd_fill_buffer(context.commands, context.markers.0, 0, vk::WHOLE_SIZE, 0);
+        }
+        self.noted.clear();
+        let mut commands = Commands { inner, raw: context.commands, noted: &mut self.noted };
+        if inner.options.timestamps {
+            commands.reset(context.queries, 2 * MAX_PASSES);
+        }
+        if let Some((markers, _)) = &context.markers {
+            commands.clear_markers(*markers);
         }
         // What earlier submissions wrote, and the markers' reset, come before everything here.
-        barrier(inner, context.commands);
+        commands.barrier();
         self.hazards = Hazards::default();
         self.passes.clear();
         Ok(())
@@ -723,6 +656,7 @@ impl<'g> Recorder<'g> {
             rehearsal: self.rehearsal.take(),
             passes: std::mem::take(&mut self.passes),
             schedule: std::mem::take(&mut self.schedule),
+            commands: std::mem::take(&mut self.noted),
             differences: self.differences.take().unwrap_or_default(),
             trace: self.trace.take().map(|trace| trace.found).unwrap_or_default(),
         };
@@ -745,6 +679,7 @@ impl<'g> Recorder<'g> {
             rehearsal: None,
             passes,
             schedule: Schedule::default(),
+            commands: std::mem::take(&mut self.noted),
             differences: vec![],
             trace: BTreeMap::new(),
         };
@@ -771,23 +706,6 @@ impl Drop for Recorder<'_> {
     }
 }
 
-fn barrier(inner: &Inner, commands: vk::CommandBuffer) {
-    let stages = SHADER | COPY | INDIRECT;
-    let writes = vk::AccessFlags2::SHADER_STORAGE_WRITE | vk::AccessFlags2::TRANSFER_WRITE;
-    let reads = vk::AccessFlags2::SHADER_STORAGE_READ
-        | vk::AccessFlags2::TRANSFER_READ
-        | vk::AccessFlags2::INDIRECT_COMMAND_READ;
-    let memory = [vk::MemoryBarrier2::default()
-        .src_stage_mask(stages)
-        .src_access_mask(writes)
-        .dst_stage_mask(stages)
-        .dst_access_mask(reads | writes)];
-    // SAFETY: a command buffer in recording, synchronization2 is enabled.
-    unsafe {
-        inner.device.cmd_pipeline_barrier2(commands, &vk::DependencyInfo::default().memory_barriers(&memory));
-    }
-}
-
 impl Submission<'_> {
     fn start(&mut self) -> Result<(), Error> {
         if self.rehearsal.is_some() {
@@ -795,16 +713,11 @@ impl Submission<'_> {
         }
         let inner = self.gpu.inner();
         let context = self.context.as_ref().expect("a submission holds its context until it is waited for");
-        let host = [vk::MemoryBarrier2::default()
-            .src_stage_mask(SHADER | COPY)
-            .src_access_mask(vk::AccessFlags2::SHADER_STORAGE_WRITE | vk::AccessFlags2::TRANSFER_WRITE)
-            .dst_stage_mask(vk::PipelineStageFlags2::HOST)
-            .dst_access_mask(vk::AccessFlags2::HOST_READ)];
+        Commands { inner, raw: context.commands, noted: &mut self.commands }.barrier_to_host();
         let commands = [vk::CommandBufferSubmitInfo::default().command_buffer(context.commands)];
         let submit = [vk::SubmitInfo2::default().command_buffer_infos(&commands)];
         // SAFETY: the command buffer is in recording and its fence unsignalled.
         let result = unsafe {
-            inner.device.cmd_pipeline_barrier2(context.commands, &vk::DependencyInfo::default().memory_barriers(&host));
             inner.device.end_command_buffer(context.commands).named("ending a command buffer")?;
             inner.device.queue_submit2(*lock(&inner.queue), &submit, context.fence)
         };
@@ -817,11 +730,8 @@ impl Submission<'_> {
             Ok(()) => Ok(()),
             Err(vk::Result::ERROR_DEVICE_LOST) => {
                 let context = self.context.as_ref().expect("held until waited for");
-                let reached = context.markers.1.mapped_slice().map_or(0, |bytes| {
-                    bytemuck::pod_collect_to_vec::<u8, u32>(bytes).iter().take_while(|&&m| m == 1).count()
-                });
-                let pass = reached.checked_sub(1).and_then(|i| self.passes.get(i)).copied().unwrap_or("none");
-                Err(Error::DeviceLost { pass: pass.into() })
+                let markers = context.markers.as_ref().and_then(|(_, allocation)| allocation.mapped_slice());
+                Err(Error::DeviceLost { place: place_of_fault(&self.passes, markers) })
             }
             Err(result) => Err(Error::Vulkan { what: "submitting work", result }),
         }
@@ -830,7 +740,7 @@ impl Submission<'_> {
     /// Waits for the end and returns the time of every pass (empty unless the device was opened with timestamps).
     ///
     /// # Errors
-    /// [`Error::DeviceLost`] with the last pass reached.
+    /// [`Error::DeviceLost`] with the pass, where faults are traced.
     pub fn wait(mut self) -> Result<Vec<Timing>, Error> {
         if self.rehearsal.is_some() {
             return Ok(vec![]);
@@ -898,13 +808,26 @@ impl Drop for Submission<'_> {
     }
 }
 
+/// Where a device was lost, as a part of a sentence: in the first pass without its marker. Without markers, what would tell.
+fn place_of_fault(passes: &[&str], markers: Option<&[u8]>) -> String {
+    let Some(markers) = markers else {
+        let [first, last] = [passes.first(), passes.last()].map(|pass| pass.copied().unwrap_or("none"));
+        return format!(
+            "in one of {} passes from {first} to {last}; the same command with --trace-faults says in which, and takes longer",
+            passes.len()
+        );
+    };
+    let ended = bytemuck::pod_collect_to_vec::<u8, u32>(markers).iter().take_while(|&&marker| marker == 1).count();
+    passes.get(ended).map_or_else(|| "behind the last pass that is traced".to_owned(), |pass| format!("in pass {pass}"))
+}
+
 #[cfg(test)]
 mod tests {
     use rand::{RngExt, SeedableRng};
     use rand_pcg::Pcg64Mcg;
 
     use super::*;
-    use crate::gpu::testing;
+    use crate::gpu::{Options, testing};
 
     /// Fills and copies among a few buffers, drawn at random: overlapped they come to what they come to one by one.
     #[test]
@@ -962,11 +885,35 @@ mod tests {
                 rehearsal: None,
                 passes: vec![],
                 schedule: Schedule::default(),
+                commands: vec![],
                 differences: vec![],
                 trace: BTreeMap::new(),
             });
         }
         let buffer = gpu.upload("words", &[1u32, 2, 3]).expect("the device goes on");
         assert_eq!(gpu.read(&buffer).expect("readable"), [1, 2, 3]);
+    }
+
+    #[test]
+    fn a_lost_device_is_said_to_be_lost_in_a_pass() {
+        let lost = |options: Options| {
+            let gpu = testing::gpu_with(options);
+            let buffer = gpu.upload("words", &[1u32, 2, 3]).expect("room");
+            let mut rec = gpu.recorder().expect("a recorder");
+            rec.fill(&buffer, 7);
+            rec.zero(&buffer);
+            let mut submission = rec.submit().expect("the device takes it");
+            gpu.wait_idle().expect("the device runs it");
+            submission.passes.push("primitives/scan");
+            let said = submission.lost(Err(vk::Result::ERROR_DEVICE_LOST)).expect_err("lost").to_string();
+            submission.wait().expect("it is not");
+            said
+        };
+        let plain = lost(Options::default());
+        assert!(
+            plain.contains("in one of 3 passes from fill to primitives/scan; ") && plain.contains("--trace-faults")
+        );
+        let traced = Options { trace_faults: true, ..Options::default() };
+        assert_eq!(lost(traced), "the device was lost in pass primitives/scan");
     }
 }

@@ -5,8 +5,6 @@
 
 use ash::vk;
 
-use super::device::Pipeline;
-
 /// A figure in the driver's words.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 pub struct Statistic {
@@ -72,12 +70,15 @@ impl Compiled {
 }
 
 /// The driver's figures for a pipeline made with statistics; none where it has none.
-pub(super) fn of(extension: &ash::khr::pipeline_executable_properties::Device, pipeline: &Pipeline) -> Vec<Statistic> {
-    let info = vk::PipelineInfoKHR::default().pipeline(pipeline.raw);
+pub(super) fn of(
+    extension: &ash::khr::pipeline_executable_properties::Device,
+    pipeline: vk::Pipeline,
+) -> Vec<Statistic> {
+    let info = vk::PipelineInfoKHR::default().pipeline(pipeline);
     // SAFETY: the pipeline is live and was made to keep its statistics.
     let count = unsafe { extension.get_pipeline_executable_properties(&info) }.map_or(0, |all| all.len() as u32);
     let of_executable = |index: u32| {
-        let info = vk::PipelineExecutableInfoKHR::default().pipeline(pipeline.raw).executable_index(index);
+        let info = vk::PipelineExecutableInfoKHR::default().pipeline(pipeline).executable_index(index);
         // SAFETY: as above; the index is one of those just counted.
         unsafe { extension.get_pipeline_executable_statistics(&info) }.unwrap_or_default()
     };
