@@ -200,13 +200,13 @@ fn eval_of_what_cannot_be_compared() {
 
 /// A random model of two anchors for the small scene, in a folder of its own.
 fn with_model(folder: &Path) {
-    let anchors = model::files::Anchors {
-        position: vec![[0.0, 1.0, 0.5], [0.3, 1.2, 0.7]],
-        feature: vec![[0.1; model::files::FEATURES]; 2],
-        offset: vec![0.05; 2 * 10 * 3],
-        offsets_per_anchor: 10,
-        log_scaling: vec![[-2.0; 6]; 2],
-    };
+    let anchors = model::files::Anchors::new(
+        10,
+        vec![[0.0, 1.0, 0.5], [0.3, 1.2, 0.7]],
+        vec![[0.1; model::files::FEATURES]; 2],
+        vec![0.05; 2 * 10 * 3],
+        vec![[-2.0; 6]; 2],
+    );
     let weights = model::init::weights(1, 10, false, 0.0);
     model::files::save(&folder.join("model"), &anchors, &weights).expect("a writable folder");
 }

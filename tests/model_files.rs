@@ -18,13 +18,13 @@ fn anchors(count: usize, offsets_per_anchor: usize, seed: u64) -> Anchors {
             return value;
         }
     };
-    Anchors {
-        position: (0..count).map(|_| [(); 3].map(|()| value())).collect(),
-        feature: (0..count).map(|_| [(); 32].map(|()| value())).collect(),
-        offset: (0..count * offsets_per_anchor * 3).map(|_| value()).collect(),
+    Anchors::new(
         offsets_per_anchor,
-        log_scaling: (0..count).map(|_| [(); 6].map(|()| value())).collect(),
-    }
+        (0..count).map(|_| [(); 3].map(|()| value())).collect(),
+        (0..count).map(|_| [(); 32].map(|()| value())).collect(),
+        (0..count * offsets_per_anchor * 3).map(|_| value()).collect(),
+        (0..count).map(|_| [(); 6].map(|()| value())).collect(),
+    )
 }
 
 fn bits(anchors: &Anchors) -> Vec<u32> {

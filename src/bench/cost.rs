@@ -16,6 +16,8 @@ pub use crate::cost::{Dispatch, Work};
 use crate::gpu::form::without_form;
 use crate::math::attention::WEIGHTS as ATTENTION_WEIGHTS;
 use crate::math::decoder::Layout;
+use crate::model::arrays::ARRAYS;
+use crate::model::parameter::{PROJECTIONS, WEIGHTS};
 
 impl Dispatch<'_> {
     /// Items of a primitive, by the name of the buffer that its first binding counts them in.
@@ -35,16 +37,16 @@ impl Dispatch<'_> {
 
 /// Floats of a learnt array, its gradient or its moments; of the decoders those of one head, a third.
 fn learnt(c: &Counts, name: &str) -> f64 {
-    let name = name.strip_prefix("grad_").unwrap_or(name);
-    let name = name.strip_suffix("_first").or(name.strip_suffix("_root")).unwrap_or(name);
-    match name {
-        "feature" => 32.0 * c.anchors,
-        "offset" => 3.0 * c.offsets * c.anchors,
-        "log_scaling" => 6.0 * c.anchors,
-        "weights" => c.weights(),
-        "attention_weights" | "attention" => ATTENTION_WEIGHTS as f64,
-        "losses" => 8.0,
-        _ => f64::NAN,
+    if let Some(array) = ARRAYS.iter().find(|array| array.names.contain(name)) {
+        f64::from((array.width)(c.offsets as u32)) * c.anchors
+    } else if WEIGHTS.contain(name) {
+        c.weights()
+    } else if PROJECTIONS.contain(name) {
+        ATTENTION_WEIGHTS as f64
+    } else if name == "losses" {
+        8.0
+    } else {
+        f64::NAN
     }
 }
 

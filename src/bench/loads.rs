@@ -198,7 +198,7 @@ impl Load {
             anchors.log_scaling.push([spread, spread, spread, scale, scale, scale]);
             anchors.offset.extend((0..3 * offsets).map(|_| rng.random_range(-1.0f32..1.0)));
         }
-        anchors
+        anchors.completed()
     }
 
     /// The model, with room for what there will be.
@@ -348,13 +348,13 @@ fn bytes(gpu: &Gpu, settings: &Settings, load: &Load, capacity: Capacity) -> Res
     let rehearsal = gpu.rehearsal();
     let plan = Plan::new(&load.blank(), settings);
     let (anchors, offsets) = (load.anchors as usize, settings.model.offsets as usize);
-    let anchors = Anchors {
-        position: vec![[0.0; 3]; anchors],
-        feature: vec![[0.0; FEATURES]; anchors],
-        offset: vec![0.0; anchors * 3 * offsets],
-        offsets_per_anchor: offsets,
-        log_scaling: vec![[0.0; 6]; anchors],
-    };
+    let anchors = Anchors::new(
+        offsets,
+        vec![[0.0; 3]; anchors],
+        vec![[0.0; FEATURES]; anchors],
+        vec![0.0; anchors * 3 * offsets],
+        vec![[0.0; 6]; anchors],
+    );
     let weights = init::weights(0, offsets, plan.attention, settings.model.opacity);
     let number = super::usual_step(&plan, settings, 0);
     let mut step = Step::new(&rehearsal, plan, settings, &anchors, &weights, 1.0)?;

@@ -13,6 +13,8 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use crate::optimizer::Group;
+
 pub use arguments::SettingsArgs;
 pub use error::{Error, Invalid, Origin};
 use layer::Layers;
@@ -122,18 +124,10 @@ impl Settings {
         new.train.coarse.until = at(self.train.coarse.until);
         (new.train.eval_interval, new.train.save_interval) = (0, 0);
         new.optimizer.schedule_length = at(self.optimizer.schedule_length);
-        let rates = &mut new.optimizer.learning_rate;
-        let all = [
-            &mut rates.offset,
-            &mut rates.feature,
-            &mut rates.log_scaling,
-            &mut rates.mlp_opacity,
-            &mut rates.mlp_cov,
-            &mut rates.mlp_color,
-            &mut rates.attention,
-        ];
-        for rate in all.into_iter().flatten() {
-            *rate *= share.powf(-RATE_EXPONENT);
+        for group in Group::ALL {
+            for rate in new.optimizer.learning_rate.of_mut(group) {
+                *rate *= share.powf(-RATE_EXPONENT);
+            }
         }
         new.model.attention.start = at(self.model.attention.start);
         let (old, densify) = (&self.densify, &mut new.densify);

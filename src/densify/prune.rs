@@ -88,9 +88,10 @@ pub fn run(gpu: &Gpu, anchors: &mut Anchors, statistics: &mut Statistics, config
     let rows = gpu.read(&kept_count)?[0];
     if rows < n {
         gather(gpu, &kept, rows, 3, &mut anchors.position)?;
-        for parameter in [&mut anchors.feature, &mut anchors.offset, &mut anchors.log_scaling] {
-            for tensor in [&mut parameter.value, &mut parameter.first, &mut parameter.root] {
-                gather(gpu, &kept, rows, parameter.width, tensor)?;
+        for parameter in anchors.parameters_mut() {
+            let width = parameter.width;
+            for tensor in parameter.tensors_mut() {
+                gather(gpu, &kept, rows, width, tensor)?;
             }
         }
         gather(gpu, &kept, rows, offsets, &mut statistics.gradient)?;
@@ -102,7 +103,7 @@ pub fn run(gpu: &Gpu, anchors: &mut Anchors, statistics: &mut Statistics, config
     let cap = config.max_log_scaling as f32;
     if cap < f32::INFINITY {
         let mut rec = gpu.recorder()?;
-        let buffers = prune_cap::Buffers { log_scaling: &anchors.log_scaling.value };
+        let buffers = prune_cap::Buffers { log_scaling: &anchors.log_scaling().value };
         rec.run(prune_cap::Kernel, buffers, prune_cap::Push { anchors: rows, cap }, rows);
         rec.submit()?.wait()?;
     }
@@ -188,13 +189,13 @@ mod tests {
         {
             let mut rng = Pcg64Mcg::seed_from_u64(n as u64);
             let mut random = |len: usize| -> Vec<f32> { (0..len).map(|_| rng.random_range(-1.0..1.0)).collect() };
-            let model = files::Anchors {
-                position: random(3 * n).as_chunks().0.to_vec(),
-                feature: random(32 * n).as_chunks().0.to_vec(),
-                offset: random(3 * offsets * n),
-                offsets_per_anchor: offsets,
-                log_scaling: random(6 * n).as_chunks().0.to_vec(),
-            };
+            let model = files::Anchors::new(
+                offsets,
+                random(3 * n).as_chunks().0.to_vec(),
+                random(32 * n).as_chunks().0.to_vec(),
+                random(3 * offsets * n),
+                random(6 * n).as_chunks().0.to_vec(),
+            );
             let mut anchors = Anchors::upload(&gpu, &model, n as u32 + 9).unwrap();
             for parameter in anchors.parameters() {
                 gpu.write(&parameter.first, &random(n * parameter.width as usize)).unwrap();
@@ -241,13 +242,7 @@ mod tests {
     #[test]
     fn an_infinite_cap_leaves_the_scales_alone() {
         let gpu = testing::gpu();
-        let model = files::Anchors {
-            position: vec![[0.0; 3]],
-            feature: vec![[0.0; 32]],
-            offset: vec![0.0; 30],
-            offsets_per_anchor: 10,
-            log_scaling: vec![[7.0; 6]],
-        };
+        let model = files::Anchors::new(10, vec![[0.0; 3]], vec![[0.0; 32]], vec![0.0; 30], vec![[7.0; 6]]);
         let mut anchors = Anchors::upload(&gpu, &model, 0).unwrap();
         let mut statistics = Statistics::new(&gpu, 1, 10, false).unwrap();
         let config = Config { max_log_scaling: f64::INFINITY, ..Config::default() };

@@ -2,7 +2,7 @@
 
 use crate::gpu::kernels::densify::statistics;
 use crate::gpu::{Buffer, Error, Gpu, Groups, Recorder, Reference};
-use crate::model::anchors::lengthen;
+use crate::model::parameter::lengthen;
 use crate::primitives::dispatch;
 
 impl Reference for statistics::Kernel {

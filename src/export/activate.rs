@@ -5,7 +5,7 @@ use crate::gpu::kernels::export::{activate, activate_backward};
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::math::camera::{from_center, split};
 use crate::math::harmonics::{coefficients, harmonics};
-use crate::model::anchors::Parameter;
+use crate::model::parameter::{Parameter, names};
 use crate::render::project::Gaussians;
 
 /// The kernel's: e^88 is the last power of e below the largest float32.
@@ -109,39 +109,17 @@ impl Static {
     pub fn upload(gpu: &Gpu, cloud: &Cloud) -> Result<Self, Error> {
         let count = cloud.len() as u32;
         let each = coefficients(cloud.degree) as u32;
-        let parameter = |names, width, data: &[f32]| -> Result<Parameter, Error> {
-            let parameter = Parameter::new(gpu, names, width, count.max(1))?;
-            gpu.write(&parameter.value, data)?;
-            Ok(parameter)
-        };
-        let all = Self {
+        let rows = count.max(1);
+        let parameter = |names, width, data: &[f32]| Parameter::upload(gpu, names, width, rows, data);
+        Ok(Self {
             count,
             degree: cloud.degree,
-            position: parameter(["position", "position_first", "position_root"], 3, cloud.position.as_flattened())?,
-            log_scale: parameter(
-                ["log_scale", "log_scale_first", "log_scale_root"],
-                3,
-                cloud.log_scale.as_flattened(),
-            )?,
-            quaternion: parameter(
-                ["quaternion", "quaternion_first", "quaternion_root"],
-                4,
-                cloud.rotation.as_flattened(),
-            )?,
-            logit: parameter(["logit", "logit_first", "logit_root"], 1, &cloud.logit)?,
-            harmonics: parameter(
-                ["harmonics", "harmonics_first", "harmonics_root"],
-                3 * each,
-                cloud.harmonics.as_flattened(),
-            )?,
-        };
-        let mut rec = gpu.recorder()?;
-        for parameter in all.parameters() {
-            rec.zero(&parameter.first);
-            rec.zero(&parameter.root);
-        }
-        rec.submit()?.wait()?;
-        Ok(all)
+            position: parameter(names!("position"), 3, cloud.position.as_flattened())?,
+            log_scale: parameter(names!("log_scale"), 3, cloud.log_scale.as_flattened())?,
+            quaternion: parameter(names!("quaternion"), 4, cloud.rotation.as_flattened())?,
+            logit: parameter(names!("logit"), 1, &cloud.logit)?,
+            harmonics: parameter(names!("harmonics"), 3 * each, cloud.harmonics.as_flattened())?,
+        })
     }
 
     /// Position, log-scale, quaternion, logit, harmonics.
@@ -154,8 +132,7 @@ impl Static {
     /// # Errors
     /// Whatever the copies meet.
     pub fn read(&self, gpu: &Gpu) -> Result<Cloud, Error> {
-        let n = self.count as usize;
-        let read = |parameter: &Parameter| gpu.read_range(&parameter.value, n * parameter.width as usize);
+        let read = |parameter: &Parameter| parameter.read(gpu, self.count);
         let triples = |flat: Vec<f32>| -> Vec<[f32; 3]> { flat.as_chunks().0.to_vec() };
         let unit = |q: &[f32; 4]| {
             let norm = wide(*q).iter().map(|v| v * v).sum::<f64>().sqrt().max(NORM_EPSILON);
@@ -261,13 +238,13 @@ impl ActivateBackward {
     /// # Errors
     /// As [`Gpu::buffer`].
     pub fn new(gpu: &Gpu, of: &Static) -> Result<Self, Error> {
-        let like = |name, parameter: &Parameter| gpu.buffer(name, parameter.value.len());
+        let like = |parameter: &Parameter| gpu.buffer(parameter.names.gradient, parameter.value.len());
         Ok(Self {
-            position: like("grad_position", &of.position)?,
-            log_scale: like("grad_log_scale", &of.log_scale)?,
-            quaternion: like("grad_quaternion", &of.quaternion)?,
-            logit: like("grad_logit", &of.logit)?,
-            harmonics: like("grad_harmonics", &of.harmonics)?,
+            position: like(&of.position)?,
+            log_scale: like(&of.log_scale)?,
+            quaternion: like(&of.quaternion)?,
+            logit: like(&of.logit)?,
+            harmonics: like(&of.harmonics)?,
         })
     }
 

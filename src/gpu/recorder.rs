@@ -519,13 +519,18 @@ impl<'g> Recorder<'g> {
 
     /// Sets `len` elements from `at` on to zero.
     pub fn zero_range<T: bytemuck::Pod>(&mut self, buffer: &Buffer<T>, at: usize, len: usize) {
-        assert!(at + len <= buffer.len(), "zero {len} from {at} of {buffer:?}");
+        self.fill_range(buffer, at, len, 0);
+    }
+
+    /// Sets every word of `len` elements from `at` on.
+    pub fn fill_range<T: bytemuck::Pod>(&mut self, buffer: &Buffer<T>, at: usize, len: usize, word: u32) {
+        assert!(at + len <= buffer.len(), "fill {len} from {at} of {buffer:?}");
         if len == 0 {
             return;
         }
         let slot = buffer.slot();
         let [at, bytes] = [at, len].map(|n| (n * size_of::<T>()) as u64);
-        let work = Work::Fill { to: slot.raw, at, bytes, word: 0 };
+        let work = Work::Fill { to: slot.raw, at, bytes, word };
         self.pass("fill", &[(slot.id(), slot.name, Access::Write)], Some(work));
     }
 

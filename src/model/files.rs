@@ -5,6 +5,8 @@
 //! - `f_offset_{c K + k}` is component c of offset k: such files hold the (K, 3) offsets transposed to (3, K).
 //! - `scale_*` are the six log-scales (natural logarithm of scene units): three for the offsets, three for the Gaussians.
 //! - `nx ny nz` are zero; `opacity` and `rot_*` are an anchor's own, which nothing reads: logit(0.1) and (1, 0, 0, 0).
+//! - Arrays that Scaffold-GS does not have follow as `NAME_0..`; in a file without them all their elements are the initial
+//!   value.
 //!
 //! `weights.safetensors` has float32 tensors under PyTorch's names, weights as (outputs, inputs):
 //! `mlp_{opacity,cov,color}.{0,2}.{weight,bias}` and, if attention was trained,
@@ -25,8 +27,9 @@ use ply_rs_bw::writer::Writer;
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 
-/// Length of an anchor's feature.
-pub const FEATURES: usize = 32;
+use super::arrays::{ARRAYS, Array};
+pub use super::arrays::{Anchors, FEATURES};
+
 /// Inputs of a decoder: feature, unit view direction, distance.
 pub const DECODER_INPUTS: usize = FEATURES + 4;
 /// Hidden width of a decoder.
@@ -40,21 +43,6 @@ pub const WEIGHTS: &str = "weights.safetensors";
 
 /// logit(0.1), the opacity that such files carry for an anchor itself.
 const PLACEHOLDER_OPACITY: f32 = -2.197_224_6;
-
-/// The anchors of a scene.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Anchors {
-    /// \[anchor\] position, scene units.
-    pub position: Vec<[f32; 3]>,
-    /// \[anchor\] feature.
-    pub feature: Vec<[f32; FEATURES]>,
-    /// \[anchor, offset, xyz\] offsets of the Gaussians, in units of the anchor's first three scales.
-    pub offset: Vec<f32>,
-    /// Gaussians per anchor, K.
-    pub offsets_per_anchor: usize,
-    /// \[anchor\] log-scales: three for the offsets, three for the Gaussians.
-    pub log_scaling: Vec<[f32; 6]>,
-}
 
 /// A float32 tensor, row-major.
 #[derive(Debug, Clone, PartialEq)]
@@ -257,13 +245,15 @@ pub fn load(folder: &Path) -> Result<(Anchors, Weights), Error> {
 fn check(anchors: &Anchors, weights: &Weights) -> Result<(), Error> {
     let n = anchors.position.len();
     let k = anchors.offsets_per_anchor;
-    if anchors.feature.len() != n || anchors.log_scaling.len() != n || anchors.offset.len() != n * k * 3 || k == 0 {
-        return Err(Error::Inconsistent(format!(
-            "{n} positions, {} features, {} log-scales and {} offset components for {k} offsets per anchor",
-            anchors.feature.len(),
-            anchors.log_scaling.len(),
-            anchors.offset.len(),
-        )));
+    if k == 0 {
+        return Err(Error::Inconsistent("no offsets per anchor".to_owned()));
+    }
+    for array in &ARRAYS {
+        let (len, wanted) = ((array.get)(anchors).len(), n * anchors.width(array));
+        if len != wanted {
+            let name = array.names.value;
+            return Err(Error::Inconsistent(format!("{len} values of `{name}` instead of {wanted} for {n} positions")));
+        }
     }
     let expected: BTreeMap<_, _> = weight_shapes(k, weights.has_attention()).into_iter().collect();
     for (name, shape) in &expected {
@@ -301,17 +291,25 @@ fn write_temporary(
 
 // ---------------------------------------------------------------- point_cloud.ply
 
+/// The attributes of an array, in the order of the file.
+fn columns(array: &Array, offsets_per_anchor: usize) -> impl Iterator<Item = String> + use<> {
+    let stem = array.stem;
+    (0..(array.width)(offsets_per_anchor as u32)).map(move |column| format!("{stem}_{column}"))
+}
+
 /// The attributes of a vertex, in the order of the file.
 fn attributes(offsets_per_anchor: usize) -> Vec<String> {
-    let numbered = |stem: &'static str, count| (0..count).map(move |i| format!("{stem}_{i}"));
+    let of = |array: &Array| columns(array, offsets_per_anchor);
+    let [feature, offset, log_scaling, others @ ..] = &ARRAYS;
     ["x", "y", "z", "nx", "ny", "nz"]
         .map(str::to_owned)
         .into_iter()
-        .chain(numbered("f_offset", 3 * offsets_per_anchor))
-        .chain(numbered("f_anchor_feat", FEATURES))
+        .chain(of(offset))
+        .chain(of(feature))
         .chain(["opacity".to_owned()])
-        .chain(numbered("scale", 6))
-        .chain(numbered("rot", 4))
+        .chain(of(log_scaling))
+        .chain((0..4).map(|i| format!("rot_{i}")))
+        .chain(others.iter().flat_map(of))
         .collect()
 }
 
@@ -358,18 +356,24 @@ fn write_anchors(out: &mut impl Write, anchors: &Anchors) -> io::Result<()> {
     header.elements.insert(vertex.name.clone(), vertex.clone());
     let writer = Writer::<Row>::new();
     writer.write_header(out, &header)?;
+    let [feature, offset, log_scaling, others @ ..] = &ARRAYS;
+    let put = |row: &mut Row, anchor: usize, array: &Array| {
+        let width = anchors.width(array);
+        let values = &(array.get)(anchors)[anchor * width..][..width];
+        row.values.extend((0..width).map(|column| values[(array.element)(k, column)]));
+    };
     let mut row = Row::new();
     for anchor in 0..vertex.count {
         row.next.set(0);
         row.values.clear();
         row.values.extend(anchors.position[anchor]);
         row.values.extend([0.0; 3]);
-        let offset = &anchors.offset[anchor * k * 3..(anchor + 1) * k * 3];
-        row.values.extend((0..3).flat_map(|component| offset.iter().skip(component).step_by(3)));
-        row.values.extend(anchors.feature[anchor]);
+        put(&mut row, anchor, offset);
+        put(&mut row, anchor, feature);
         row.values.push(PLACEHOLDER_OPACITY);
-        row.values.extend(anchors.log_scaling[anchor]);
+        put(&mut row, anchor, log_scaling);
         row.values.extend([1.0, 0.0, 0.0, 0.0]);
+        others.iter().for_each(|array| put(&mut row, anchor, array));
         writer.write_little_endian_element(out, &row, &vertex)?;
     }
     Ok(())
@@ -386,36 +390,30 @@ pub fn load_anchors(path: &Path) -> Result<Anchors, Error> {
     let parser = Parser::<Row>::new();
     let header = parser.read_header(&mut reader).map_err(|error| broken(format!("not a PLY file ({error})")))?;
     let mut columns = None;
-    let mut anchors = Anchors::default();
     for element in header.elements.values() {
         if element.name == "vertex" {
-            let found = Columns::find(path, element)?;
-            anchors.offsets_per_anchor = found.offset.len() / 3;
-            columns = Some(found);
-        }
-        // Elements after the vertices are of no use.
-        if element.name != "vertex" && columns.is_some() {
-            return Ok(anchors);
+            columns = Some(Columns::find(path, element)?);
+        } else if let Some(columns) = columns {
+            // Elements after the vertices are of no use.
+            return Ok(columns.anchors());
         }
         for index in 0..element.count {
             let row = read_row(&parser, &mut reader, header.encoding, element).map_err(|error| {
                 let (count, name) = (element.count, &element.name);
                 broken(format!("cut off or damaged at {name} {index} of {count}, which its header declares ({error})"))
             })?;
-            if let Some(columns) = &columns {
-                columns.append(path, index, &row.values, &mut anchors)?;
+            if let Some(columns) = &mut columns {
+                columns.append(path, index, &row.values)?;
             }
         }
     }
-    if columns.is_none() {
-        return Err(broken("a PLY file without vertices".to_owned()));
-    }
+    let Some(columns) = columns else { return Err(broken("a PLY file without vertices".to_owned())) };
     let mut rest = reader.into_inner();
     let left = rest.fill_buf().map_err(|source| Error::Io { path: path.to_owned(), source })?;
     if header.encoding != Encoding::Ascii && !left.is_empty() {
         return Err(broken("goes on after the last vertex that its header declares".to_owned()));
     }
-    Ok(anchors)
+    Ok(columns.anchors())
 }
 
 fn read_row<R: BufRead>(
@@ -438,14 +436,15 @@ fn read_row<R: BufRead>(
     Ok(row)
 }
 
-/// Where a model's attributes stand in a row of the file.
+/// Where a model's attributes stand in a row of the file, and what was read of them.
 struct Columns {
     names: Vec<String>,
     position: [usize; 3],
-    /// Component-major, as in the file: `[component * K + offset]`.
-    offset: Vec<usize>,
-    feature: [usize; FEATURES],
-    log_scaling: [usize; 6],
+    offsets_per_anchor: usize,
+    /// \[array, element\] in the order of [`ARRAYS`]; empty for one that the file does not have.
+    arrays: [Vec<usize>; ARRAYS.len()],
+    read: Vec<[f32; 3]>,
+    values: [Vec<f32>; ARRAYS.len()],
 }
 
 impl Columns {
@@ -456,59 +455,61 @@ impl Columns {
             Some(&i) => Ok(i),
             None => Err(Error::MissingAttribute { path: path.to_owned(), attribute }),
         };
-        fn numbered<const N: usize>(
-            stem: &str,
-            column: &impl Fn(String) -> Result<usize, Error>,
-        ) -> Result<[usize; N], Error> {
-            let mut columns = [0; N];
-            for (i, at) in columns.iter_mut().enumerate() {
-                *at = column(format!("{stem}_{i}"))?;
-            }
-            Ok(columns)
-        }
         let position = [column("x".into())?, column("y".into())?, column("z".into())?];
-        let feature = numbered("f_anchor_feat", &column)?;
-        if index.contains_key(format!("f_anchor_feat_{FEATURES}").as_str()) {
+        let [feature, offset, _, others @ ..] = &ARRAYS;
+        if index.contains_key(format!("{}_{FEATURES}", feature.stem).as_str()) {
             let reason =
                 format!("anchors have more than {FEATURES} feature components; this program decodes {FEATURES}");
             return Err(Error::Format { path: path.to_owned(), reason });
         }
         // The highest number says how many there should be, in threes, so that a gap is named.
-        let numbers = names.iter().filter_map(|name| name.strip_prefix("f_offset_")?.parse::<usize>().ok());
-        let components = numbers.max().map_or(3, |last| (last / 3).saturating_add(1).saturating_mul(3));
-        let offset = (0..components).map(|i| column(format!("f_offset_{i}"))).collect::<Result<_, _>>()?;
-        let log_scaling = numbered("scale", &column)?;
-        Ok(Self { position, offset, feature, log_scaling, names })
+        let numbers = names.iter().filter_map(|name| name.strip_prefix(offset.stem)?.strip_prefix('_')?.parse().ok());
+        let offsets_per_anchor = numbers.max().map_or(1, |last: usize| (last / 3 + 1).min(u32::MAX as usize / 3));
+        let mut arrays = [const { Vec::new() }; ARRAYS.len()];
+        for (array, found) in ARRAYS.iter().zip(&mut arrays) {
+            let of = || columns(array, offsets_per_anchor);
+            let own = others.iter().any(|other| other.names == array.names);
+            if own && !of().any(|name| index.contains_key(name.as_str())) {
+                continue;
+            }
+            // No more than the file has attributes: the first that is missing ends it.
+            let in_file = of().map(&column).collect::<Result<Vec<_>, _>>()?;
+            *found = vec![0; in_file.len()];
+            for (i, column) in in_file.into_iter().enumerate() {
+                found[(array.element)(offsets_per_anchor, i)] = column;
+            }
+        }
+        let values = [const { Vec::new() }; ARRAYS.len()];
+        Ok(Self { names, position, offsets_per_anchor, arrays, read: vec![], values })
     }
 
-    fn append(&self, path: &Path, vertex: usize, row: &[f32], anchors: &mut Anchors) -> Result<(), Error> {
+    fn append(&mut self, path: &Path, vertex: usize, row: &[f32]) -> Result<(), Error> {
+        let names = &self.names;
         let value = |column: usize| match row[column] {
             value if value.is_finite() => Ok(value),
             value => {
-                let attribute = self.names[column].clone();
+                let attribute = names[column].clone();
                 Err(Error::NotFinite { path: path.to_owned(), attribute, vertex, value })
             }
         };
-        fn gather<const N: usize>(
-            columns: &[usize; N],
-            value: &impl Fn(usize) -> Result<f32, Error>,
-        ) -> Result<[f32; N], Error> {
-            let mut values = [0.0; N];
-            for (to, &column) in values.iter_mut().zip(columns) {
-                *to = value(column)?;
-            }
-            Ok(values)
-        }
-        anchors.position.push(gather(&self.position, &value)?);
-        anchors.feature.push(gather(&self.feature, &value)?);
-        anchors.log_scaling.push(gather(&self.log_scaling, &value)?);
-        let k = self.offset.len() / 3;
-        for offset in 0..k {
-            for component in 0..3 {
-                anchors.offset.push(value(self.offset[component * k + offset])?);
+        let [x, y, z] = self.position;
+        self.read.push([value(x)?, value(y)?, value(z)?]);
+        for (columns, values) in self.arrays.iter().zip(&mut self.values) {
+            for &column in columns {
+                values.push(value(column)?);
             }
         }
         Ok(())
+    }
+
+    /// The anchors that were read. Arrays that the file does not have begin with their initial value.
+    fn anchors(self) -> Anchors {
+        let mut anchors =
+            Anchors { position: self.read, offsets_per_anchor: self.offsets_per_anchor, ..Anchors::default() };
+        for (array, values) in ARRAYS.iter().zip(self.values) {
+            (array.set)(&mut anchors, values);
+        }
+        anchors.completed()
     }
 }
 

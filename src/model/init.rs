@@ -81,13 +81,8 @@ pub fn anchors(points: &[[f32; 3]], voxel: f64, offsets_per_anchor: usize) -> Re
     cells.dedup();
     let position: Vec<[f32; 3]> = cells.iter().map(|cell| cell.map(|v| (f64::from(v) * voxel) as f32)).collect();
     let log_scaling = mean_distance_to_nearest(&position, voxel).into_iter().map(|d| [d.ln() as f32; 6]).collect();
-    let anchors = Anchors {
-        feature: vec![[0.0; FEATURES]; position.len()],
-        offset: vec![0.0; position.len() * offsets_per_anchor * 3],
-        offsets_per_anchor,
-        log_scaling,
-        position,
-    };
+    let (feature, offset) = (vec![[0.0; FEATURES]; position.len()], vec![0.0; position.len() * offsets_per_anchor * 3]);
+    let anchors = Anchors::new(offsets_per_anchor, position, feature, offset, log_scaling);
     Ok(Initial { anchors, voxel })
 }
 

@@ -1,11 +1,13 @@
 //! What is learnt: anchors, decoder, attention; files on disk.
 
 pub mod anchors;
+pub mod arrays;
 pub mod attention;
 pub mod attention_blend;
 pub mod attention_select;
 pub mod config;
 pub mod files;
 pub mod init;
+pub mod parameter;
 
 pub use config::Config;

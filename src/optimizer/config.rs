@@ -19,26 +19,73 @@ pub struct Config {
     pub learning_rate: LearningRates,
 }
 
-/// `[initial, final]` learning rate of each parameter group, log-linear in between; equal ends mean a constant rate and
-/// `[0, 0]` a group that is not trained.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default, expecting = "a table")]
-pub struct LearningRates {
+/// Declares the groups: a variant of [`Group`], the setting of its rates, and their default.
+macro_rules! groups {
+    ($($(#[$doc:meta])+ $group:ident: $setting:ident = $rates:expr;)+) => {
+        /// Parameters that share a learning rate.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+        #[serde(rename_all = "snake_case")]
+        pub enum Group { $($(#[$doc])+ $group),+ }
+
+        impl Group {
+            /// Every group, in the order of the settings.
+            pub const ALL: [Self; [$(Self::$group),+].len()] = [$(Self::$group),+];
+
+            /// The key of its rates in the settings.
+            pub fn name(self) -> &'static str {
+                match self { $(Self::$group => stringify!($setting)),+ }
+            }
+        }
+
+        /// `[initial, final]` learning rate of each parameter group, log-linear in between; equal ends mean a constant rate
+        /// and `[0, 0]` a group that is not trained.
+        #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+        #[serde(deny_unknown_fields, default, expecting = "a table")]
+        pub struct LearningRates { $($(#[$doc])+ pub $setting: [f64; 2]),+ }
+
+        impl Default for LearningRates {
+            fn default() -> Self {
+                Self { $($setting: $rates),+ }
+            }
+        }
+
+        impl LearningRates {
+            /// The rates of a group.
+            pub fn of(&self, group: Group) -> [f64; 2] {
+                match group { $(Group::$group => self.$setting),+ }
+            }
+
+            /// The rates of a group, to be changed.
+            pub fn of_mut(&mut self, group: Group) -> &mut [f64; 2] {
+                match group { $(Group::$group => &mut self.$setting),+ }
+            }
+        }
+    };
+}
+
+groups! {
     /// Offsets of the Gaussians from their anchor, multiplied by the scene radius (1.1 times the largest distance of a
     /// camera from the mean camera).
-    pub offset: [f64; 2],
+    Offset: offset = [0.01, 0.0001];
     /// Anchor features.
-    pub feature: [f64; 2],
+    Feature: feature = [0.0075, 0.0075];
     /// The six log-scales of an anchor.
-    pub log_scaling: [f64; 2],
+    LogScaling: log_scaling = [0.007, 0.007];
     /// Opacity decoder.
-    pub mlp_opacity: [f64; 2],
+    MlpOpacity: mlp_opacity = [0.002, 0.00002];
     /// Covariance decoder.
-    pub mlp_cov: [f64; 2],
+    MlpCov: mlp_cov = [0.004, 0.004];
     /// Colour decoder.
-    pub mlp_color: [f64; 2],
+    MlpColor: mlp_color = [0.008, 0.00005];
     /// Projections of the cross-attention.
-    pub attention: [f64; 2],
+    Attention: attention = [0.002, 0.00002];
+}
+
+impl Group {
+    /// Whether its rates are given for a scene of radius 1, and multiplied by the scene's.
+    pub fn goes_with_radius(self) -> bool {
+        self == Self::Offset
+    }
 }
 
 impl Default for Config {
@@ -49,20 +96,6 @@ impl Default for Config {
             lazy: false,
             schedule_length: 0,
             learning_rate: LearningRates::default(),
-        }
-    }
-}
-
-impl Default for LearningRates {
-    fn default() -> Self {
-        Self {
-            offset: [0.01, 0.0001],
-            feature: [0.0075, 0.0075],
-            log_scaling: [0.007, 0.007],
-            mlp_opacity: [0.002, 0.00002],
-            mlp_cov: [0.004, 0.004],
-            mlp_color: [0.008, 0.00005],
-            attention: [0.002, 0.00002],
         }
     }
 }
@@ -83,22 +116,13 @@ impl Config {
             self.epsilon,
             "must be between 1e-37 and 1e30, as float32 holds it",
         )?;
-        let rates = &self.learning_rate;
-        let groups = [
-            ("learning_rate.offset", rates.offset),
-            ("learning_rate.feature", rates.feature),
-            ("learning_rate.log_scaling", rates.log_scaling),
-            ("learning_rate.mlp_opacity", rates.mlp_opacity),
-            ("learning_rate.mlp_cov", rates.mlp_cov),
-            ("learning_rate.mlp_color", rates.mlp_color),
-            ("learning_rate.attention", rates.attention),
-        ];
-        for (key, rate) in groups {
+        for group in Group::ALL {
+            let rate = self.learning_rate.of(group);
             // An infinite rate times an update of zero is not a number.
             let positive = rate.iter().all(|end| (1e-37..=1e30).contains(end));
             ensure(
                 positive || rate == [0.0, 0.0],
-                key,
+                &format!("learning_rate.{}", group.name()),
                 format_args!("{rate:?}"),
                 "must be [initial, final], both positive (1e-37 to 1e30; the decay between them is log-linear) or both 0",
             )?;

@@ -115,12 +115,12 @@ impl Forward {
     ) -> Binned<'s> {
         let Model { anchors, weights } = model;
         self.visible.record(rec, anchors, camera, near, limits);
-        let offset = anchors.offset.value.view();
+        let offset = anchors.offset().value.view();
         let model = decode::Anchors {
             position: &anchors.position,
-            feature: &anchors.feature.value,
+            feature: &anchors.feature().value,
             offset: &offset,
-            log_scaling: &anchors.log_scaling.value,
+            log_scaling: &anchors.log_scaling().value,
             weights,
             visible: &self.visible.list,
         };

@@ -43,7 +43,7 @@ impl Visible {
     /// Lists the anchors whose ellipsoid touches the view. More than there is room for raise the overflow flag and
     /// leave the list empty.
     pub fn record(&self, rec: &mut Recorder<'_>, anchors: &Anchors, camera: &Camera, near: f32, limits: &Limits) {
-        let log_scaling = &anchors.log_scaling.value;
+        let log_scaling = &anchors.log_scaling().value;
         let flags = match (&self.cull, &self.all) {
             (Some(cull), _) => cull.record(rec, &anchors.position, log_scaling, anchors.count, camera, near),
             (None, Some(all)) => all,

@@ -313,9 +313,6 @@ pub(crate) struct Warm {
     pub(crate) capacity: crate::render::view::Capacity,
 }
 
-/// Anchors' features, offsets and scalings, and the decoders: what is learnt from the first step on.
-const LEARNT: usize = 4;
-
 impl Warm {
     pub(crate) fn train(
         gpu: &Gpu,
@@ -332,7 +329,7 @@ impl Warm {
         let (anchors, weights) = step.model()?;
         let mut tensors = vec![];
         let mut values = BTreeMap::new();
-        for parameter in step.parameters().into_iter().take(LEARNT) {
+        for parameter in step.anchors.parameters().iter().chain([&step.weights]) {
             let [value, first, root] = parameter.tensors().map(|tensor| gpu.read(tensor));
             let value = value?;
             values.insert(parameter.value.name(), value.clone());

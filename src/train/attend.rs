@@ -4,10 +4,12 @@ use super::order::{Stream, random};
 use super::photographs::Photograph;
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::math::attention::WEIGHTS;
-use crate::model::anchors::{Anchors, Parameter};
+use crate::model::anchors::Anchors;
 use crate::model::attention_blend::{Blend, Inputs};
 use crate::model::attention_select::{Chosen, Draw, KEY_BITS, Select, View, patch_position};
 use crate::model::config::Attention as Config;
+use crate::model::parameter::{PROJECTIONS, Parameter};
+use crate::optimizer::Group;
 use crate::primitives::Count;
 use crate::primitives::sort::{Pairs, Sort};
 use crate::render::visible::Visible;
@@ -18,10 +20,8 @@ pub struct Attend {
     seed: u64,
     room: Option<Room>,
     blend: Blend,
-    /// Projections, flat, with their moments.
+    /// Projections, flat, with their gradient.
     pub weights: Parameter,
-    /// dL/d weights.
-    pub grad_weights: Buffer<f32>,
 }
 
 /// What depends on the number of anchors.
@@ -61,19 +61,13 @@ impl Attend {
     /// # Errors
     /// As [`Gpu::buffer`].
     pub fn new(gpu: &Gpu, config: &Config, seed: u64, anchors: u32, weights: &[f32]) -> Result<Self, Error> {
-        let parameter =
-            Parameter::new(gpu, ["attention_weights", "attention_first", "attention_root"], WEIGHTS as u32, 1)?;
-        gpu.write(&parameter.value, weights)?;
-        let mut rec = gpu.recorder()?;
-        rec.zero(&parameter.first);
-        rec.zero(&parameter.root);
-        rec.submit()?.wait()?;
+        let mut weights = Parameter::upload(gpu, PROJECTIONS, WEIGHTS as u32, 1, weights)?.in_group(Group::Attention);
+        weights.make_gradient(gpu)?;
         Ok(Self {
             seed,
             room: Some(Room::new(gpu, config, anchors)?),
             blend: Blend::new(gpu, config.tokens, config.blend as f32)?,
-            grad_weights: gpu.buffer("grad_attention_weights", WEIGHTS)?,
-            weights: parameter,
+            weights,
             config: config.clone(),
         })
     }
@@ -93,6 +87,11 @@ impl Attend {
         Ok(())
     }
 
+    /// dL/d projections.
+    pub fn grad_weights(&self) -> &Buffer<f32> {
+        self.weights.gradient.as_ref().expect("made with the projections")
+    }
+
     fn room(&self) -> &Room {
         self.room.as_ref().expect("released only while no step is recorded")
     }
@@ -108,7 +107,7 @@ impl Attend {
         near: f32,
         step: u32,
     ) -> (&'a Buffer<f32>, Option<Attended<'a>>) {
-        let Some([x0, y0, x1, y1]) = photograph.mask_box else { return (&anchors.feature.value, None) };
+        let Some([x0, y0, x1, y1]) = photograph.mask_box else { return (&anchors.feature().value, None) };
         let camera = &photograph.camera;
         let view = View {
             rotation: camera.rotation,
@@ -130,7 +129,7 @@ impl Attend {
         let sorted = sort.record(rec, pairs, Count::Device(&visible.count), KEY_BITS);
         let chosen = select.take(rec, sorted.values);
         let inputs = Inputs { chosen, weights: &self.weights.value };
-        let feature = &anchors.feature.value;
+        let feature = &anchors.feature().value;
         let attended = Attended { chosen, reference: photograph.reference };
         if self.config.write_back {
             let which = (anchors.count as usize, attended.reference);
@@ -152,7 +151,7 @@ impl Attend {
     ) -> &Buffer<u32> {
         let skip = self.blend.attention().skip(rec, attended.chosen.tokens, overflow);
         if self.config.write_back {
-            self.blend.write_back(rec, attended.chosen, skip, &anchors.feature.value, attended.reference);
+            self.blend.write_back(rec, attended.chosen, skip, &anchors.feature().value, attended.reference);
         }
         skip
     }
@@ -161,9 +160,9 @@ impl Attend {
     pub fn backward(&self, rec: &mut Recorder<'_>, attended: Attended<'_>, grad_feature: &Buffer<f32>) {
         let inputs = Inputs { chosen: attended.chosen, weights: &self.weights.value };
         if self.config.write_back {
-            self.blend.weights_backward(rec, inputs, grad_feature, &self.grad_weights);
+            self.blend.weights_backward(rec, inputs, grad_feature, self.grad_weights());
         } else {
-            self.blend.backward(rec, inputs, grad_feature, &self.grad_weights);
+            self.blend.backward(rec, inputs, grad_feature, self.grad_weights());
         }
     }
 }

@@ -31,8 +31,10 @@ use crate::gpu::{self, Buffer, Gpu};
 use crate::losses::Term;
 use crate::math::attention::WEIGHTS as ATTENTION;
 use crate::math::decoder::Layout;
-use crate::model::anchors::{Anchors, Parameter};
+use crate::model::anchors::Anchors;
+use crate::model::arrays::ARRAYS;
 use crate::model::files;
+use crate::model::parameter::{Names, PROJECTIONS, WEIGHTS};
 use crate::render::view::Capacity;
 use crate::scene::{Camera, Prior, Scene};
 
@@ -80,18 +82,12 @@ pub struct Culprit {
 
 /// A step's arrays of float32 with the length that is in use.
 fn floats(step: &Step) -> Vec<(Buffer<f32>, usize)> {
-    let Step { anchors, weights, statistics, attend, .. } = step;
+    let Step { anchors, statistics, .. } = step;
     let n = anchors.count as usize;
     let mut all = vec![(anchors.position.view(), 3 * n)];
-    let mut push = |parameter: &Parameter, len: usize| {
-        all.extend(parameter.tensors().map(|tensor| (tensor.view(), len)));
-    };
-    for parameter in anchors.parameters() {
-        push(parameter, n * parameter.width as usize);
-    }
-    push(weights, Layout { offsets: anchors.offsets as usize }.weights());
-    if let Some(attend) = attend {
-        push(&attend.weights, ATTENTION);
+    let of_anchors = anchors.parameters().iter().map(|parameter| (parameter, n));
+    for (parameter, rows) in of_anchors.chain(step.networks().map(|parameter| (parameter, 1))) {
+        all.extend(parameter.tensors().map(|tensor| (tensor.view(), rows * parameter.width as usize)));
     }
     if let Some(statistics) = statistics {
         all.push((statistics.gradient.view(), n * anchors.offsets as usize));
@@ -153,16 +149,14 @@ impl Model {
 
     /// The model's files.
     pub fn files(&self) -> (files::Anchors, files::Weights) {
-        let anchors = files::Anchors {
-            position: self.float("position").as_chunks().0.to_vec(),
-            feature: self.float("feature").as_chunks().0.to_vec(),
-            offset: self.float("offset").to_vec(),
-            offsets_per_anchor: self.offsets as usize,
-            log_scaling: self.float("log_scaling").as_chunks().0.to_vec(),
-        };
-        let attention = [WAITING, "attention_weights"].map(|name| self.float(name)).concat();
+        let mut anchors = files::Anchors { offsets_per_anchor: self.offsets as usize, ..files::Anchors::default() };
+        anchors.position = self.float("position").as_chunks().0.to_vec();
+        for array in &ARRAYS {
+            (array.set)(&mut anchors, self.float(array.names.value).to_vec());
+        }
+        let attention = [WAITING, PROJECTIONS.value].map(|name| self.float(name)).concat();
         let attention = Some(attention.as_slice()).filter(|weights| !weights.is_empty());
-        (anchors, files::Weights::from_device(self.offsets as usize, self.float("weights"), attention))
+        (anchors, files::Weights::from_device(self.offsets as usize, self.float(WEIGHTS.value), attention))
     }
 
     /// The step that this was read from, stages included.
@@ -174,9 +168,9 @@ impl Model {
         let mut step = Step::new(gpu, plan, settings, &anchors, &weights, self.voxel)?;
         step.anchors = Anchors::upload(gpu, &anchors, self.capacity.anchors)?;
         step.resize(self.capacity)?;
-        if self.arrays.contains_key("attention_weights") {
+        if self.arrays.contains_key(PROJECTIONS.value) {
             let (config, seed) = (&settings.model.attention, settings.train.seed);
-            let initial = self.float("attention_weights");
+            let initial = self.float(PROJECTIONS.value);
             step.attend = Some(Attend::new(gpu, config, seed, step.anchors.capacity, initial)?);
             step.attention_weights = None;
         }
@@ -198,24 +192,23 @@ impl Model {
     /// What is wrong with the lengths, if anything is: [`Model::restore`] relies on them.
     fn check(&self) -> Result<(), String> {
         let (n, k) = (self.anchors as usize, self.offsets as usize);
-        let mut wanted = vec![("position".to_owned(), 3 * n)];
-        let moments = |name: &str, len: usize| ["", "_first", "_root"].map(|part| (format!("{name}{part}"), len));
-        for (name, len) in [("feature", 32 * n), ("offset", 3 * k * n), ("log_scaling", 6 * n)] {
-            wanted.extend(moments(name, len));
+        let mut wanted = vec![("position", 3 * n)];
+        let mut parameter = |names: Names, len: usize| wanted.extend(names.kept().map(|name| (name, len)));
+        for array in &ARRAYS {
+            parameter(array.names, n * (array.width)(self.offsets) as usize);
         }
-        wanted.extend(moments("weights", Layout { offsets: k }.weights()));
-        if self.arrays.contains_key("attention_weights") {
-            wanted.push(("attention_weights".to_owned(), ATTENTION));
-            wanted.extend(moments("attention", ATTENTION).into_iter().skip(1));
+        parameter(WEIGHTS, Layout { offsets: k }.weights());
+        if self.arrays.contains_key(PROJECTIONS.value) {
+            parameter(PROJECTIONS, ATTENTION);
         }
         if self.arrays.contains_key(WAITING) {
-            wanted.push((WAITING.to_owned(), ATTENTION));
+            wanted.push((WAITING, ATTENTION));
         }
         if self.arrays.contains_key("visits") {
-            wanted.extend([("accumulated_gradient".to_owned(), n * k), ("opacity_sum".to_owned(), n)]);
+            wanted.extend([("accumulated_gradient", n * k), ("opacity_sum", n)]);
         }
-        for (name, len) in &wanted {
-            if self.float(name).len() != *len {
+        for (name, len) in wanted {
+            if self.float(name).len() != len {
                 return Err(format!("its tensor `{name}` has {} values instead of {len}", self.float(name).len()));
             }
         }

@@ -3,6 +3,9 @@
 use super::photographs::reduced_size;
 use crate::config::Settings;
 use crate::losses;
+use crate::model::arrays::ARRAYS;
+use crate::model::parameter::DECODERS;
+use crate::optimizer::Group;
 use crate::render::rasterize::Outputs;
 use crate::scene::{Prior, Scene};
 use crate::stage;
@@ -48,23 +51,21 @@ impl DepthLosses {
     }
 }
 
-/// The parameters that are trained: only their gradients are computed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
-pub struct Trained {
-    /// Anchor features, or the attention's projections behind them.
-    pub feature: bool,
-    /// Offsets.
-    pub offset: bool,
-    /// Log-scales.
-    pub log_scaling: bool,
-    /// Any of the decoders.
-    pub decoders: bool,
-}
+/// The groups that need a gradient: only theirs are computed.
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
+pub struct Trained(Vec<Group>);
 
 impl Default for Trained {
-    /// Everything.
+    /// Every group.
     fn default() -> Self {
-        Self { feature: true, offset: true, log_scaling: true, decoders: true }
+        Self(Group::ALL.to_vec())
+    }
+}
+
+impl Trained {
+    /// Whether any of these groups is trained.
+    pub fn any(&self, groups: impl IntoIterator<Item = Group>) -> bool {
+        groups.into_iter().any(|group| self.0.contains(&group))
     }
 }
 
@@ -210,22 +211,18 @@ impl Plan {
             leave("sentinel", "train.sentinel_interval is 0");
         }
         let rates = &settings.optimizer.learning_rate;
-        let some = |rate: [f64; 2]| rate != [0.0; 2];
-        let trained = Trained {
-            feature: some(rates.feature) || attention,
-            offset: some(rates.offset),
-            log_scaling: some(rates.log_scaling),
-            decoders: some(rates.mlp_opacity) || some(rates.mlp_color) || some(rates.mlp_cov),
+        let trained = |group: &Group| match group {
+            // Gradients pass through the features to the attention's projections.
+            Group::Feature if attention => true,
+            Group::Attention => attention,
+            _ => rates.of(*group) != [0.0; 2],
         };
-        for (what, trained, rate) in [
-            ("gradient of features", trained.feature, "feature"),
-            ("gradient of offsets", trained.offset, "offset"),
-            ("gradient of log-scales", trained.log_scaling, "log_scaling"),
-            ("gradient of decoders", trained.decoders, "mlp_*"),
-        ] {
-            if !trained {
-                leave(what, &format!("optimizer.learning_rate.{rate} is zero"));
-            }
+        let trained = Trained(Group::ALL.into_iter().filter(trained).collect());
+        for array in ARRAYS.iter().filter(|array| !trained.any([array.group])) {
+            leave(array.gradient, &format!("optimizer.learning_rate.{} is zero", array.group.name()));
+        }
+        if !trained.any(DECODERS) {
+            leave("gradient of decoders", "optimizer.learning_rate.mlp_* is zero");
         }
         leave("gradient of anchor positions", "anchors do not move");
         leave("gradient of view directions and distances", "cameras do not move");

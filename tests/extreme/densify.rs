@@ -53,13 +53,13 @@ pub const CASES: &[Case] = &[
 
 fn model(position: Vec<[f32; 3]>) -> files::Anchors {
     let n = position.len();
-    files::Anchors {
+    files::Anchors::new(
+        OFFSETS as usize,
         position,
-        feature: (0..n).map(|a| std::array::from_fn(|c| (a * 32 + c) as f32 * 1e-3)).collect(),
-        offset: vec![0.0; n * 3 * OFFSETS as usize],
-        offsets_per_anchor: OFFSETS as usize,
-        log_scaling: vec![[VOXEL.ln(); 6]; n],
-    }
+        (0..n).map(|a| std::array::from_fn(|c| (a * 32 + c) as f32 * 1e-3)).collect(),
+        vec![0.0; n * 3 * OFFSETS as usize],
+        vec![[VOXEL.ln(); 6]; n],
+    )
 }
 
 struct Scene {

@@ -162,13 +162,8 @@ fn colmap(_: &Gpu) {
 
 fn model_files(_: &Gpu) {
     let folder = tempfile::tempdir().expect("a temporary folder");
-    let good = files::Anchors {
-        position: vec![[0.5, 1.0, 2.0]; 3],
-        feature: vec![[0.1; 32]; 3],
-        offset: vec![0.2; 3 * 2 * 3],
-        offsets_per_anchor: 2,
-        log_scaling: vec![[-1.0; 6]; 3],
-    };
+    let good =
+        files::Anchors::new(2, vec![[0.5, 1.0, 2.0]; 3], vec![[0.1; 32]; 3], vec![0.2; 3 * 2 * 3], vec![[-1.0; 6]; 3]);
     let weights = init::weights(1, 2, true, 0.0);
     let refused = |file: &str, what: &str| {
         let text = match files::load(folder.path()) {

@@ -131,7 +131,7 @@ fn alone() {
     for (half, end) in half.iter().zip(end) {
         assert!(end.is_finite() && end < 2.0 * half, "largest magnitudes {half}, {end}");
     }
-    for parameter in run.step().anchors.parameters().into_iter().chain([&run.step().weights]) {
+    for parameter in run.step().anchors.parameters().iter().chain([&run.step().weights]) {
         for tensor in parameter.tensors() {
             assert!(gpu.read(tensor).expect("read").iter().all(|v| v.is_finite()), "{}", tensor.name());
         }

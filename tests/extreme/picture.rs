@@ -94,15 +94,15 @@ fn model(seed: u64, anchors: usize, extent: f32) -> Model {
     }
     assert_eq!(from, weights.len());
     Model {
-        anchors: files::Anchors {
-            position: (0..anchors)
+        anchors: files::Anchors::new(
+            K,
+            (0..anchors)
                 .map(|_| std::array::from_fn(|_| (rng.random_range(-extent..extent) * 16.0).round() / 16.0))
                 .collect(),
-            feature: (0..anchors).map(|_| std::array::from_fn(|_| rng.random_range(-1.0..1.0))).collect(),
-            offset: (0..anchors * K * 3).map(|_| rng.random_range(-1.0..1.0)).collect(),
-            offsets_per_anchor: K,
-            log_scaling: (0..anchors).map(|_| std::array::from_fn(|_| rng.random_range(-3.5..-2.0))).collect(),
-        },
+            (0..anchors).map(|_| std::array::from_fn(|_| rng.random_range(-1.0..1.0))).collect(),
+            (0..anchors * K * 3).map(|_| rng.random_range(-1.0..1.0)).collect(),
+            (0..anchors).map(|_| std::array::from_fn(|_| rng.random_range(-3.5..-2.0))).collect(),
+        ),
         weights,
     }
 }
@@ -150,9 +150,9 @@ fn run_with(gpu: &Gpu, method: Method, model: &Model, camera: &Camera, near: f32
     let project_backward = ProjectBackward::new(gpu, &forward.project).expect(fine);
     let decode_backward = DecodeBackward::new(gpu, &forward.decode).expect(fine);
     let zeros = |name, len: usize| gpu.upload(name, &vec![0f32; len]).expect(fine);
-    let grad_feature = zeros("grad_feature", anchors.feature.value.len());
-    let grad_offset = zeros("grad_offset", anchors.offset.value.len());
-    let grad_scaling = zeros("grad_log_scaling", anchors.log_scaling.value.len());
+    let grad_feature = zeros("grad_feature", anchors.feature().value.len());
+    let grad_offset = zeros("grad_offset", anchors.offset().value.len());
+    let grad_scaling = zeros("grad_log_scaling", anchors.log_scaling().value.len());
     let grad_weights = zeros("grad_weights", weights.len());
     let mut rng = Pcg64Mcg::seed_from_u64(77);
     let mut random = || (0..pixels).map(|_| rng.random_range(-1f32..1.0)).collect::<Vec<f32>>();
@@ -163,12 +163,12 @@ fn run_with(gpu: &Gpu, method: Method, model: &Model, camera: &Camera, near: f32
 
     let mut rec = gpu.recorder().expect(fine);
     forward.visible.record(&mut rec, &anchors, camera, near, &limits);
-    let offset = anchors.offset.value.view();
+    let offset = anchors.offset().value.view();
     let of = decode::Anchors {
         position: &anchors.position,
-        feature: &anchors.feature.value,
+        feature: &anchors.feature().value,
         offset: &offset,
-        log_scaling: &anchors.log_scaling.value,
+        log_scaling: &anchors.log_scaling().value,
         weights: &weights,
         visible: &forward.visible.list,
     };

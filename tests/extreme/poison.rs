@@ -164,13 +164,13 @@ fn moments(gpu: &Gpu) {
     let setup = Setup::new();
     let tensors = |run: &Run<'_>| -> Vec<[Buffer<f32>; 3]> {
         let step = run.step();
-        let parameters = step.anchors.parameters().into_iter().chain([&step.weights]);
+        let parameters = step.anchors.parameters().iter().chain([&step.weights]);
         parameters.map(|p| p.tensors().map(Buffer::view)).collect()
     };
     // Room for anchors to come holds whatever it holds.
     let read = |run: &Run<'_>| -> Vec<Vec<u32>> {
         let step = run.step();
-        let of_anchors = step.anchors.parameters().into_iter().map(|p| (step.anchors.count * p.width) as usize);
+        let of_anchors = step.anchors.parameters().iter().map(|p| (step.anchors.count * p.width) as usize);
         let lengths = of_anchors.chain([step.weights.value.len()]);
         let words = |(tensors, n): ([Buffer<f32>; 3], usize)| {
             tensors.map(|buffer| bits(&gpu.read_range(&buffer, n).expect("read")))
@@ -231,11 +231,11 @@ fn whole_run(gpu: &Gpu) {
             match what {
                 0 => spread(&step.anchors.position.view(), 3, n, 7),
                 w @ 1..=3 => {
-                    let p = step.anchors.parameters()[w - 1];
+                    let p = &step.anchors.parameters()[w - 1];
                     spread(&p.value, p.width as usize, n, 7);
                 }
                 w @ 4..=5 => {
-                    let p = &step.anchors.feature;
+                    let p = step.anchors.feature();
                     spread(p.tensors()[w - 3], p.width as usize, n, 7);
                 }
                 w => spread(step.weights.tensors()[w - 6], 1, step.weights.width as usize, 97),

@@ -15,6 +15,7 @@ use crate::gpu::kernels::densify::{
 };
 use crate::gpu::{Buffer, Error, Gpu};
 use crate::model::anchors::Anchors;
+use crate::model::arrays::ARRAYS;
 use crate::primitives::{Compact, Count, Pairs, Sort};
 pub use twins::CELL_LIMIT;
 
@@ -87,8 +88,8 @@ fn cells(
     let offsets = anchors.offsets;
     let slots = judged * offsets;
     let position = &anchors.position;
-    let offset = anchors.offset.value.view::<[f32; 3]>();
-    let log_scaling = &anchors.log_scaling.value;
+    let offset = anchors.offset().value.view::<[f32; 3]>();
+    let log_scaling = &anchors.log_scaling().value;
 
     let flags = gpu.buffer("candidate_flags", slots as usize)?;
     let listed = gpu.buffer("candidates", slots as usize)?;
@@ -274,15 +275,17 @@ pub fn run(
             order: &cells.order,
             candidates: &cells.candidates,
             position: &anchors.position,
-            feature: &anchors.feature.value,
-            log_scaling: &anchors.log_scaling.value,
+            feature: &anchors.feature().value,
+            log_scaling: &anchors.log_scaling().value,
         };
         let Cells { low, bits, found, .. } = cells;
         let push = grow_append::Push { low, bits, found, offsets, anchors: first, added, size, log_size };
         rec.run(grow_append::Kernel, buffers, push, added as usize * 32);
-        rec.zero_range(&anchors.offset.value, (first * 3 * offsets) as usize, (added * 3 * offsets) as usize);
-        for parameter in anchors.parameters() {
+        for (array, parameter) in ARRAYS.iter().zip(anchors.parameters()) {
             let [at, len] = [first, added].map(|n| (n * parameter.width) as usize);
+            if let Some(initial) = array.initial {
+                rec.fill_range(&parameter.value, at, len, initial.to_bits());
+            }
             rec.zero_range(&parameter.first, at, len);
             rec.zero_range(&parameter.root, at, len);
         }

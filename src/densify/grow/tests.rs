@@ -66,7 +66,7 @@ fn scene(rng: &mut Pcg64Mcg, n: usize, offsets: usize, extent: i32, voxel: f32) 
         model.feature.push(std::array::from_fn(|_| rng.random_range(-2.0..2.0)));
         model.log_scaling.push(log_scaling);
     }
-    model
+    model.completed()
 }
 
 fn candidates_case(n: usize, offsets: usize) -> grow_candidates::Arrays {
@@ -311,6 +311,7 @@ fn grow_plainly(model: &mut files::Anchors, gathered: &mut Gathered, config: &Co
             gathered.visits.push(0);
         }
     }
+    *model = std::mem::take(model).completed();
     for s in 0..judged * offsets {
         if gathered.seen[s] > config.min_slot_visits {
             (gathered.gradient[s], gathered.seen[s]) = (0.0, 0);
@@ -379,13 +380,13 @@ fn cells_far_apart_need_three_words() {
     let mut integers =
         |n: usize, limit: i32| -> Vec<f32> { (0..n).map(|_| rng.random_range(-limit..limit) as f32).collect() };
     // Integers that float32 holds exactly, scales of 1: 22 bits for each coordinate.
-    let model = files::Anchors {
-        position: integers(3 * 200, 100).as_chunks().0.to_vec(),
-        feature: integers(32 * 200, 100).as_chunks().0.to_vec(),
-        offset: integers(3 * 2000, 2_000_000 - 200),
-        offsets_per_anchor: 10,
-        log_scaling: vec![[0.0; 6]; 200],
-    };
+    let model = files::Anchors::new(
+        10,
+        integers(3 * 200, 100).as_chunks().0.to_vec(),
+        integers(32 * 200, 100).as_chunks().0.to_vec(),
+        integers(3 * 2000, 2_000_000 - 200),
+        vec![[0.0; 6]; 200],
+    );
     let mut gathered = Gathered::random(&mut rng, 200, 10);
     let round = Round { voxel: 1.0, seed: 8, step: 1600 };
     let config = Config { levels: 1, coarsest_cell: 1.0, ..Config::default() };

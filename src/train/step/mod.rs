@@ -14,9 +14,10 @@ use crate::densify::{Drawn, Statistics};
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::losses::{self, DepthView, Losses};
 use crate::math::decoder::Layout;
-use crate::model::anchors::{Anchors, Parameter};
+use crate::model::anchors::Anchors;
 use crate::model::files;
-use crate::optimizer::adam;
+use crate::model::parameter::{DECODERS, Parameter, Part, WEIGHTS};
+use crate::optimizer::{Group, adam};
 use crate::primitives::limit::Limits;
 use crate::render::decode::{self, DecodeBackward, GaussianGradients, WantedGradients};
 use crate::render::project::{ProjectBackward, SplatGradients};
@@ -28,27 +29,7 @@ use crate::stage;
 
 use super::attend::Attend;
 use super::photographs::Photograph;
-use super::plan::{Plan, Trained};
-
-/// Where the gradients of what is trained go, zeroed at the beginning of every step.
-struct Gradients {
-    feature: Option<Buffer<f32>>,
-    offset: Option<Buffer<f32>>,
-    log_scaling: Option<Buffer<f32>>,
-    weights: Option<Buffer<f32>>,
-}
-
-impl Gradients {
-    fn new(gpu: &Gpu, trained: Trained, anchors: &Anchors, weights: &Parameter) -> Result<Self, Error> {
-        let of = |name, parameter: &Parameter| gpu.buffer(name, parameter.value.len());
-        Ok(Self {
-            feature: trained.feature.then(|| of("grad_feature", &anchors.feature)).transpose()?,
-            offset: trained.offset.then(|| of("grad_offset", &anchors.offset)).transpose()?,
-            log_scaling: trained.log_scaling.then(|| of("grad_log_scaling", &anchors.log_scaling)).transpose()?,
-            weights: trained.decoders.then(|| of("grad_weights", weights)).transpose()?,
-        })
-    }
-}
+use super::plan::Plan;
 
 /// The stages between the anchors and the picture, both ways.
 struct Stages {
@@ -56,19 +37,11 @@ struct Stages {
     rasterize: Backward,
     project: ProjectBackward,
     decode: DecodeBackward,
-    gradients: Gradients,
 }
 
 impl Stages {
-    fn new(
-        gpu: &Gpu,
-        plan: &Plan,
-        capacity: Capacity,
-        anchors: &Anchors,
-        weights: &Parameter,
-        config: &Config,
-    ) -> Result<Self, Error> {
-        let (offsets, trained) = (anchors.offsets, plan.trained);
+    fn new(gpu: &Gpu, plan: &Plan, capacity: Capacity, offsets: u32, config: &Config) -> Result<Self, Error> {
+        let [feature, decoders] = [&[Group::Feature][..], &DECODERS].map(|groups| plan.trained.any(groups.to_vec()));
         let method = Method::new(gpu, config)?;
         let forward = Forward::new(gpu, capacity, offsets, method, plan.largest(), config.cull)?;
         let slots = (capacity.visible * offsets) as usize;
@@ -77,10 +50,8 @@ impl Stages {
             rasterize: gpu
                 .stage(stage::RASTERIZE_BACKWARD, || Backward::new(gpu, method, slots, pairs, plan.outputs()))?,
             project: gpu.stage(stage::PROJECT_BACKWARD, || ProjectBackward::new(gpu, &forward.project))?,
-            decode: gpu.stage(stage::DECODE_BACKWARD, || {
-                DecodeBackward::of(gpu, &forward.decode, trained.feature, trained.decoders)
-            })?,
-            gradients: gpu.stage(stage::DECODE_BACKWARD, || Gradients::new(gpu, trained, anchors, weights))?,
+            decode: gpu
+                .stage(stage::DECODE_BACKWARD, || DecodeBackward::of(gpu, &forward.decode, feature, decoders))?,
             forward,
         })
     }
@@ -133,9 +104,6 @@ pub struct Step {
     background: [f32; 3],
 }
 
-/// Names of the decoders' arrays on the device.
-const WEIGHTS: [&str; 3] = ["weights", "weights_first", "weights_root"];
-
 impl Step {
     /// Uploads the model and makes the stages that the plan has. `voxel` is the side of the anchors' grid, scene units.
     ///
@@ -152,22 +120,19 @@ impl Step {
         let anchors = gpu.stage(stage::MODEL, || Anchors::upload(gpu, anchors, 0))?;
         let initial = weights;
         let flat = initial.decoders();
-        let weights = gpu.stage(stage::MODEL, || Parameter::new(gpu, WEIGHTS, flat.len() as u32, 1))?;
-        gpu.write(&weights.value, &flat)?;
-        let mut rec = gpu.recorder()?;
-        rec.zero(&weights.first);
-        rec.zero(&weights.root);
-        rec.submit()?.wait()?;
+        let weights = gpu.stage(stage::MODEL, || Parameter::upload(gpu, WEIGHTS, flat.len() as u32, 1, &flat))?;
+        let layout = Layout { offsets: anchors.offsets as usize };
+        let parts = DECODERS.iter().enumerate();
+        let weights = weights.in_parts(parts.map(|(head, &group)| Part { group, first: layout.head(head) as u32 }));
         let capacity = Capacity::guess(anchors.capacity);
-        let stages = Stages::new(gpu, &plan, capacity, &anchors, &weights, &settings.render)?;
         let canvases = Canvas::all(gpu, &plan, settings)?;
-        Ok(Self {
+        let mut step = Self {
             limits: Limits::new(gpu)?,
             gpu: gpu.clone(),
             anchors,
             weights,
             capacity,
-            stages: Some(stages),
+            stages: None,
             canvases,
             statistics: None,
             voxel,
@@ -183,7 +148,9 @@ impl Step {
             background: settings.train.background.map(|c| c as f32),
             config: settings.clone(),
             plan,
-        })
+        };
+        step.furnish()?;
+        Ok(step)
     }
 
     /// Makes the stages anew for this capacity. Nothing of the step may be in flight.
@@ -200,6 +167,9 @@ impl Step {
     /// Gives back all memory that holds nothing from one step to the next.
     fn release(&mut self) {
         self.stages = None;
+        for parameter in self.anchors.parameters_mut().iter_mut().chain([&mut self.weights]) {
+            parameter.gradient = None;
+        }
         if let Some(attend) = &mut self.attend {
             attend.release();
         }
@@ -209,7 +179,12 @@ impl Step {
     fn furnish(&mut self) -> Result<(), Error> {
         let Self { gpu, plan, anchors, weights, config, .. } = self;
         self.capacity.anchors = anchors.capacity;
-        self.stages = Some(Stages::new(gpu, plan, self.capacity, anchors, weights, &config.render)?);
+        self.stages = Some(Stages::new(gpu, plan, self.capacity, anchors.offsets, &config.render)?);
+        for parameter in anchors.parameters_mut().iter_mut().chain([weights]) {
+            if plan.trained.any(parameter.groups()) {
+                gpu.stage(stage::DECODE_BACKWARD, || parameter.make_gradient(gpu))?;
+            }
+        }
         if let Some(attend) = &mut self.attend {
             gpu.stage(stage::ATTENTION, || attend.furnish(gpu, anchors.capacity))?;
         }
@@ -294,14 +269,14 @@ impl Step {
         compare: impl FnOnce(&mut Recorder<'_>, &'s Canvas) -> losses::Gradients<'s>,
     ) {
         let Self { anchors, limits, near, .. } = self;
-        let Stages { forward, rasterize: backward, project: project_backward, decode: decode_backward, gradients } =
-            self.stages();
+        let Stages { forward, rasterize: backward, project: project_backward, decode: decode_backward } = self.stages();
         let canvas = self.canvas(camera.size);
         // Depth is drawn for views alone whose depth is compared.
         let color_alone = canvas.picture.color();
         let picture = if depth { &canvas.picture } else { &color_alone };
         rec.stage(stage::DECODE_BACKWARD);
-        for gradient in [&gradients.feature, &gradients.offset, &gradients.log_scaling].into_iter().flatten() {
+        // Rows of anchors that are not drawn are not written.
+        for gradient in anchors.parameters().iter().filter_map(|parameter| parameter.gradient.as_ref()) {
             rec.zero(gradient);
         }
         rec.stage(stage::CULL);
@@ -311,14 +286,14 @@ impl Step {
         rec.stage(stage::ATTENTION);
         let (feature, attended) = match attend.zip(photograph) {
             Some((attend, photograph)) => attend.forward(rec, anchors, &forward.visible, photograph, *near, step),
-            None => (&anchors.feature.value, None),
+            None => (&anchors.feature().value, None),
         };
-        let offset = anchors.offset.value.view();
+        let offset = anchors.offset().value.view();
         let model = decode::Anchors {
             position: &anchors.position,
             feature,
             offset: &offset,
-            log_scaling: &anchors.log_scaling.value,
+            log_scaling: &anchors.log_scaling().value,
             weights: &self.weights.value,
             visible: &forward.visible.list,
         };
@@ -352,17 +327,16 @@ impl Step {
             scale: &project_backward.grad_scale,
             rotation: &project_backward.grad_rotation,
         };
-        let grad_offset = gradients.offset.as_ref().map(Buffer::view);
+        let grad_offset = anchors.offset().gradient.as_ref().map(Buffer::view);
         let to = WantedGradients {
-            feature: gradients.feature.as_ref(),
+            feature: anchors.feature().gradient.as_ref(),
             offset: grad_offset.as_ref(),
-            log_scaling: gradients.log_scaling.as_ref(),
-            weights: gradients.weights.as_ref(),
+            log_scaling: anchors.log_scaling().gradient.as_ref(),
+            weights: self.weights.gradient.as_ref(),
         };
         rec.stage(stage::DECODE_BACKWARD);
         decode_backward.record(rec, &forward.decode, model, gaussians, to);
-        let network = Layout { offsets: anchors.offsets as usize }.weights() as u32;
-        self.sentinel(rec, gradients.weights.as_ref(), network);
+        self.sentinel(rec, to.weights, self.weights.width);
         rec.stage(stage::ATTENTION);
         if let Some(((attend, attended), grad_feature)) = self.attend.as_ref().zip(attended).zip(to.feature) {
             attend.backward(rec, attended, grad_feature);
@@ -410,7 +384,11 @@ impl Step {
 
     /// Everything that is learnt, with its moments; the attention's projections from its first step on.
     pub fn parameters(&self) -> Vec<&Parameter> {
-        let attention = self.attend.as_ref().map(|attend| &attend.weights);
-        self.anchors.parameters().into_iter().chain([&self.weights]).chain(attention).collect()
+        self.anchors.parameters().iter().chain(self.networks()).collect()
+    }
+
+    /// The networks' parameters: a row each, every gradient written in every step.
+    pub(super) fn networks(&self) -> impl Iterator<Item = &Parameter> {
+        [&self.weights].into_iter().chain(self.attend.as_ref().map(|attend| &attend.weights))
     }
 }

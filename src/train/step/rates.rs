@@ -1,37 +1,41 @@
 //! Learning rates of a step.
 
 use crate::config::Settings;
+use crate::model::parameter::Parameter;
 use crate::optimizer::schedule::Rate;
+use crate::optimizer::{Group, adam};
 
-/// Learning rates of one step.
+/// Learning rates of one step, by group.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Rates {
-    /// Anchor features.
-    pub feature: f64,
-    /// Offsets, the scene's radius included.
-    pub offset: f64,
-    /// Log-scales.
-    pub log_scaling: f64,
-    /// Opacity, colour and covariance decoder.
-    pub decoders: [f64; 3],
-    /// Attention's projections.
-    pub attention: f64,
-}
+pub struct Rates([f64; Group::ALL.len()]);
 
 impl Rates {
     /// The rates of `step` (counted from 1) for a scene of this radius.
     pub fn at(settings: &Settings, radius: f64, step: u32) -> Self {
         let config = &settings.optimizer;
         let length = if config.schedule_length == 0 { settings.train.iterations } else { config.schedule_length };
-        let at = |[initial, last]: [f64; 2]| Rate { initial, last }.at(step, length);
-        let rates = &config.learning_rate;
-        Self {
-            feature: at(rates.feature),
-            offset: at(rates.offset.map(|r| r * radius)),
-            log_scaling: at(rates.log_scaling),
-            decoders: [at(rates.mlp_opacity), at(rates.mlp_color), at(rates.mlp_cov)],
-            attention: at(rates.attention),
-        }
+        Self(Group::ALL.map(|group| {
+            let factor = if group.goes_with_radius() { radius } else { 1.0 };
+            let [initial, last] = config.learning_rate.of(group).map(|rate| rate * factor);
+            Rate { initial, last }.at(step, length)
+        }))
+    }
+
+    /// The rate of a group.
+    pub fn of(&self, group: Group) -> f64 {
+        self.0[group as usize]
+    }
+
+    /// The rates of a parameter's parts; `None` where all are zero.
+    ///
+    /// # Panics
+    /// When the parameter has no group.
+    pub(super) fn of_parts(&self, parameter: &Parameter) -> Option<adam::Rates> {
+        let parts = &parameter.parts;
+        let part = |i: usize| parts.get(i).or(parts.last()).expect("what a step trains belongs to a group");
+        let rate = std::array::from_fn(|i| self.of(part(i).group));
+        let parts = std::array::from_fn(|i| parts.get(i + 1).map_or(u32::MAX, |part| part.first));
+        (rate != [0.0; 3]).then_some(adam::Rates { rate, parts })
     }
 }
 
@@ -44,15 +48,14 @@ mod tests {
     fn rates_of_all_groups() {
         let settings = Settings::default();
         let mut table = String::from("step");
-        for name in ["feature", "offset", "log_scaling", "mlp_opacity", "mlp_color", "mlp_cov", "attention"] {
-            table += &format!(" {name:>16}");
+        for group in Group::ALL {
+            table += &format!(" {:>16}", group.name());
         }
         for step in [0, 1, 1500, 15_000, 30_000, 40_000] {
-            let Rates { feature, offset, log_scaling, decoders: [opacity, color, cov], attention } =
-                Rates::at(&settings, 2.5, step);
+            let rates = Rates::at(&settings, 2.5, step);
             table += &format!("\n{step}");
-            for rate in [feature, offset, log_scaling, opacity, color, cov, attention] {
-                table += &format!(" {rate:>16.10e}");
+            for group in Group::ALL {
+                table += &format!(" {:>16.10e}", rates.of(group));
             }
         }
         insta::assert_snapshot!(table);

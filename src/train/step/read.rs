@@ -2,8 +2,8 @@
 
 use super::Step;
 use crate::gpu::Error;
-use crate::math::decoder::Layout;
 use crate::model::files;
+use crate::model::parameter::Parameter;
 use crate::render::rasterize::Picture;
 use crate::render::view::{Capacity, Model, Painter, Rendered};
 use crate::scene::Camera;
@@ -54,25 +54,16 @@ impl Step {
     /// Whatever the copies meet.
     pub fn gradients(&self) -> Result<std::collections::BTreeMap<String, Vec<f32>>, Error> {
         let mut all = std::collections::BTreeMap::new();
-        let n = self.anchors.count as usize;
-        let gradients = &self.stages().gradients;
-        for (name, buffer, width) in [
-            ("feature", gradients.feature.as_ref(), 32),
-            ("offset", gradients.offset.as_ref(), 3 * self.anchors.offsets as usize),
-            ("log_scaling", gradients.log_scaling.as_ref(), 6),
-        ] {
-            if let Some(buffer) = buffer {
-                all.insert(name.to_owned(), self.gpu.read_range(buffer, n * width)?);
-            }
+        let read = |parameter: &Parameter, rows: u32| {
+            let len = (rows * parameter.width) as usize;
+            parameter.gradient.as_ref().map(|gradient| self.gpu.read_range(gradient, len)).transpose()
+        };
+        for parameter in self.anchors.parameters() {
+            let gradient = read(parameter, self.anchors.count)?;
+            all.extend(gradient.map(|gradient| (parameter.names.value.to_owned(), gradient)));
         }
-        let layout = Layout { offsets: self.anchors.offsets as usize };
-        let Some(weights) = &gradients.weights else { return Ok(all) };
-        let flat = self.gpu.read_range(weights, layout.weights())?;
-        let attention = self
-            .attend
-            .as_ref()
-            .map(|attend| self.gpu.read_range(&attend.grad_weights, crate::math::attention::WEIGHTS));
-        let attention = attention.transpose()?;
+        let Some(flat) = read(&self.weights, 1)? else { return Ok(all) };
+        let attention = self.attend.as_ref().map_or(Ok(None), |attend| read(&attend.weights, 1))?;
         let weights = files::Weights::from_device(self.anchors.offsets as usize, &flat, attention.as_deref());
         all.extend(weights.tensors.into_iter().map(|(name, tensor)| (name, tensor.data)));
         Ok(all)
@@ -88,13 +79,12 @@ impl Step {
     /// # Errors
     /// Whatever the copies meet.
     pub fn model(&self) -> Result<(files::Anchors, files::Weights), Error> {
-        let layout = Layout { offsets: self.anchors.offsets as usize };
-        let flat = self.gpu.read_range(&self.weights.value, layout.weights())?;
+        let flat = self.weights.read(&self.gpu, 1)?;
         let attention = match (&self.attend, &self.attention_weights) {
-            (Some(attend), _) => Some(self.gpu.read_range(&attend.weights.value, crate::math::attention::WEIGHTS)?),
+            (Some(attend), _) => Some(attend.weights.read(&self.gpu, 1)?),
             (None, initial) => initial.clone(),
         };
-        let weights = files::Weights::from_device(layout.offsets, &flat, attention.as_deref());
+        let weights = files::Weights::from_device(self.anchors.offsets as usize, &flat, attention.as_deref());
         Ok((self.anchors.read(&self.gpu)?, weights))
     }
 }
