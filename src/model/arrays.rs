@@ -23,8 +23,6 @@ pub struct Anchors {
     pub offset: Vec<f32>,
     /// \[anchor\] log-scales: three for the offsets, three for the Gaussians.
     pub log_scaling: Vec<[f32; 6]>,
-    /// \[anchor\] two strengths, which nothing draws: half their squares are a loss of their own.
-    pub strength: Vec<[f32; 2]>,
 }
 
 /// A learnt array with a row for each anchor.
@@ -51,7 +49,7 @@ pub struct Array {
 }
 
 /// Every learnt array of the anchors. The first three are those of Scaffold-GS.
-pub static ARRAYS: [Array; 4] = [
+pub static ARRAYS: [Array; 3] = [
     Array {
         names: names!("feature"),
         gradient: "gradient of features",
@@ -86,17 +84,6 @@ pub static ARRAYS: [Array; 4] = [
         stem: "scale",
         element: |_, column| column,
     },
-    Array {
-        names: names!("strength"),
-        gradient: "gradient of strengths",
-        group: Group::Strength,
-        width: |_| 2,
-        get: |anchors| anchors.strength.as_flattened(),
-        set: |anchors, values| anchors.strength = values.as_chunks().0.to_vec(),
-        initial: Some(0.5),
-        stem: "strength",
-        element: |_, column| column,
-    },
 ];
 
 impl Anchors {
@@ -108,8 +95,7 @@ impl Anchors {
         offset: Vec<f32>,
         log_scaling: Vec<[f32; 6]>,
     ) -> Self {
-        let strength = vec![];
-        Self { position, offsets_per_anchor, feature, offset, log_scaling, strength }.completed()
+        Self { position, offsets_per_anchor, feature, offset, log_scaling }.completed()
     }
 
     /// The same, where arrays that have an initial value and are shorter than the positions go on with it.

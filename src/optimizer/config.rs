@@ -71,8 +71,6 @@ groups! {
     Feature: feature = [0.0075, 0.0075];
     /// The six log-scales of an anchor.
     LogScaling: log_scaling = [0.007, 0.007];
-    /// The two strengths of an anchor.
-    Strength: strength = [0.01, 0.01];
     /// Opacity decoder.
     MlpOpacity: mlp_opacity = [0.002, 0.00002];
     /// Covariance decoder.

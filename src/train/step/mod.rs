@@ -279,11 +279,6 @@ impl Step {
         for gradient in anchors.parameters().iter().filter_map(|parameter| parameter.gradient.as_ref()) {
             rec.zero(gradient);
         }
-        // The gradient of half a square is the value.
-        let strength = anchors.of(Group::Strength);
-        if let Some(gradient) = &strength.gradient {
-            rec.copy(&strength.value, gradient, (anchors.count * strength.width) as usize);
-        }
         rec.stage(stage::CULL);
         forward.visible.record(rec, anchors, camera, *near, limits);
         // A step may be recorded again after later ones: the stage is there then, but its time has not come.
