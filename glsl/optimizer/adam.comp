@@ -22,7 +22,6 @@ layout(push_constant, scalar) uniform Push {
   float root_complement;   // sqrt(1 - beta2)
   float correction;        // 1 / (1 - beta1^t)
   float root_correction;   // sqrt(1 / (1 - beta2^t))
-  uint lazy;               // not 0: an element without gradient stays as it is, moments and all
 } push;
 const uint VECTORS = 4u; // per thread, a group apart so that neighbours stay neighbours
 void main() {
@@ -55,12 +54,6 @@ void main() {
       rate = mix(rate, vec4(rates.z), greaterThanEqual(element, uvec4(parts.y)));
     }
     vec4 v = old_value - rate * ((correction * m) / (root_correction * r + epsilon));
-    if (push.lazy != 0u) {
-      bvec4 still = equal(g, vec4(0.0));
-      v = mix(v, old_value, still);
-      m = mix(m, old_first, still);
-      r = mix(r, old_root, still);
-    }
     if (4u * i < offset || 4u * i + 4u > end) { // the ends of a range that starts or stops within a vector
       uvec4 element = 4u * i + uvec4(0, 1, 2, 3);
       bvec4 inside = bvec4(uvec4(greaterThanEqual(element, uvec4(offset))) & uvec4(lessThan(element, uvec4(end))));

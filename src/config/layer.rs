@@ -5,6 +5,7 @@ use serde::Deserialize;
 use toml::de::{DeTable, DeValue};
 use toml::{Spanned, Table, Value};
 
+use super::removed::without_removed;
 use super::{Error, Invalid, Origin, PRESETS, Settings, Source};
 
 /// The layers laid over each other so far, and who set each key.
@@ -47,7 +48,7 @@ impl Layers {
             Source::File(path) => {
                 let text =
                     std::fs::read_to_string(path).map_err(|source| Error::Read { path: path.clone(), source })?;
-                self.push_text(&text, &Place::File(path.clone()))
+                self.push_text(&without_removed(&text), &Place::File(path.clone()))
             }
             Source::Set(text) => self.push_text(&set_as_toml(text)?, &Place::Set(text.clone())),
             Source::Flag { flag, key, value } => self.push_text(&format!("{key} = {value}"), &Place::Flag(flag)),

@@ -8,6 +8,7 @@
 mod arguments;
 mod error;
 mod layer;
+mod removed;
 
 use std::path::PathBuf;
 
@@ -18,6 +19,7 @@ use crate::optimizer::Group;
 pub use arguments::SettingsArgs;
 pub use error::{Error, Invalid, Origin};
 use layer::Layers;
+pub use removed::without_removed;
 
 /// The presets shipped with the program: name and TOML text (`configs/NAME.toml`).
 pub const PRESETS: [(&str, &str); 4] = [

@@ -19,13 +19,11 @@ pub struct Config {
     pub beta2: f64,
     /// Added to the root of the second moment.
     pub epsilon: f64,
-    /// Leave an element alone in steps in which it has no gradient: its moments are of the steps that see it.
-    pub lazy: bool,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        Self { beta1: 0.9, beta2: 0.999, epsilon: 1e-15, lazy: false }
+        Self { beta1: 0.9, beta2: 0.999, epsilon: 1e-15 }
     }
 }
 
@@ -46,7 +44,6 @@ impl Config {
             root_complement: (1.0 - self.beta2).sqrt() as f32,
             correction: (1.0 / power(self.beta1)) as f32,
             root_correction: (1.0 / power(self.beta2)).sqrt() as f32,
-            lazy: self.lazy.into(),
         }
     }
 }
@@ -94,9 +91,6 @@ impl Reference for adam::Kernel {
         let [value, first, root] = [host.value, host.first, host.root].map(|v| v.as_flattened_mut());
         for i in push.offset as usize..(push.offset + push.n) as usize {
             let gradient = host.gradient.as_flattened()[i];
-            if push.lazy != 0 && gradient == 0.0 {
-                continue;
-            }
             let old = math::adam::State { value: value[i].into(), first: first[i].into(), root: root[i].into() };
             let part = push.parts.iter().filter(|&&first| i >= first as usize).count();
             let new = math::adam::step(old, gradient.into(), &factors(push.rate[part]));

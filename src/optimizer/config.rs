@@ -10,9 +10,6 @@ pub struct Config {
     pub betas: [f64; 2],
     /// Added to the root of the second moment.
     pub epsilon: f64,
-    /// Leave what an anchor has learnt alone in steps that have no gradient for it, with its moments. In GScream (false) the
-    /// moments decay between the visits of the few views that see it.
-    pub lazy: bool,
     /// Steps from a group's initial to its final learning rate; 0 means `train.iterations`.
     pub schedule_length: u32,
     /// Learning rates by group.
@@ -90,13 +87,7 @@ impl Group {
 
 impl Default for Config {
     fn default() -> Self {
-        Self {
-            betas: [0.9, 0.999],
-            epsilon: 1e-15,
-            lazy: false,
-            schedule_length: 0,
-            learning_rate: LearningRates::default(),
-        }
+        Self { betas: [0.9, 0.999], epsilon: 1e-15, schedule_length: 0, learning_rate: LearningRates::default() }
     }
 }
 

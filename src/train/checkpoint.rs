@@ -25,7 +25,7 @@ use super::attend::Attend;
 use super::plan::Plan;
 use super::run::Progress;
 use super::step::Step;
-use crate::config::Settings;
+use crate::config::{Settings, without_removed};
 use crate::densify::Statistics;
 use crate::gpu::{self, Buffer, Gpu};
 use crate::losses::Term;
@@ -585,9 +585,7 @@ pub fn read(path: &Path, owner: &Owner) -> Result<State, Refusal> {
     if let Some(difference) = scene.difference(&owner.scene) {
         return Err(refuse(format!("is of another scene: {difference}")));
     }
-    if entry("settings") != owner.settings {
-        let difference = setting_difference(entry("settings"), &owner.settings);
-        let difference = difference.unwrap_or_else(|| "their text differs".to_owned());
+    if let Some(difference) = setting_difference(&without_removed(entry("settings")), &owner.settings) {
         return Err(refuse(format!("is of a run with other settings: {difference}")));
     }
     if entry("version") != env!("CARGO_PKG_VERSION") {

@@ -142,7 +142,6 @@ impl Step {
                 beta1: settings.optimizer.betas[0],
                 beta2: settings.optimizer.betas[1],
                 epsilon: settings.optimizer.epsilon,
-                lazy: false,
             },
             near: settings.render.near as f32,
             background: settings.train.background.map(|c| c as f32),
