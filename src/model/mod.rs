@@ -3,8 +3,6 @@
 pub mod anchors;
 pub mod arrays;
 pub mod attention;
-pub mod attention_blend;
-pub mod attention_select;
 pub mod config;
 pub mod files;
 pub mod init;

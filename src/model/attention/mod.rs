@@ -6,6 +6,8 @@
 //! forms the shares again from them. As the two directions differ only in who asks, they run the same kernels with the
 //! bindings swapped, and the backward pass treats both at once for the tokens it owns.
 
+pub mod blend;
+pub mod select;
 #[cfg(test)]
 mod tests;
 mod twins;

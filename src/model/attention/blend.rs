@@ -8,8 +8,8 @@ use crate::gpu::kernels::model::{attention_blend_gather, attention_blend_scatter
 use crate::gpu::{Buffer, Error, Gpu, Recorder, Reference};
 use crate::math::attention::FEATURE;
 
-use super::attention::{Attention, Pair};
-use super::attention_select::Chosen;
+use super::select::Chosen;
+use super::{Attention, Pair};
 
 /// Vectors of a row.
 const ROW: usize = FEATURE / 4;
