@@ -3,8 +3,11 @@
 //! GLSL declares a kernel's interface, once: binding numbers, element types, access, push constants, specialisation
 //! constants and the group size are read from the module by reflection; comments behind a declaration become its docs.
 //!
-//! A line `// variant NAME: DEFINE ...` compiles the file once more as `STEM_NAME` with these macros defined, for an
-//! interface that differs (a specialisation constant does not remove a binding, an `#ifdef` does).
+//! A line `// variant NAME: DEFINE ...` compiles the file once more as `STEM_NAME` with these macros defined (a
+//! specialisation constant does not remove a binding, an `#ifdef` does). `ROOM/cpu/STEM.comp` is the form for CPU drivers of
+//! `ROOM/STEM.comp`. All of them are one module with one twin. A binding that not every variant has is an `Option`: those
+//! that are given say which variant runs. Where that leaves several, `Kernel` is an enum that says the rest: `Gpu` or `Cpu`
+//! for the form, and the macro that tells a variant from the first one with the same bindings (`Plain`).
 
 use std::collections::{BTreeMap, HashMap};
 use std::fmt::Write as _;
@@ -19,21 +22,27 @@ fn main() -> Result<()> {
     println!("cargo:rerun-if-changed=glsl");
     println!("cargo:rerun-if-changed=build.rs");
     let out = PathBuf::from(env::var("OUT_DIR")?);
-    let mut tree = Tree::default();
-    let mut interfaces = vec![];
     let mut files: Vec<PathBuf> = walkdir::WalkDir::new("glsl")
         .into_iter()
         .map(|entry| entry.map(walkdir::DirEntry::into_path))
         .collect::<Result<_, _>>()?;
     files.retain(|path| path.extension().is_some_and(|e| e == "comp"));
-    files.sort();
+    // A form for CPU drivers joins its kernel's module.
+    let for_cpus = |path: &Path| path.parent().is_some_and(|folder| folder.ends_with("cpu"));
+    files.sort_by_key(|path| (for_cpus(path), path.clone()));
     let compiler = shaderc::Compiler::new()?;
+    let mut kernels: BTreeMap<(Vec<String>, String), Kernel> = BTreeMap::new();
     for path in &files {
         check_mirror(path)?;
         let source = fs::read_to_string(path).with_context(|| format!("{} cannot be read", path.display()))?;
+        let folder = path.parent().and_then(|p| p.strip_prefix("glsl").ok()).context("a kernel outside glsl/")?;
+        let stem = path.file_stem().and_then(|s| s.to_str()).context("a kernel's name is not UTF-8")?;
+        let folders: Vec<String> = folder.iter().map(|f| f.to_string_lossy().into_owned()).collect();
+        let room = (folders[..folders.len() - usize::from(for_cpus(path))].to_vec(), stem.to_owned());
+        let joins = for_cpus(path) && kernels.contains_key(&room);
+        let kernel = kernels.entry(if joins { room } else { (folders, stem.to_owned()) }).or_default();
+        kernel.sources.push(path.display().to_string());
         for (suffix, defines) in variants(&source) {
-            let folder = path.parent().and_then(|p| p.strip_prefix("glsl").ok()).context("a kernel outside glsl/")?;
-            let stem = path.file_stem().and_then(|s| s.to_str()).context("a kernel's name is not UTF-8")?;
             let stem = if suffix.is_empty() { stem.to_owned() } else { format!("{stem}_{suffix}") };
             let name = folder.join(&stem).to_string_lossy().replace('\\', "/");
             // -O strips names and unused bindings: reflect the unoptimised module, ship the optimised one.
@@ -42,11 +51,15 @@ fn main() -> Result<()> {
             let spirv = out.join(format!("{}.spv", name.replace('/', ".")));
             fs::write(&spirv, slim.as_binary_u8())?;
             let interface = reflect(plain.as_binary(), &source).with_context(|| format!("in {}", path.display()))?;
-            let folders: Vec<String> = folder.iter().map(|f| f.to_string_lossy().into_owned()).collect();
-            tree.insert(&folders, stem, rust_module(&name, path, &interface, &spirv));
-            interfaces.push(interface);
+            kernel.variants.push(Variant { name, cpu: joins, defines, interface, spirv });
         }
     }
+    let mut tree = Tree::default();
+    for ((folders, stem), kernel) in &kernels {
+        let code = kernel.print(stem).with_context(|| format!("in {}", kernel.sources.join(" and ")))?;
+        tree.insert(folders, stem.clone(), code);
+    }
+    let interfaces: Vec<&Interface> = kernels.values().flat_map(|k| &k.variants).map(|v| &v.interface).collect();
     fs::write(out.join("kernels.rs"), format!("{}{}", extremes(&interfaces), tree.print()))?;
     Ok(())
 }
@@ -55,15 +68,14 @@ fn main() -> Result<()> {
 const CPU_LANES: u32 = 8;
 
 /// What the most demanding kernels ask of a device.
-fn extremes(all: &[Interface]) -> String {
-    let most = |of: &dyn Fn(&Interface) -> u32| all.iter().map(of).max().unwrap_or(0);
-    let push = |i: &Interface| i.push.iter().map(|m| m.offset + m.value.size()).max().unwrap_or(0);
+fn extremes(all: &[&Interface]) -> String {
+    let most = |of: &dyn Fn(&Interface) -> u32| all.iter().map(|i| of(i)).max().unwrap_or(0);
     // Forms for CPUs have a workgroup of one subgroup, and run where it has that width alone.
     let subgroups = all.iter().filter(|i| i.subgroups && i.group[0] > CPU_LANES).map(|i| i.group[0]);
     let constant = |doc: &str, name: &str, value: u32| format!("/// {doc}\npub const {name}: u32 = {value};\n");
     [
         constant("Most storage buffers that a kernel binds.", "MOST_BUFFERS", most(&|i| i.bindings.len() as u32)),
-        constant("Most bytes of push constants.", "MOST_PUSH_BYTES", most(&push)),
+        constant("Most bytes of push constants.", "MOST_PUSH_BYTES", most(&Interface::push_bytes)),
         constant("Most threads of a workgroup.", "MOST_THREADS", most(&|i| i.group.iter().product())),
         constant(
             "Most threads of a workgroup with subgroup operations: its subgroups are asked to be full and of one size.",
@@ -157,6 +169,7 @@ impl Type {
     }
 }
 
+#[derive(Clone)]
 struct Binding {
     number: u32,
     name: String,
@@ -165,6 +178,7 @@ struct Binding {
     doc: String,
 }
 
+#[derive(Clone, PartialEq)]
 struct Member {
     name: String,
     offset: u32,
@@ -172,6 +186,7 @@ struct Member {
     doc: String,
 }
 
+#[derive(Clone, PartialEq)]
 struct Constant {
     id: u32,
     name: String,
@@ -186,6 +201,12 @@ struct Interface {
     push: Vec<Member>,
     constants: Vec<Constant>,
     subgroups: bool,
+}
+
+impl Interface {
+    fn push_bytes(&self) -> u32 {
+        self.push.iter().map(|m| m.offset + m.value.size()).max().unwrap_or(0)
+    }
 }
 
 fn word(operand: &Operand) -> Word {
@@ -330,105 +351,258 @@ fn comment(source: &str, needle: &str) -> String {
         .map_or(String::new(), |(_, text)| text.trim().replace('[', "\\[").replace(']', "\\]"))
 }
 
-fn rust_module(name: &str, path: &Path, interface: &Interface, spirv: &Path) -> String {
-    let Interface { group, bindings, push, constants, subgroups } = interface;
-    let mut w = String::new();
-    let mut line = |text: String| {
-        w.push_str(&text);
-        w.push('\n');
-    };
-    let doc = |text: &str| if text.is_empty() { String::new() } else { format!("/// {text}\n") };
-    let each = |f: &dyn Fn(&Binding) -> String| bindings.iter().map(f).collect::<Vec<_>>().join("\n");
-    let stem = name.rsplit('/').next().unwrap_or(name);
-    line(format!("/// `{name}`, from `{}`.", path.display()));
-    line(format!("pub mod {stem} {{"));
-    line("#[allow(unused_imports)] use crate::gpu::kernel::*;".into());
-    line("/// What the kernel binds.\n#[derive(Clone, Copy)]\npub struct Buffers<'a> {".into());
-    line(each(&|b| format!("{}pub {}: &'a crate::gpu::Buffer<{}>,", doc(&b.doc), b.name, b.element.rust())));
-    line("}".into());
-    line("/// The same bindings as host slices: what the CPU twin sees.\npub struct Host<'a> {".into());
-    line(each(&|b| {
-        let mutable = if b.access == "Read" { "" } else { "mut " };
-        format!("{}pub {}: &'a {mutable}[{}],", doc(&b.doc), b.name, b.element.rust())
-    }));
-    line("}".into());
-    line("/// The same bindings, owned: one test case.\n#[derive(Clone, Default)]\npub struct Arrays {".into());
-    line(each(&|b| format!("{}pub {}: Vec<{}>,", doc(&b.doc), b.name, b.element.rust())));
-    line("}".into());
-    if push.is_empty() {
-        line("/// No push constants.\npub type Push = ();".into());
-    } else {
-        line("/// Push constants.\n#[repr(C)]\n#[derive(Clone, Copy, Debug, Default, bytemuck::Pod, bytemuck::Zeroable)]\npub struct Push {".into());
-        for m in push {
-            line(format!("{}pub {}: {},", doc(&m.doc), m.name, m.value.rust()));
+/// One compilation of a kernel.
+struct Variant {
+    name: String,
+    /// Compiled from the form for CPU drivers, of a kernel that has one for GPUs too.
+    cpu: bool,
+    defines: Vec<String>,
+    interface: Interface,
+    spirv: PathBuf,
+}
+
+/// A kernel: all its variants, the base first.
+#[derive(Default)]
+struct Kernel {
+    sources: Vec<String>,
+    variants: Vec<Variant>,
+}
+
+/// `NO_SSIM` as `NoSsim`, `RUN=4` as `Run4`.
+fn camel(define: &str) -> String {
+    let capital = |word: &str| format!("{}{}", &word[..1], word[1..].to_lowercase());
+    define.split(['_', '=']).filter(|word| !word.is_empty()).map(capital).collect()
+}
+
+impl Kernel {
+    /// Every variant's bindings, by number, those that only the form for CPU drivers has behind the others.
+    fn bindings(&self) -> Result<Vec<Binding>> {
+        let mut all: Vec<(bool, Binding)> = vec![];
+        for (variant, b) in self.variants.iter().flat_map(|v| v.interface.bindings.iter().map(move |b| (v, b))) {
+            match all.iter_mut().find(|(_, known)| known.name == b.name) {
+                None => all.push((variant.cpu, b.clone())),
+                Some((_, known)) => {
+                    ensure!(known.element.scalar == b.element.scalar, "buffer {} has two types", b.name);
+                    if known.access != b.access {
+                        known.access = "ReadWrite";
+                    }
+                }
+            }
+        }
+        ensure!(all.len() <= 32, "{} bindings", all.len());
+        all.sort_by_key(|(cpu, b)| (*cpu, b.number));
+        Ok(all.into_iter().map(|(_, b)| b).collect())
+    }
+
+    /// The longest push constants, with which all others begin.
+    fn push(&self) -> Result<&[Member]> {
+        let longest = self.variants.iter().map(|v| v.interface.push.as_slice()).max_by_key(|push| push.len());
+        let longest = longest.unwrap_or_default();
+        for Variant { name, interface, .. } in &self.variants {
+            let same = |(a, b): (&Member, &Member)| (&a.name, a.offset, &a.value) == (&b.name, b.offset, &b.value);
+            ensure!(interface.push.iter().zip(longest).all(same), "{name}: push constants must begin like the others'");
+        }
+        Ok(longest)
+    }
+
+    /// Every variant's specialisation constants, by number.
+    fn constants(&self) -> Result<Vec<Constant>> {
+        let mut all: BTreeMap<u32, Constant> = BTreeMap::new();
+        for constant in self.variants.iter().flat_map(|v| &v.interface.constants) {
+            let known = all.entry(constant.id).or_insert_with(|| constant.clone());
+            ensure!(known.name == constant.name, "constant {} has two names", constant.id);
+        }
+        Ok(all.into_values().collect())
+    }
+
+    /// Of each variant a bit for every binding that it has.
+    fn bound(&self, bindings: &[Binding]) -> Vec<u32> {
+        let has = |v: &Variant, b: &Binding| v.interface.bindings.iter().any(|own| own.name == b.name);
+        let bits = |v| bindings.iter().enumerate().map(|(i, b)| u32::from(has(v, b)) << i).sum();
+        self.variants.iter().map(bits).collect()
+    }
+
+    /// What `Kernel` says of each variant.
+    fn choices(&self, bound: &[u32]) -> Result<Vec<String>> {
+        let base = if self.variants.iter().any(|v| v.cpu) { "Gpu" } else { "Plain" };
+        let mut choices: Vec<String> = vec![];
+        for (i, variant) in self.variants.iter().enumerate() {
+            let first = (0..i).find(|&j| bound[j] == bound[i] && self.variants[j].cpu == variant.cpu);
+            let choice = match first {
+                _ if variant.cpu => "Cpu".into(),
+                None => base.into(),
+                Some(first) => {
+                    let own = variant.defines.iter().find(|d| !self.variants[first].defines.contains(d));
+                    camel(own.with_context(|| format!("{} is as {}", variant.name, self.variants[first].name))?)
+                }
+            };
+            let taken = choices.iter().zip(bound).any(|(c, b)| (c, b) == (&choice, &bound[i]));
+            ensure!(!taken, "nothing tells {} from another variant", variant.name);
+            choices.push(choice);
+        }
+        Ok(choices)
+    }
+
+    fn print(&self, stem: &str) -> Result<String> {
+        let (bindings, push, constants) = (self.bindings()?, self.push()?, self.constants()?);
+        let bound = self.bound(&bindings);
+        let choices = self.choices(&bound)?;
+        let mut kinds: Vec<&String> = vec![];
+        for choice in &choices {
+            if !kinds.contains(&choice) {
+                kinds.push(choice);
+            }
+        }
+        let optional = |i: usize| bound.iter().any(|bits| bits >> i & 1 == 0);
+        let mut w = String::new();
+        let mut line = |text: String| {
+            w.push_str(&text);
+            w.push('\n');
+        };
+        let doc = |text: &str| if text.is_empty() { String::new() } else { format!("/// {text}\n") };
+        let each = |f: &dyn Fn(usize, &Binding) -> String| {
+            bindings.iter().enumerate().map(|(i, b)| f(i, b)).collect::<Vec<_>>().join("\n")
+        };
+        let field = |i: usize, b: &Binding, ty: String| {
+            let ty = if optional(i) { format!("Option<{ty}>") } else { ty };
+            format!("{}pub {}: {ty},", doc(&b.doc), b.name)
+        };
+        let mutable = |b: &Binding| if b.access == "Read" { "" } else { "mut " };
+        let names: Vec<String> = self.variants.iter().map(|v| format!("`{}`", v.name)).collect();
+        line(format!("/// {}, from `{}`.", names.join(", "), self.sources.join("` and `")));
+        line(format!("pub mod {stem} {{"));
+        line("#[allow(unused_imports)] use crate::gpu::kernel::*;".into());
+        line("/// What the kernel binds.\n#[derive(Clone, Copy)]\npub struct Buffers<'a> {".into());
+        line(each(&|i, b| field(i, b, format!("&'a crate::gpu::Buffer<{}>", b.element.rust()))));
+        line("}".into());
+        line("/// The same bindings as host slices: what the CPU twin sees.\npub struct Host<'a> {".into());
+        line(each(&|i, b| field(i, b, format!("&'a {}[{}]", mutable(b), b.element.rust()))));
+        if kinds.len() > 1 {
+            line("/// What runs.\npub kernel: Kernel,".into());
         }
         line("}".into());
-        let size = push.iter().map(|m| m.offset + m.value.size()).max().unwrap_or(0);
-        line(format!("const _: () = assert!(size_of::<Push>() == {size} && {size} <= 128);"));
-        for m in push {
-            line(format!("const _: () = assert!(std::mem::offset_of!(Push, {}) == {});", m.name, m.offset));
-        }
-    }
-    if constants.is_empty() {
-        line("/// No specialisation constants.\npub type Constants = ();".into());
-    } else {
-        line("/// Specialisation constants.\n#[repr(C)]\n#[derive(Clone, Copy, Debug, bytemuck::Pod, bytemuck::Zeroable)]\npub struct Constants {".into());
-        for c in constants {
-            line(format!("{}pub {}: {},", doc(&c.doc), c.name, c.scalar));
-        }
-        line("}\nimpl Default for Constants { fn default() -> Self { Self {".into());
-        for c in constants {
-            line(format!("{}: {},", c.name, c.default));
-        }
-        line("} } }".into());
-    }
-    line("/// The kernel.\n#[derive(Clone, Copy, Debug)]\npub struct Kernel;".into());
-    line("impl crate::gpu::Kernel for Kernel {".into());
-    line("type Buffers<'a> = Buffers<'a>; type Host<'a> = Host<'a>; type Arrays = Arrays; type Push = Push; type Constants = Constants;".into());
-    line(format!("const NAME: &'static str = {name:?};"));
-    line(format!("const GROUP: [u32; 3] = {group:?};"));
-    line(format!("const SUBGROUPS: bool = {subgroups};"));
-    line(format!(
-        "const BINDINGS: &'static [Binding] = &[{}];",
-        each(&|b| format!(
-            "Binding {{ number: {}, name: {:?}, access: Access::{}, scalar: Scalar::{}, components: {} }},",
-            b.number,
-            b.name,
-            b.access,
-            b.element.scalar.to_uppercase(),
-            b.element.components
-        ))
-    ));
-    line(format!(
-        "const CONSTANTS: &'static [u32] = &[{}];",
-        constants.iter().map(|c| format!("{},", c.id)).collect::<String>()
-    ));
-    line(format!("const SPIRV: &'static [u8] = include_bytes!({:?});", spirv.display().to_string()));
-    line(format!(
-        "fn slots(buffers: &Buffers<'_>) -> Vec<Slot> {{ vec![{}] }}",
-        each(&|b| format!("buffers.{}.slot(),", b.name))
-    ));
-    let pattern = bindings.iter().map(|b| b.name.clone()).collect::<Vec<_>>().join(", ");
-    line(format!(
-        "fn host(words: &mut [Vec<u32>]) -> Host<'_> {{ let [{pattern}] = words else {{ wrong_bindings(Self::NAME, {}) }}; Host {{ {} }} }}",
-        bindings.len(),
-        each(&|b| if b.access == "Read" {
-            format!("{0}: elements({0}),", b.name)
+        line("/// The same bindings, owned: one test case.\n#[derive(Clone, Default)]\npub struct Arrays {".into());
+        line(each(&|i, b| field(i, b, format!("Vec<{}>", b.element.rust()))));
+        line("}".into());
+        if push.is_empty() {
+            line("/// No push constants.\npub type Push = ();".into());
         } else {
-            format!("{0}: elements_mut({0}),", b.name)
-        })
-    ));
-    line(format!(
-        "fn words(arrays: Arrays) -> Vec<Vec<u32>> {{ vec![{}] }}",
-        each(&|b| format!("words_of(&arrays.{}),", b.name))
-    ));
-    line(format!(
-        "fn arrays(words: &[Vec<u32>]) -> Arrays {{ let [{pattern}] = words else {{ wrong_bindings(Self::NAME, {}) }}; Arrays {{ {} }} }}",
-        bindings.len(),
-        each(&|b| format!("{0}: elements_of({0}),", b.name))
-    ));
-    line("}\n}".into());
-    w
+            line("/// Push constants.\n#[repr(C)]\n#[derive(Clone, Copy, Debug, Default, bytemuck::Pod, bytemuck::Zeroable)]\npub struct Push {".into());
+            for m in push {
+                line(format!("{}pub {}: {},", doc(&m.doc), m.name, m.value.rust()));
+            }
+            line("}".into());
+            let size = push.iter().map(|m| m.offset + m.value.size()).max().unwrap_or(0);
+            line(format!("const _: () = assert!(size_of::<Push>() == {size} && {size} <= 128);"));
+            for m in push {
+                line(format!("const _: () = assert!(std::mem::offset_of!(Push, {}) == {});", m.name, m.offset));
+            }
+        }
+        if constants.is_empty() {
+            line("/// No specialisation constants.\npub type Constants = ();".into());
+        } else {
+            line("/// Specialisation constants.\n#[repr(C)]\n#[derive(Clone, Copy, Debug, bytemuck::Pod, bytemuck::Zeroable)]\npub struct Constants {".into());
+            for c in &constants {
+                line(format!("{}pub {}: {},", doc(&c.doc), c.name, c.scalar));
+            }
+            line("}\nimpl Default for Constants { fn default() -> Self { Self {".into());
+            for c in &constants {
+                line(format!("{}: {},", c.name, c.default));
+            }
+            line("} } }".into());
+        }
+        let mut choice = "0";
+        if kinds.len() > 1 {
+            line("/// The kernel: what its bindings do not tell of a variant.".into());
+            line("#[derive(Clone, Copy, Debug, PartialEq, Eq)]\npub enum Kernel {".into());
+            kinds.iter().for_each(|kind| line(format!("{kind},")));
+            line("}".into());
+            if kinds[0] == "Gpu" {
+                line(
+                    "impl From<crate::gpu::Form> for Kernel { fn from(form: crate::gpu::Form) -> Self { match form {"
+                        .into(),
+                );
+                line("crate::gpu::Form::Gpu => Self::Gpu, crate::gpu::Form::Cpu => Self::Cpu } } }".into());
+            }
+            choice = "self as u32";
+        } else {
+            line("/// The kernel.\n#[derive(Clone, Copy, Debug)]\npub struct Kernel;".into());
+        }
+        line("impl crate::gpu::Kernel for Kernel {".into());
+        line("type Buffers<'a> = Buffers<'a>; type Host<'a> = Host<'a>; type Arrays = Arrays; type Push = Push; type Constants = Constants;".into());
+        line(format!("const BINDINGS: usize = {};", bindings.len()));
+        line("const VARIANTS: &'static [Interface] = &[".into());
+        for ((variant, bound), choice) in self.variants.iter().zip(&bound).zip(&choices) {
+            let kind = kinds.iter().position(|kind| *kind == choice).unwrap_or(0);
+            line(variant.print(&bindings, &constants, *bound, kind));
+        }
+        line("];".into());
+        line(format!("fn choice(self) -> u32 {{ {choice} }}"));
+        line(format!(
+            "fn slots(buffers: &Buffers<'_>) -> Vec<Option<Slot>> {{ vec![{}] }}",
+            each(&|i, b| match optional(i) {
+                true => format!("buffers.{}.map(|b| b.slot()),", b.name),
+                false => format!("Some(buffers.{}.slot()),", b.name),
+            })
+        ));
+        let pattern = bindings.iter().map(|b| b.name.clone()).collect::<Vec<_>>().join(", ");
+        let open = format!("let [{pattern}] = words else {{ wrong_bindings(Self::VARIANTS, {}) }};", bindings.len());
+        line(format!(
+            "fn host(self, words: &mut [Option<Vec<u32>>]) -> Host<'_> {{ {open} Host {{ {} {} }} }}",
+            each(&|i, b| {
+                let (of, by) =
+                    if b.access == "Read" { ("as_deref", "elements") } else { ("as_deref_mut", "elements_mut") };
+                match optional(i) {
+                    true => format!("{0}: {0}.{of}().map({by}),", b.name),
+                    false => format!("{0}: {by}(bound({0}.{of}(), {0:?})),", b.name),
+                }
+            }),
+            if kinds.len() > 1 { "kernel: self," } else { "" }
+        ));
+        line(format!(
+            "fn words(arrays: Arrays) -> Vec<Option<Vec<u32>>> {{ vec![{}] }}",
+            each(&|i, b| match optional(i) {
+                true => format!("arrays.{}.as_deref().map(words_of),", b.name),
+                false => format!("Some(words_of(&arrays.{})),", b.name),
+            })
+        ));
+        line(format!(
+            "fn arrays(words: &[Option<Vec<u32>>]) -> Arrays {{ {open} Arrays {{ {} }} }}",
+            each(&|i, b| match optional(i) {
+                true => format!("{0}: {0}.as_deref().map(elements_of),", b.name),
+                false => format!("{0}: elements_of(bound({0}.as_deref(), {0:?})),", b.name),
+            })
+        ));
+        line("}\n}".into());
+        Ok(w)
+    }
+}
+
+impl Variant {
+    /// Its `Interface`, as Rust.
+    fn print(&self, all: &[Binding], constants: &[Constant], bound: u32, choice: usize) -> String {
+        let Interface { group, bindings, subgroups, constants: own, .. } = &self.interface;
+        let binding = |b: &Binding| {
+            let at = all.iter().position(|of_all| of_all.name == b.name).unwrap_or(0);
+            let (number, name, access, scalar) = (b.number, &b.name, b.access, b.element.scalar.to_uppercase());
+            format!(
+                "Binding {{ number: {number}, at: {at}, name: {name:?}, access: Access::{access}, scalar: Scalar::{scalar} }},\n"
+            )
+        };
+        let constant = |c: &Constant| {
+            let at = constants.iter().position(|of_all| of_all.id == c.id).unwrap_or(0);
+            format!("({}, {at}),", c.id)
+        };
+        format!(
+            "Interface {{ name: {:?}, choice: {choice}, bound: {bound:#b}, group: {group:?}, subgroups: {subgroups}, \
+             bindings: &[{}], constants: &[{}], push_bytes: {}, spirv: include_bytes!({:?}) }},",
+            self.name,
+            bindings.iter().map(binding).collect::<String>(),
+            own.iter().map(constant).collect::<String>(),
+            self.interface.push_bytes(),
+            self.spirv.display().to_string()
+        )
+    }
 }
 
 /// Modules nested as the folders are.

@@ -7,7 +7,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::step::Rates;
-use crate::gpu::kernels::bench::{ceilings_copy, ceilings_copy_vec4, ceilings_empty, ceilings_exp, ceilings_fma};
+use crate::gpu::kernels::bench::{ceilings_copy, ceilings_empty, ceilings_exp, ceilings_fma};
 use crate::gpu::{Buffer, Check, Error, Gpu, Reference, Timing};
 use crate::report::statistics::Spread;
 
@@ -26,20 +26,15 @@ const EXPS: u32 = 16 * 4;
 /// Dispatches in a row.
 const DISPATCHES: usize = 128;
 
-macro_rules! copy_twin {
-    ($module:ident) => {
-        impl Reference for $module::Kernel {
-            fn reference(host: $module::Host<'_>, push: $module::Push, (): ()) {
-                host.to[..push.n as usize].copy_from_slice(&host.from[..push.n as usize]);
-            }
-            fn check(_: &'static str) -> Check {
-                Check { relative: 0.0, absolute: 0.0, band: 0.0 }
-            }
-        }
-    };
+impl Reference for ceilings_copy::Kernel {
+    fn reference(host: ceilings_copy::Host<'_>, push: ceilings_copy::Push, (): ()) {
+        let floats = if host.kernel == ceilings_copy::Kernel::Vec4 { 4 * push.n } else { push.n } as usize;
+        host.to[..floats].copy_from_slice(&host.from[..floats]);
+    }
+    fn check(_: &'static str) -> Check {
+        Check { relative: 0.0, absolute: 0.0, band: 0.0 }
+    }
 }
-copy_twin!(ceilings_copy);
-copy_twin!(ceilings_copy_vec4);
 
 impl Reference for ceilings_fma::Kernel {
     // With a <= 1/2 a chain's roundings sum to at most two of them: eight chains, well within the default check.
@@ -162,19 +157,12 @@ impl<'g> Probe<'g> {
     /// Nanoseconds of a copy of so many floats.
     fn copy(&self, vectors: bool, len: usize) -> Result<f64, Error> {
         let mut rec = self.gpu.recorder()?;
-        let len = len as u32;
-        if vectors {
-            let buffers = ceilings_copy_vec4::Buffers { from: &self.from.view(), to: &self.to.view() };
-            rec.run(
-                ceilings_copy_vec4::Kernel,
-                buffers,
-                ceilings_copy_vec4::Push { n: len / 4 },
-                (len / 4).div_ceil(4),
-            );
-        } else {
-            let buffers = ceilings_copy::Buffers { from: &self.from, to: &self.to };
-            rec.run(ceilings_copy::Kernel, buffers, ceilings_copy::Push { n: len }, len.div_ceil(4));
-        }
+        let (kernel, n) = match vectors {
+            true => (ceilings_copy::Kernel::Vec4, len as u32 / 4),
+            false => (ceilings_copy::Kernel::Plain, len as u32),
+        };
+        let buffers = ceilings_copy::Buffers { from: &self.from, to: &self.to };
+        rec.run(kernel, buffers, ceilings_copy::Push { n }, n.div_ceil(4));
         Ok(span(&rec.submit()?.wait()?))
     }
 
@@ -306,13 +294,12 @@ mod tests {
         for n in [0usize, 1, 63, 64, 65, 255, 256, 257, 1000] {
             // Something behind the end, which must stay.
             let to = vec![testing::UNWRITTEN; n + 5];
-            let case = ceilings_copy::Arrays { from: ramp(n + 5), to: to.clone() };
             let push = ceilings_copy::Push { n: n as u32 };
-            testing::assert_twin(ceilings_copy::Kernel, &gpu, case, push, n.div_ceil(4));
-            let vectors = |values: &[f32]| values.iter().map(|v| [*v, 2.0 * v, 3.0, -v]).collect::<Vec<_>>();
-            let case = ceilings_copy_vec4::Arrays { from: vectors(&ramp(n + 5)), to: vectors(&to) };
-            let push = ceilings_copy_vec4::Push { n: n as u32 };
-            testing::assert_twin(ceilings_copy_vec4::Kernel, &gpu, case, push, n.div_ceil(4));
+            for (kernel, floats) in [(ceilings_copy::Kernel::Plain, n + 5), (ceilings_copy::Kernel::Vec4, 4 * (n + 5))]
+            {
+                let case = ceilings_copy::Arrays { from: ramp(floats), to: vec![testing::UNWRITTEN; floats] };
+                testing::assert_twin(kernel, &gpu, case, push, n.div_ceil(4));
+            }
             for rounds in [0, 1, 3] {
                 let case = ceilings_fma::Arrays { start: ramp(n + 5), sums: to.clone() };
                 let push = ceilings_fma::Push { n: n as u32, rounds, a: 0.4375, b: 0.3 };

@@ -336,10 +336,7 @@ mod tests {
     }
 
     fn forward(case: &activate::Arrays, n: usize, degree: u32) -> activate::Arrays {
-        use crate::gpu::Kernel;
-        let mut words = activate::Kernel::words(case.clone());
-        activate::Kernel::reference(activate::Kernel::host(&mut words), push(n, degree), ());
-        activate::Kernel::arrays(&words)
+        testing::run_twin(activate::Kernel, (), case.clone(), push(n, degree))
     }
 
     #[test]
@@ -365,7 +362,6 @@ mod tests {
     /// inputs and outputs: steps of 2^-7 leave 2e-5 of rounding and 1e-4 of curvature.
     #[test]
     fn gradients_are_the_activations_derivatives() {
-        use crate::gpu::Kernel;
         let mut rng = Pcg64::seed_from_u64(2);
         let (n, degree) = (20, 3);
         let start = case(&mut rng, n, degree);
@@ -375,10 +371,8 @@ mod tests {
         let mut grad = backward_case(&mut rng, &there, degree);
         grad.drawn = vec![1; n];
         grad.grad_seen = vec![[0.0; 3]; n];
-        let mut words = activate_backward::Kernel::words(grad.clone());
         let push = activate_backward::Push { count: n as u32, coefficients: 16 };
-        activate_backward::Kernel::reference(activate_backward::Kernel::host(&mut words), push, ());
-        let got = activate_backward::Kernel::arrays(&words);
+        let got = testing::run_twin(activate_backward::Kernel, (), grad.clone(), push);
         let value = |at: &activate::Arrays, i: usize| -> f64 {
             let out = forward(at, n, degree);
             let dot =

@@ -524,7 +524,7 @@ impl Inner {
             .constants
             .iter()
             .enumerate()
-            .map(|(i, &id)| vk::SpecializationMapEntry { constant_id: id, offset: 4 * i as u32, size: 4 })
+            .map(|(i, &(id, _))| vk::SpecializationMapEntry { constant_id: id, offset: 4 * i as u32, size: 4 })
             .collect();
         let specialization = vk::SpecializationInfo::default().map_entries(&entries).data(constants);
         let words = ash::util::read_spv(&mut std::io::Cursor::new(kernel.spirv)).expect("build.rs wrote whole words");
@@ -621,14 +621,14 @@ mod tests {
     #[test]
     fn compiling_keeps_nobody_waiting_who_wants_another_kernel() {
         let gpu = testing::fresh_gpu(Options::default());
-        let slow = gpu.inner().pipeline(limit::Kernel::INTERFACE, &[]).expect("layouts");
+        let slow = gpu.inner().pipeline(&limit::Kernel::VARIANTS[0], &[]).expect("layouts");
         let making = lock(&slow.making);
         let (done, is_done) = mpsc::channel();
         std::thread::scope(|scope| {
             scope.spawn(|| {
                 let inner = gpu.inner();
-                let other = inner.pipeline(dispatch::Kernel::INTERFACE, &[]).expect("layouts");
-                let again = inner.pipeline(limit::Kernel::INTERFACE, &[]).expect("layouts");
+                let other = inner.pipeline(&dispatch::Kernel::VARIANTS[0], &[]).expect("layouts");
+                let again = inner.pipeline(&limit::Kernel::VARIANTS[0], &[]).expect("layouts");
                 inner.compile_all([&other, &other].into_iter()).expect("it compiles");
                 done.send((other.made.get().is_some(), Arc::ptr_eq(&again, &slow))).expect("somebody waits");
             });

@@ -44,33 +44,58 @@ pub enum Scalar {
 pub struct Binding {
     /// Binding number in set 0.
     pub number: u32,
+    /// Place among the bindings of all of the kernel's variants.
+    pub at: usize,
     /// Name of the array in GLSL.
     pub name: &'static str,
     /// Declared access.
     pub access: Access,
     /// Component type.
     pub scalar: Scalar,
-    /// Components per element.
-    pub components: u32,
 }
 
-/// All of a kernel that does not depend on its types: what the device needs, compiled once for all kernels.
+/// A compiled variant of a kernel, without the types: what the device needs.
 #[derive(Debug)]
 pub struct Interface {
-    /// As [`Kernel::NAME`].
+    /// `folder/stem_variant`, also the name of the pass and of its timing.
     pub name: &'static str,
-    /// As [`Kernel::GROUP`].
+    /// [`Kernel::choice`] of the kernel that this is.
+    pub choice: u32,
+    /// A bit for each of the kernel's bindings that it has.
+    pub bound: u32,
+    /// Threads per workgroup.
     pub group: [u32; 3],
-    /// As [`Kernel::SUBGROUPS`].
+    /// True when it uses subgroup operations: the subgroup size is then pinned and subgroups are full.
     pub subgroups: bool,
-    /// As [`Kernel::BINDINGS`].
+    /// Its storage buffers, by binding number.
     pub bindings: &'static [Binding],
-    /// As [`Kernel::CONSTANTS`].
-    pub constants: &'static [u32],
-    /// Bytes of the push constants.
+    /// Its specialisation constants: id, and place in the kernel's `Constants`.
+    pub constants: &'static [(u32, usize)],
+    /// Bytes of the push constants: those with which the kernel's begin.
     pub push_bytes: u32,
-    /// As [`Kernel::SPIRV`].
+    /// Optimised SPIR-V.
     pub spirv: &'static [u8],
+}
+
+impl Interface {
+    /// Its specialisation constants, of those of all variants.
+    pub(super) fn own_constants(&self, all: &[u8]) -> Vec<u8> {
+        self.constants.iter().flat_map(|&(_, at)| &all[4 * at..4 * at + 4]).copied().collect()
+    }
+
+    /// Moves the words of its buffers, in their order, to their places among all of the kernel's bindings.
+    pub(super) fn spread(&self, words: &mut [Vec<u32>], all: usize) -> Vec<Option<Vec<u32>>> {
+        let mut spread = vec![None; all];
+        for (binding, words) in self.bindings.iter().zip(words) {
+            spread[binding.at] = Some(std::mem::take(words));
+        }
+        spread
+    }
+
+    /// The reverse of [`Self::spread`].
+    pub(super) fn collect<T>(&self, mut all: Vec<Option<T>>) -> Vec<T> {
+        self.bindings.iter().map(|b| bound(all[b.at].take(), b.name)).collect()
+    }
 }
 
 /// A kernel's twin without its types.
@@ -84,13 +109,19 @@ pub(super) struct Twin<'c> {
     pub cancels: fn(&'static str) -> bool,
 }
 
-/// Calls `then` with the kernel's twin for these constants.
+/// Calls `then` with the variant's twin for these constants.
 pub(super) fn with_twin<K: Reference, R>(
+    kernel: K,
+    variant: &'static Interface,
     push: K::Push,
     constants: K::Constants,
     then: impl FnOnce(Twin<'_>) -> R,
 ) -> R {
-    let reference = |words: &mut [Vec<u32>]| K::reference(K::host(words), push, constants);
+    let reference = |words: &mut [Vec<u32>]| {
+        let mut all = variant.spread(words, K::BINDINGS);
+        K::reference(kernel.host(&mut all), push, constants);
+        words.iter_mut().zip(variant.collect(all)).for_each(|(words, after)| *words = after);
+    };
     then(Twin { reference: &reference, check: K::check, cancels: K::cancels })
 }
 
@@ -121,13 +152,18 @@ pub fn elements_of<T: bytemuck::Pod>(words: &[u32]) -> Vec<T> {
 /// Stops where a kernel is given another number of arrays than it binds.
 #[cold]
 #[inline(never)]
-pub fn wrong_bindings(kernel: &str, bindings: usize) -> ! {
-    panic!("{kernel} binds {bindings} buffers")
+pub fn wrong_bindings(variants: &[Interface], bindings: usize) -> ! {
+    panic!("{} binds {bindings} buffers", variants[0].name)
+}
+
+/// What is bound in every variant.
+pub fn bound<T>(value: Option<T>, binding: &str) -> T {
+    value.unwrap_or_else(|| panic!("{binding} is bound in every variant"))
 }
 
 /// A compute kernel's interface. Implemented by `build.rs` from the GLSL source, never by hand.
-pub trait Kernel: 'static {
-    /// Named, typed bindings.
+pub trait Kernel: Copy + Debug + 'static {
+    /// Named, typed bindings; those that only some variants have are `Option`s.
     type Buffers<'a>: Copy;
     /// The same as host slices.
     type Host<'a>;
@@ -137,36 +173,34 @@ pub trait Kernel: 'static {
     type Push: bytemuck::Pod + Debug + Default;
     /// Specialisation constants.
     type Constants: bytemuck::Pod + Debug + Default;
-    /// `folder/stem`, also the name of the pass and of its timing.
-    const NAME: &'static str;
-    /// Threads per workgroup.
-    const GROUP: [u32; 3];
-    /// True when it uses subgroup operations: the subgroup size is then pinned and subgroups are full.
-    const SUBGROUPS: bool;
-    /// The storage buffers, by binding number.
-    const BINDINGS: &'static [Binding];
-    /// Ids of the specialisation constants, in `Constants`' order.
-    const CONSTANTS: &'static [u32];
-    /// Optimised SPIR-V.
-    const SPIRV: &'static [u8];
-    /// The above without the types.
-    const INTERFACE: &'static Interface = &Interface {
-        name: Self::NAME,
-        group: Self::GROUP,
-        subgroups: Self::SUBGROUPS,
-        bindings: Self::BINDINGS,
-        constants: Self::CONSTANTS,
-        push_bytes: size_of::<Self::Push>() as u32,
-        spirv: Self::SPIRV,
-    };
-    /// The bound buffers in the order of `BINDINGS`.
-    fn slots(buffers: &Self::Buffers<'_>) -> Vec<MemorySlot>;
-    /// Host slices over one vector of words per binding.
-    fn host(words: &mut [Vec<u32>]) -> Self::Host<'_>;
+    /// Bindings of all variants together.
+    const BINDINGS: usize;
+    /// What the kernel is compiled to, the base first.
+    const VARIANTS: &'static [Interface];
+    /// The base's name.
+    const NAME: &'static str = Self::VARIANTS[0].name;
+    /// Threads per workgroup, of the base.
+    const GROUP: [u32; 3] = Self::VARIANTS[0].group;
+    /// What the bindings do not tell of the variant: its number.
+    fn choice(self) -> u32;
+    /// The buffers that are given, each at its place among all bindings.
+    fn slots(buffers: &Self::Buffers<'_>) -> Vec<Option<MemorySlot>>;
+    /// Host slices over the words of the buffers that are given.
+    fn host(self, words: &mut [Option<Vec<u32>>]) -> Self::Host<'_>;
     /// A test case as words.
-    fn words(arrays: Self::Arrays) -> Vec<Vec<u32>>;
+    fn words(arrays: Self::Arrays) -> Vec<Option<Vec<u32>>>;
     /// Words as a test case.
-    fn arrays(words: &[Vec<u32>]) -> Self::Arrays;
+    fn arrays(words: &[Option<Vec<u32>>]) -> Self::Arrays;
+
+    /// The variant that has exactly the bindings that are given.
+    ///
+    /// # Panics
+    /// When no variant has them.
+    fn variant<T>(self, given: &[Option<T>]) -> &'static Interface {
+        let bound: u32 = given.iter().enumerate().map(|(i, of)| u32::from(of.is_some()) << i).sum();
+        let found = Self::VARIANTS.iter().find(|v| (v.choice, v.bound) == (self.choice(), bound));
+        found.unwrap_or_else(|| panic!("{}: no variant {self:?} has bindings {bound:#b}", Self::NAME))
+    }
 }
 
 /// The CPU twin: plain loops, float64 inside. [`super::Recorder::run`] asks for it, so a kernel without a twin does

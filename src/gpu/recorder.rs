@@ -287,7 +287,7 @@ impl<'g> Recorder<'g> {
     /// Runs kernel `K` with these specialisation constants.
     pub fn run_with<'t, K: Reference>(
         &mut self,
-        _kernel: K,
+        kernel: K,
         constants: K::Constants,
         buffers: K::Buffers<'_>,
         push: K::Push,
@@ -297,13 +297,14 @@ impl<'g> Recorder<'g> {
             return;
         }
         let (slots, threads) = (K::slots(&buffers), threads.into());
+        let variant = kernel.variant(&slots);
         let call = Call {
-            kernel: K::INTERFACE,
-            constants: bytemuck::bytes_of(&constants),
-            push: bytemuck::bytes_of(&push),
-            slots: &slots,
+            kernel: variant,
+            constants: &variant.own_constants(bytemuck::bytes_of(&constants)),
+            push: &bytemuck::bytes_of(&push)[..variant.push_bytes as usize],
+            slots: &variant.collect(slots),
         };
-        let result = with_twin::<K, _>(push, constants, |twin| self.try_run(call, twin, threads));
+        let result = with_twin(kernel, variant, push, constants, |twin| self.try_run(call, twin, threads));
         self.keep(result);
     }
 

@@ -10,7 +10,7 @@ use super::check::Difference;
 use super::descriptors::Descriptors;
 use super::device::{Gpu, Options, lock};
 use super::form::Form;
-use super::kernel::{Reference, with_twin};
+use super::kernel::{Interface, Reference, with_twin};
 use super::recorder::Threads;
 
 /// A device under the validation layer. Dropping it fails the test if the layer said anything.
@@ -140,12 +140,13 @@ pub const UNWRITTEN: f32 = f32::from_bits(0x7fc01234);
 /// # Panics
 /// When the device refuses.
 pub fn run_once<'t, K: Reference>(
+    kernel: K,
     gpu: &Gpu,
     case: &K::Arrays,
     push: K::Push,
     threads: impl Into<Threads<'t>>,
 ) -> K::Arrays {
-    run_once_with::<K>(gpu, case, push, K::Constants::default(), threads)
+    run_once_with(kernel, gpu, K::Constants::default(), case, push, threads)
 }
 
 /// As [`run_once`], with specialisation constants.
@@ -153,25 +154,44 @@ pub fn run_once<'t, K: Reference>(
 /// # Panics
 /// As [`run_once`].
 pub fn run_once_with<'t, K: Reference>(
+    kernel: K,
     gpu: &Gpu,
+    constants: K::Constants,
     case: &K::Arrays,
     push: K::Push,
-    constants: K::Constants,
     threads: impl Into<Threads<'t>>,
 ) -> K::Arrays {
-    K::arrays(&run_words::<K>(gpu, &K::words(case.clone()), push, constants, threads.into()))
+    let (variant, words) = words_of(kernel, case.clone());
+    let mut words = run_words::<K>(gpu, variant, &words, push, constants, threads.into());
+    K::arrays(&variant.spread(&mut words, K::BINDINGS))
+}
+
+/// Runs the twin on a case and returns all bindings afterwards.
+pub fn run_twin<K: Reference>(kernel: K, constants: K::Constants, case: K::Arrays, push: K::Push) -> K::Arrays {
+    let mut words = K::words(case);
+    K::reference(kernel.host(&mut words), push, constants);
+    K::arrays(&words)
+}
+
+/// The variant that a case is of, and the words of its buffers.
+fn words_of<K: Reference>(kernel: K, case: K::Arrays) -> (&'static Interface, Vec<Vec<u32>>) {
+    let words = K::words(case);
+    let variant = kernel.variant(&words);
+    (variant, variant.collect(words))
 }
 
 fn run_words<K: Reference>(
     gpu: &Gpu,
+    variant: &'static Interface,
     words: &[Vec<u32>],
     push: K::Push,
     constants: K::Constants,
     threads: Threads<'_>,
 ) -> Vec<Vec<u32>> {
-    let (push, constants) = (bytemuck::bytes_of(&push), bytemuck::bytes_of(&constants));
-    super::check::run_words(gpu, K::INTERFACE, words, push, constants, threads)
-        .unwrap_or_else(|e| panic!("{}: {e}", K::NAME))
+    let constants = variant.own_constants(bytemuck::bytes_of(&constants));
+    let push = &bytemuck::bytes_of(&push)[..variant.push_bytes as usize];
+    super::check::run_words(gpu, variant, words, push, &constants, threads)
+        .unwrap_or_else(|e| panic!("{}: {e}", variant.name))
 }
 
 /// Runs kernel and twin on the same case and compares every output within [`Reference::check`].
@@ -193,20 +213,20 @@ pub fn assert_twin<'t, K: Reference>(
 /// # Panics
 /// As [`assert_twin`].
 pub fn assert_twin_with<'t, K: Reference>(
-    _kernel: K,
+    kernel: K,
     gpu: &Gpu,
     constants: K::Constants,
     case: K::Arrays,
     push: K::Push,
     threads: impl Into<Threads<'t>>,
 ) {
-    let mut want = K::words(case);
-    let got = run_words::<K>(gpu, &want, push, constants, threads.into());
-    with_twin::<K, _>(push, constants, |twin| {
+    let (variant, mut want) = words_of(kernel, case);
+    let got = run_words::<K>(gpu, variant, &want, push, constants, threads.into());
+    with_twin(kernel, variant, push, constants, |twin| {
         (twin.reference)(&mut want);
-        for ((binding, got), want) in K::BINDINGS.iter().zip(&got).zip(&want) {
+        for ((binding, got), want) in variant.bindings.iter().zip(&got).zip(&want) {
             if binding.access.writes() {
-                let difference = Difference::of_words(K::NAME, twin, binding, got, want);
+                let difference = Difference::of_words(variant.name, twin, binding, got, want);
                 assert!(difference.ok(), "{difference}\npush {push:?}");
             }
         }

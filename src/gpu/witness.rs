@@ -47,7 +47,7 @@ impl Case {
             name: kernel.name,
             spirv: kernel.spirv,
             bindings: kernel.bindings,
-            constants: kernel.constants.iter().copied().zip(constants).collect(),
+            constants: kernel.constants.iter().map(|&(id, _)| id).zip(constants).collect(),
             push: bytemuck::pod_collect_to_vec(push),
             workgroups,
             before,

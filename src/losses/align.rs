@@ -5,10 +5,7 @@
 //! determinant would lose `mean^2 / variance` of its digits.
 
 use crate::cost::{Formula, if_so, work};
-use crate::gpu::kernels::losses::{
-    align_backward, align_fit, align_gradient, align_gradient_masked, align_means, align_means_masked, align_moments,
-    align_moments_masked,
-};
+use crate::gpu::kernels::losses::{align_backward, align_fit, align_gradient, align_means, align_moments};
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::math::align::{Fit, alignable, alignable_slope, unit};
 
@@ -100,87 +97,48 @@ impl Quantity {
     }
 }
 
-/// The sums of terms of one sign pass through 8 + 14 additions; distances from the mean cancel, and are small against
-/// the largest sum of the tensor where the means are right.
-const SUMS: Check = Check { relative: 3e-6, absolute: 3e-6, band: 0.0 };
-
-fn means_reference(
-    rendered: &[f32],
-    prior: &[f32],
-    valid: Option<&[f32]>,
-    partial: &mut [f32],
-    push: align_means::Push,
-) {
-    partial_sums(push.pixels, partial, |i| {
-        let v = valid.map_or(1.0, |v| f64::from(v[i]));
-        [v, v * alignable(rendered[i].into(), push.near.into()), v * f64::from(prior[i])]
-    });
+/// 1 where the fit looks.
+fn looks(valid: Option<&[f32]>, pixel: usize) -> f64 {
+    valid.map_or(1.0, |valid| f64::from(valid[pixel]))
 }
 
 impl Reference for align_means::Kernel {
     fn reference(host: align_means::Host<'_>, push: align_means::Push, (): ()) {
-        means_reference(host.rendered, host.prior, None, host.partial, push);
+        partial_sums(push.pixels, host.partial, |i| {
+            let v = looks(host.valid, i);
+            [v, v * alignable(host.rendered[i].into(), push.near.into()), v * f64::from(host.prior[i])]
+        });
     }
+    /// The sums of terms of one sign pass through 8 + 14 additions; distances from the mean cancel, and are small against
+    /// the largest sum of the tensor where the means are right.
     fn check(_binding: &'static str) -> Check {
-        SUMS
+        Check { relative: 3e-6, absolute: 3e-6, band: 0.0 }
     }
-}
-
-impl Reference for align_means_masked::Kernel {
-    fn reference(host: align_means_masked::Host<'_>, push: align_means_masked::Push, (): ()) {
-        means_reference(host.rendered, host.prior, Some(host.valid), host.partial, bytemuck::cast(push));
-    }
-    fn check(_binding: &'static str) -> Check {
-        SUMS
-    }
-}
-
-fn moments_reference(
-    [rendered, prior, sums]: [&[f32]; 3],
-    valid: Option<&[f32]>,
-    partial: &mut [f32],
-    push: align_moments::Push,
-) {
-    // The means of the device's sums, in float32 as there: the distances' sums are these means' rounding.
-    let inverse = if sums[0] > 0.0 { 1.0 / sums[0] } else { 0.0 };
-    let mean = [f64::from(sums[1] * inverse), f64::from(sums[2] * inverse)];
-    let unit = unit(sums[0].into(), sums[1].into());
-    partial_sums(push.pixels, partial, |i| {
-        let v = valid.map_or(1.0, |v| f64::from(v[i]));
-        let dx = (alignable(rendered[i].into(), push.near.into()) - mean[0]) * unit;
-        let dp = f64::from(prior[i]) - mean[1];
-        [v * dx, v * dp, v * dx * dx, v * dx * dp]
-    });
 }
 
 impl Reference for align_moments::Kernel {
     fn reference(host: align_moments::Host<'_>, push: align_moments::Push, (): ()) {
-        moments_reference([host.rendered, host.prior, host.sums], None, host.partial, push);
+        // The means of the device's sums, in float32 as there: the distances' sums are these means' rounding.
+        let sums = host.sums;
+        let inverse = if sums[0] > 0.0 { 1.0 / sums[0] } else { 0.0 };
+        let mean = [f64::from(sums[1] * inverse), f64::from(sums[2] * inverse)];
+        let unit = unit(sums[0].into(), sums[1].into());
+        partial_sums(push.pixels, host.partial, |i| {
+            let v = looks(host.valid, i);
+            let dx = (alignable(host.rendered[i].into(), push.near.into()) - mean[0]) * unit;
+            let dp = f64::from(host.prior[i]) - mean[1];
+            [v * dx, v * dp, v * dx * dx, v * dx * dp]
+        });
     }
+    /// Distances carry the rounding of the mean and of the disparity: 3 * 6e-8 of the value each, up to ten times their
+    /// own size where the values spread over a tenth of their mean; the products are as inexact as the distances.
     fn check(_binding: &'static str) -> Check {
-        MOMENTS
+        Check { relative: 1e-5, absolute: 1e-5, band: 0.0 }
     }
     fn cancels(_binding: &'static str) -> bool {
         true // sums of distances from the mean
     }
 }
-
-impl Reference for align_moments_masked::Kernel {
-    fn reference(host: align_moments_masked::Host<'_>, push: align_moments_masked::Push, (): ()) {
-        let valid = Some(host.valid);
-        moments_reference([host.rendered, host.prior, host.sums], valid, host.partial, bytemuck::cast(push));
-    }
-    fn check(_binding: &'static str) -> Check {
-        MOMENTS
-    }
-    fn cancels(_binding: &'static str) -> bool {
-        true // sums of distances from the mean
-    }
-}
-
-/// Distances carry the rounding of the mean and of the disparity: 3 * 6e-8 of the value each, up to ten times their
-/// own size where the values spread over a tenth of their mean; the products are as inexact as the distances.
-const MOMENTS: Check = Check { relative: 1e-5, absolute: 1e-5, band: 0.0 };
 
 impl Reference for align_fit::Kernel {
     fn reference(host: align_fit::Host<'_>, (): (), (): ()) {
@@ -211,42 +169,20 @@ impl Reference for align_backward::Kernel {
     }
 }
 
-fn gradient_reference(
-    [grad_aligned, rendered, prior, fit, sums]: [&[f32]; 5],
-    valid: Option<&[f32]>,
-    grad_depth: &mut [f32],
-    push: align_gradient::Push,
-) {
-    let fit = read_fit(fit);
-    let sums = [f64::from(sums[0]), f64::from(sums[1])];
-    for (i, out) in grad_depth.iter_mut().enumerate().take(push.pixels as usize) {
-        let (depth, near) = (f64::from(rendered[i]), f64::from(push.near));
-        let v = valid.map_or(1.0, |v| f64::from(v[i]));
-        let grad = fit.gradient(grad_aligned[i].into(), sums, alignable(depth, near), prior[i].into(), v);
-        *out = (grad * alignable_slope(depth, near)) as f32;
-    }
-}
-
-/// Four terms of a few roundings each, which may cancel.
-const GRADIENT: Check = Check { relative: 1e-5, absolute: 2e-6, band: 0.0 };
-
 impl Reference for align_gradient::Kernel {
     fn reference(host: align_gradient::Host<'_>, push: align_gradient::Push, (): ()) {
-        let inputs = [host.grad_aligned, host.rendered, host.prior, host.fit, host.sums];
-        gradient_reference(inputs, None, host.grad_depth, push);
+        let fit = read_fit(host.fit);
+        let sums = [f64::from(host.sums[0]), f64::from(host.sums[1])];
+        for (i, out) in host.grad_depth.iter_mut().enumerate().take(push.pixels as usize) {
+            let (depth, near) = (f64::from(host.rendered[i]), f64::from(push.near));
+            let (grad, prior, v) = (host.grad_aligned[i].into(), host.prior[i].into(), looks(host.valid, i));
+            let grad = fit.gradient(grad, sums, alignable(depth, near), prior, v);
+            *out = (grad * alignable_slope(depth, near)) as f32;
+        }
     }
+    /// Four terms of a few roundings each, which may cancel.
     fn check(_binding: &'static str) -> Check {
-        GRADIENT
-    }
-}
-
-impl Reference for align_gradient_masked::Kernel {
-    fn reference(host: align_gradient_masked::Host<'_>, push: align_gradient_masked::Push, (): ()) {
-        let inputs = [host.grad_aligned, host.rendered, host.prior, host.fit, host.sums];
-        gradient_reference(inputs, Some(host.valid), host.grad_depth, bytemuck::cast(push));
-    }
-    fn check(_binding: &'static str) -> Check {
-        GRADIENT
+        Check { relative: 1e-5, absolute: 2e-6, band: 0.0 }
     }
 }
 
@@ -302,28 +238,12 @@ impl Align {
         let Self { pixels, partial, sums, fit, .. } = self;
         let (pixels, near) = (*pixels, prior.quantity.near());
         let (threads, groups) = (threads(pixels), groups(pixels));
-        let values = prior.values;
-        match prior.valid {
-            None => {
-                let buffers = align_means::Buffers { rendered, prior: values, partial };
-                rec.run(align_means::Kernel, buffers, align_means::Push { pixels, near }, threads);
-            }
-            Some(valid) => {
-                let buffers = align_means_masked::Buffers { rendered, prior: values, partial, valid };
-                rec.run(align_means_masked::Kernel, buffers, align_means_masked::Push { pixels, near }, threads);
-            }
-        }
+        let Prior { values: prior, valid, .. } = prior;
+        let buffers = align_means::Buffers { rendered, prior, partial, valid };
+        rec.run(align_means::Kernel, buffers, align_means::Push { pixels, near }, threads);
         sum::record(rec, partial, groups, 3, sums, 0);
-        match prior.valid {
-            None => {
-                let buffers = align_moments::Buffers { rendered, prior: values, sums, partial };
-                rec.run(align_moments::Kernel, buffers, align_moments::Push { pixels, near }, threads);
-            }
-            Some(valid) => {
-                let buffers = align_moments_masked::Buffers { rendered, prior: values, sums, partial, valid };
-                rec.run(align_moments_masked::Kernel, buffers, align_moments_masked::Push { pixels, near }, threads);
-            }
-        }
+        let buffers = align_moments::Buffers { rendered, prior, sums, partial, valid };
+        rec.run(align_moments::Kernel, buffers, align_moments::Push { pixels, near }, threads);
         sum::record(rec, partial, groups, 4, sums, 3);
         rec.run(align_fit::Kernel, align_fit::Buffers { sums, fit }, (), 1u32);
         fit
@@ -344,25 +264,10 @@ impl Align {
         let buffers = align_backward::Buffers { grad_aligned, rendered, fit, partial };
         rec.run(align_backward::Kernel, buffers, align_backward::Push { pixels, near }, threads(pixels));
         sum::record(rec, partial, groups(pixels), 2, grad_sums, 0);
-        let (values, sums) = (prior.values, grad_sums);
-        match prior.valid {
-            None => {
-                let buffers = align_gradient::Buffers { grad_aligned, rendered, prior: values, fit, sums, grad_depth };
-                rec.run(align_gradient::Kernel, buffers, align_gradient::Push { pixels, near }, pixels);
-            }
-            Some(valid) => {
-                let buffers = align_gradient_masked::Buffers {
-                    grad_aligned,
-                    rendered,
-                    prior: values,
-                    fit,
-                    sums,
-                    grad_depth,
-                    valid,
-                };
-                rec.run(align_gradient_masked::Kernel, buffers, align_gradient_masked::Push { pixels, near }, pixels);
-            }
-        }
+        let Prior { values: prior, valid, .. } = prior;
+        let buffers =
+            align_gradient::Buffers { grad_aligned, rendered, prior, fit, sums: grad_sums, grad_depth, valid };
+        rec.run(align_gradient::Kernel, buffers, align_gradient::Push { pixels, near }, pixels);
         grad_depth
     }
 }
@@ -388,33 +293,25 @@ mod tests {
                 let valid: Vec<f32> = noise(0.0, 1.0).into_iter().map(f32::round).collect();
                 let partial = vec![UNWRITTEN; 4 * groups(pixels) as usize + 1];
                 let threads = threads(pixels);
-                let case =
-                    align_means::Arrays { rendered: rendered.clone(), prior: prior.clone(), partial: partial.clone() };
-                testing::assert_twin(align_means::Kernel, &gpu, case, align_means::Push { pixels, near }, threads);
-                let case = align_means_masked::Arrays {
-                    rendered: rendered.clone(),
-                    prior: prior.clone(),
-                    partial: partial.clone(),
-                    valid: valid.clone(),
-                };
-                let push = align_means_masked::Push { pixels, near };
-                testing::assert_twin(align_means_masked::Kernel, &gpu, case, push, threads);
-                for n in [0.0, 1.0, pixels as f32] {
-                    let sums = vec![n, 2.5 * n, 0.5 * n];
-                    let case = align_moments_masked::Arrays {
+                let valids = [None, Some(valid)];
+                for valid in &valids {
+                    let case = align_means::Arrays {
                         rendered: rendered.clone(),
                         prior: prior.clone(),
-                        sums: sums.clone(),
                         partial: partial.clone(),
                         valid: valid.clone(),
                     };
-                    let push = align_moments_masked::Push { pixels, near };
-                    testing::assert_twin(align_moments_masked::Kernel, &gpu, case, push, threads);
+                    let push = align_means::Push { pixels, near };
+                    testing::assert_twin(align_means::Kernel, &gpu, case, push, threads);
+                }
+                for (n, valid) in [0.0, 1.0, pixels as f32].into_iter().flat_map(|n| valids.iter().map(move |v| (n, v)))
+                {
                     let case = align_moments::Arrays {
                         rendered: rendered.clone(),
                         prior: prior.clone(),
-                        sums,
+                        sums: vec![n, 2.5 * n, 0.5 * n],
                         partial: partial.clone(),
+                        valid: valid.clone(),
                     };
                     let push = align_moments::Push { pixels, near };
                     testing::assert_twin(align_moments::Kernel, &gpu, case, push, threads);
@@ -430,28 +327,19 @@ mod tests {
                     };
                     let push = align_backward::Push { pixels, near };
                     testing::assert_twin(align_backward::Kernel, &gpu, case, push, threads);
-                    let (sums, grad_depth) = (vec![0.4, -1.7], vec![UNWRITTEN; n]);
-                    let case = align_gradient::Arrays {
-                        grad_aligned: grad_aligned.clone(),
-                        rendered: rendered.clone(),
-                        prior: prior.clone(),
-                        fit: fit.clone(),
-                        sums: sums.clone(),
-                        grad_depth: grad_depth.clone(),
-                    };
-                    let push = align_gradient::Push { pixels, near };
-                    testing::assert_twin(align_gradient::Kernel, &gpu, case, push, pixels);
-                    let case = align_gradient_masked::Arrays {
-                        grad_aligned: grad_aligned.clone(),
-                        rendered: rendered.clone(),
-                        prior: prior.clone(),
-                        fit,
-                        sums,
-                        grad_depth,
-                        valid: valid.clone(),
-                    };
-                    let push = align_gradient_masked::Push { pixels, near };
-                    testing::assert_twin(align_gradient_masked::Kernel, &gpu, case, push, pixels);
+                    for valid in &valids {
+                        let case = align_gradient::Arrays {
+                            grad_aligned: grad_aligned.clone(),
+                            rendered: rendered.clone(),
+                            prior: prior.clone(),
+                            fit: fit.clone(),
+                            sums: vec![0.4, -1.7],
+                            grad_depth: vec![UNWRITTEN; n],
+                            valid: valid.clone(),
+                        };
+                        let push = align_gradient::Push { pixels, near };
+                        testing::assert_twin(align_gradient::Kernel, &gpu, case, push, pixels);
+                    }
                 }
             }
         }
@@ -473,7 +361,7 @@ mod tests {
         for (i, sums) in cases.into_iter().enumerate() {
             let case = align_fit::Arrays { sums, fit: vec![UNWRITTEN; 11] };
             testing::assert_twin(align_fit::Kernel, &gpu, case.clone(), (), 1u32);
-            let fit = testing::run_once::<align_fit::Kernel>(&gpu, &case, (), 1u32).fit;
+            let fit = testing::run_once(align_fit::Kernel, &gpu, &case, (), 1u32).fit;
             assert_eq!(fit[0] == 0.0 && fit[1] == 0.0 && fit[5] == 0.0, i > 0, "{i}: {fit:?}");
         }
     }

@@ -4,7 +4,7 @@
 
 use super::Term;
 use crate::cost::{Formula, if_so, work};
-use crate::gpu::kernels::losses::{depth_gradient, depth_gradient_counts, depth_gradient_masked};
+use crate::gpu::kernels::losses::{depth_gradient, depth_gradient_counts};
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 
 use super::align::{groups, partial_sums, threads};
@@ -63,51 +63,6 @@ impl Reference for depth_gradient_counts::Kernel {
     }
 }
 
-fn reference(
-    difference: &[f32],
-    mask: impl Fn(usize) -> f64,
-    count: impl Fn(u32) -> f64,
-    grad_aligned: &mut [f32],
-    partial: &mut [f32],
-    push: depth_gradient::Push,
-) {
-    let [width, height] = push.size.map(|v| v as usize);
-    let mut grad = vec![0.0; width * height];
-    let mut loss = vec![0.0; width * height];
-    // In float32 as on the device: the sign of a difference is then the same.
-    let value = |i: usize| f64::from(mask(i) as f32 * difference[i]);
-    for s in 0..push.scales {
-        let (step, count) = (1 << s, count(s));
-        if count == 0.0 {
-            break;
-        }
-        let scale = f64::from(push.factor) / count;
-        for (i, loss) in loss.iter_mut().enumerate().filter(|(i, _)| has(s, *i, width)) {
-            let neighbours = [(i % width + step < width, i + step), (i / width + step < height, i + step * width)];
-            for (_, j) in neighbours.into_iter().filter(|n| n.0) {
-                let (weight, d) = (scale * mask(i) * mask(j), value(j) - value(i));
-                *loss += weight * d.abs();
-                if d != 0.0 {
-                    grad[i] -= weight * d.signum() * mask(i);
-                    grad[j] += weight * d.signum() * mask(j);
-                }
-            }
-        }
-    }
-    for (out, grad) in grad_aligned.iter_mut().zip(grad) {
-        *out = (f64::from(*out) + grad) as f32;
-    }
-    partial_sums(push.size[0] * push.size[1], partial, |i| [loss[i]]);
-}
-
-fn check(binding: &str) -> Check {
-    match binding {
-        // Up to 4 terms a scale, and one addition.
-        "grad_aligned" => Check { relative: 2e-6, absolute: 1e-6, band: 0.0 },
-        _ => Check { relative: 1e-5, absolute: 1e-6, band: 0.0 },
-    }
-}
-
 /// Pixels of scale s along a side.
 fn along(side: u32, s: u32) -> u32 {
     side.div_ceil(1 << s)
@@ -115,25 +70,42 @@ fn along(side: u32, s: u32) -> u32 {
 
 impl Reference for depth_gradient::Kernel {
     fn reference(host: depth_gradient::Host<'_>, push: depth_gradient::Push, (): ()) {
-        let count = |s| f64::from(along(push.size[0], s)) * f64::from(along(push.size[1], s));
-        reference(host.difference, |_| 1.0, count, host.grad_aligned, host.partial, push);
+        let [width, height] = push.size.map(|v| v as usize);
+        let mut grad = vec![0.0; width * height];
+        let mut loss = vec![0.0; width * height];
+        let mask = |i: usize| host.valid.map_or(1.0, |valid| f64::from(valid[i]));
+        let all = |s: u32| f64::from(along(push.size[0], s)) * f64::from(along(push.size[1], s));
+        // In float32 as on the device: the sign of a difference is then the same.
+        let value = |i: usize| f64::from(mask(i) as f32 * host.difference[i]);
+        for s in 0..push.scales {
+            let (step, count) = (1 << s, host.counts.map_or_else(|| all(s), |counts| f64::from(counts[s as usize])));
+            if count == 0.0 {
+                break;
+            }
+            let scale = f64::from(push.factor) / count;
+            for (i, loss) in loss.iter_mut().enumerate().filter(|(i, _)| has(s, *i, width)) {
+                let neighbours = [(i % width + step < width, i + step), (i / width + step < height, i + step * width)];
+                for (_, j) in neighbours.into_iter().filter(|n| n.0) {
+                    let (weight, d) = (scale * mask(i) * mask(j), value(j) - value(i));
+                    *loss += weight * d.abs();
+                    if d != 0.0 {
+                        grad[i] -= weight * d.signum() * mask(i);
+                        grad[j] += weight * d.signum() * mask(j);
+                    }
+                }
+            }
+        }
+        for (out, grad) in host.grad_aligned.iter_mut().zip(grad) {
+            *out = (f64::from(*out) + grad) as f32;
+        }
+        partial_sums(push.size[0] * push.size[1], host.partial, |i| [loss[i]]);
     }
     fn check(binding: &'static str) -> Check {
-        check(binding)
-    }
-    fn cancels(binding: &'static str) -> bool {
-        binding == "grad_aligned" // steps up and down beside each other
-    }
-}
-
-impl Reference for depth_gradient_masked::Kernel {
-    fn reference(host: depth_gradient_masked::Host<'_>, push: depth_gradient_masked::Push, (): ()) {
-        let mask = |i: usize| f64::from(host.valid[i]);
-        let count = |s: u32| f64::from(host.counts[s as usize]);
-        reference(host.difference, mask, count, host.grad_aligned, host.partial, bytemuck::cast(push));
-    }
-    fn check(binding: &'static str) -> Check {
-        check(binding)
+        match binding {
+            // Up to 4 terms a scale, and one addition.
+            "grad_aligned" => Check { relative: 2e-6, absolute: 1e-6, band: 0.0 },
+            _ => Check { relative: 1e-5, absolute: 1e-6, band: 0.0 },
+        }
     }
     fn cancels(binding: &'static str) -> bool {
         binding == "grad_aligned" // steps up and down beside each other
@@ -203,24 +175,16 @@ impl DepthGradient {
         let Self { size, scales, partial, counts } = self;
         let (size, scales) = (*size, *scales);
         let pixels = size[0] * size[1];
-        match valid {
-            None => {
-                let buffers = depth_gradient::Buffers { difference, grad_aligned, partial };
-                let push = depth_gradient::Push { size, factor, scales };
-                rec.run(depth_gradient::Kernel, buffers, push, threads(pixels));
-            }
-            Some(valid) => {
-                let Counts { partial: count_partial, counts } =
-                    counts.as_ref().expect("a masked depth gradient is made with counts");
-                let buffers = depth_gradient_counts::Buffers { valid, partial: count_partial };
-                let push = depth_gradient_counts::Push { size, scales };
-                rec.run(depth_gradient_counts::Kernel, buffers, push, threads(pixels));
-                sum::record(rec, count_partial, groups(pixels), scales, counts, 0);
-                let buffers = depth_gradient_masked::Buffers { difference, grad_aligned, partial, valid, counts };
-                let push = depth_gradient_masked::Push { size, factor, scales };
-                rec.run(depth_gradient_masked::Kernel, buffers, push, threads(pixels));
-            }
-        }
+        let counts = valid.map(|valid| {
+            let Counts { partial, counts } = counts.as_ref().expect("a masked depth gradient is made with counts");
+            let buffers = depth_gradient_counts::Buffers { valid, partial };
+            let push = depth_gradient_counts::Push { size, scales };
+            rec.run(depth_gradient_counts::Kernel, buffers, push, threads(pixels));
+            sum::record(rec, partial, groups(pixels), scales, counts, 0);
+            counts
+        });
+        let buffers = depth_gradient::Buffers { difference, grad_aligned, partial, valid, counts };
+        rec.run(depth_gradient::Kernel, buffers, depth_gradient::Push { size, factor, scales }, threads(pixels));
         sum::record(rec, partial, groups(pixels), 1, losses, slot);
     }
 }
@@ -247,6 +211,8 @@ mod tests {
                     difference: difference.clone(),
                     grad_aligned: noise(),
                     partial: partial.clone(),
+                    valid: None,
+                    counts: None,
                 };
                 let push = depth_gradient::Push { size, factor: 0.5, scales };
                 testing::assert_twin(depth_gradient::Kernel, &gpu, case.clone(), push, threads(pixels));
@@ -264,15 +230,15 @@ mod tests {
                         on.map(|i| valid[i]).sum()
                     });
                     let counts = counts.collect();
-                    let case = depth_gradient_masked::Arrays {
+                    let case = depth_gradient::Arrays {
                         difference: difference.clone(),
                         grad_aligned: noise(),
                         partial: partial.clone(),
-                        valid,
-                        counts,
+                        valid: Some(valid),
+                        counts: Some(counts),
                     };
-                    let push = depth_gradient_masked::Push { size, factor: 0.5, scales };
-                    testing::assert_twin(depth_gradient_masked::Kernel, &gpu, case, push, threads(pixels));
+                    let push = depth_gradient::Push { size, factor: 0.5, scales };
+                    testing::assert_twin(depth_gradient::Kernel, &gpu, case, push, threads(pixels));
                 }
             }
         }

@@ -3,7 +3,7 @@
 
 use super::Term;
 use crate::cost::{Formula, if_so, work};
-use crate::gpu::kernels::losses::{depth_l1, depth_l1_weighted};
+use crate::gpu::kernels::losses::depth_l1;
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::math::align::{Fit, alignable};
 
@@ -27,56 +27,26 @@ pub(super) const COSTS: &[Formula] = &[Formula {
     work: |c, d| work((16.0 + 4.0 * if_so(d.is("weighted"))) * c.pixels, 10.0 * c.pixels, 0.0),
 }];
 
-struct Inputs<'a> {
-    rendered: &'a [f32],
-    prior: &'a [f32],
-    fit: &'a [f32],
-    weight: Option<&'a [f32]>,
-}
-
-fn reference(
-    from: &Inputs<'_>,
-    [difference, grad_aligned, partial]: [&mut [f32]; 3],
-    depth_l1::Push { pixels, near, factor }: depth_l1::Push,
-) {
-    let fit = Fit::from_array(std::array::from_fn(|i| f64::from(from.fit[i])));
-    let d = |i: usize| fit.difference(alignable(from.rendered[i].into(), near.into()), from.prior[i].into());
-    let scale = |i: usize| f64::from(factor) * from.weight.map_or(1.0, |w| f64::from(w[i]));
-    for i in 0..pixels as usize {
-        let d = d(i);
-        difference[i] = d as f32;
-        grad_aligned[i] = if d == 0.0 { 0.0 } else { (scale(i) * d.signum()) as f32 };
-    }
-    partial_sums(pixels, partial, |i| [scale(i) * d(i).abs()]);
-}
-
-fn check(binding: &str) -> Check {
-    match binding {
-        // A sign may flip where the difference is within its rounding, 1e-6 of the depths, of zero.
-        "grad_aligned" => Check { relative: 1e-6, absolute: 0.0, band: 1e-5 },
-        // Six roundings of 6e-8 of the aligned value and the prior, which cancel to a hundredth of them in a good fit.
-        _ => Check { relative: 1e-6, absolute: 4e-5, band: 0.0 },
-    }
-}
-
 impl Reference for depth_l1::Kernel {
     fn reference(host: depth_l1::Host<'_>, push: depth_l1::Push, (): ()) {
-        let from = Inputs { rendered: host.rendered, prior: host.prior, fit: host.fit, weight: None };
-        reference(&from, [host.difference, host.grad_aligned, host.partial], push);
+        let depth_l1::Push { pixels, near, factor } = push;
+        let fit = Fit::from_array(std::array::from_fn(|i| f64::from(host.fit[i])));
+        let d = |i: usize| fit.difference(alignable(host.rendered[i].into(), near.into()), host.prior[i].into());
+        let scale = |i: usize| f64::from(factor) * host.weight.map_or(1.0, |w| f64::from(w[i]));
+        for i in 0..pixels as usize {
+            let d = d(i);
+            host.difference[i] = d as f32;
+            host.grad_aligned[i] = if d == 0.0 { 0.0 } else { (scale(i) * d.signum()) as f32 };
+        }
+        partial_sums(pixels, host.partial, |i| [scale(i) * d(i).abs()]);
     }
     fn check(binding: &'static str) -> Check {
-        check(binding)
-    }
-}
-
-impl Reference for depth_l1_weighted::Kernel {
-    fn reference(host: depth_l1_weighted::Host<'_>, push: depth_l1_weighted::Push, (): ()) {
-        let weight = Some(host.weight);
-        let from = Inputs { rendered: host.rendered, prior: host.prior, fit: host.fit, weight };
-        reference(&from, [host.difference, host.grad_aligned, host.partial], bytemuck::cast(push));
-    }
-    fn check(binding: &'static str) -> Check {
-        check(binding)
+        match binding {
+            // A sign may flip where the difference is within its rounding, 1e-6 of the depths, of zero.
+            "grad_aligned" => Check { relative: 1e-6, absolute: 0.0, band: 1e-5 },
+            // Six roundings of 6e-8 of the aligned value and the prior, which cancel to a hundredth of them in a good fit.
+            _ => Check { relative: 1e-6, absolute: 4e-5, band: 0.0 },
+        }
     }
 }
 
@@ -131,26 +101,13 @@ impl DepthL1 {
     ) -> (&Buffer<f32>, &Buffer<f32>) {
         let Self { pixels, difference, grad_aligned, partial } = self;
         let (pixels, near, values) = (*pixels, prior.quantity.near(), prior.values);
-        match weight {
-            Weight::All(weight) => {
-                let push = depth_l1::Push { pixels, near, factor: weight / pixels as f32 };
-                let buffers = depth_l1::Buffers { rendered, prior: values, fit, difference, grad_aligned, partial };
-                rec.run(depth_l1::Kernel, buffers, push, threads(pixels));
-            }
-            Weight::Each(weight) => {
-                let push = depth_l1_weighted::Push { pixels, near, factor: 1.0 / pixels as f32 };
-                let buffers = depth_l1_weighted::Buffers {
-                    rendered,
-                    prior: values,
-                    fit,
-                    difference,
-                    grad_aligned,
-                    partial,
-                    weight,
-                };
-                rec.run(depth_l1_weighted::Kernel, buffers, push, threads(pixels));
-            }
-        }
+        let (all, weight) = match weight {
+            Weight::All(weight) => (weight, None),
+            Weight::Each(weight) => (1.0, Some(weight)),
+        };
+        let buffers = depth_l1::Buffers { rendered, prior: values, fit, difference, grad_aligned, partial, weight };
+        let push = depth_l1::Push { pixels, near, factor: all / pixels as f32 };
+        rec.run(depth_l1::Kernel, buffers, push, threads(pixels));
         sum::record(rec, partial, groups(pixels), 1, losses, slot);
         (difference, grad_aligned)
     }
@@ -171,28 +128,19 @@ mod tests {
                 let n = pixels as usize + 3;
                 let mut noise = || -> Vec<f32> { (0..n).map(|_| rng.random()).collect() };
                 let unwritten = vec![UNWRITTEN; n];
-                let case = depth_l1::Arrays {
+                let mut case = depth_l1::Arrays {
                     rendered: noise(),
                     prior: noise(),
                     fit: vec![0.3, 0.2, 0.5, 0.4, -0.3, 0.1, 0.2, 0.1, 0.5, 1e-3, -2e-3],
                     difference: unwritten.clone(),
                     grad_aligned: unwritten.clone(),
                     partial: vec![UNWRITTEN; groups(pixels) as usize + 1],
+                    weight: None,
                 };
                 let push = depth_l1::Push { pixels, near, factor: 0.7 };
                 testing::assert_twin(depth_l1::Kernel, &gpu, case.clone(), push, threads(pixels));
-                let depth_l1::Arrays { rendered, prior, fit, difference, grad_aligned, partial } = case;
-                let case = depth_l1_weighted::Arrays {
-                    rendered,
-                    prior,
-                    fit,
-                    difference,
-                    grad_aligned,
-                    partial,
-                    weight: noise(),
-                };
-                let push = depth_l1_weighted::Push { pixels, near, factor: 0.7 };
-                testing::assert_twin(depth_l1_weighted::Kernel, &gpu, case, push, threads(pixels));
+                case.weight = Some(noise());
+                testing::assert_twin(depth_l1::Kernel, &gpu, case, push, threads(pixels));
             }
         }
     }
@@ -207,8 +155,10 @@ mod tests {
             difference: vec![UNWRITTEN; 2],
             grad_aligned: vec![UNWRITTEN; 2],
             partial: vec![UNWRITTEN],
+            weight: None,
         };
-        let got = testing::run_once::<depth_l1::Kernel>(
+        let got = testing::run_once(
+            depth_l1::Kernel,
             &gpu,
             &case,
             depth_l1::Push { pixels: 2, near: 0.0, factor: 1.0 },

@@ -1,7 +1,7 @@
 //! The step's photograph and what its mask says, from 8 bits per channel to the arrays that the losses read.
 
 use crate::cost::{Formula, if_so, work};
-use crate::gpu::kernels::losses::{frame, frame_masked, frame_masked_depth};
+use crate::gpu::kernels::losses::frame;
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 
 /// What the passes have to do.
@@ -48,58 +48,32 @@ pub struct Rectangle {
     pub added: f32,
 }
 
-fn target(picture: &[u32], target: &mut [[f32; 3]], pixels: u32) {
-    for (out, word) in target.iter_mut().zip(picture).take(pixels as usize) {
-        let [r, g, b, _] = word.to_le_bytes();
-        *out = [r, g, b].map(|v| (f64::from(v) / 255.0) as f32);
-    }
-}
-
-fn choose(picture: &[u32], out: &mut [f32], pixels: u32, value: impl Fn(usize, f64) -> f32) {
-    for (pixel, (out, word)) in out.iter_mut().zip(picture).enumerate().take(pixels as usize) {
-        *out = value(pixel, f64::from(word >> 24) / 255.0);
-    }
-}
-
-/// A division, two products and two sums of positive terms.
-const CHECK: Check = Check { relative: 5e-7, absolute: 0.0, band: 0.0 };
-
 impl Reference for frame::Kernel {
     fn reference(host: frame::Host<'_>, push: frame::Push, (): ()) {
-        target(host.picture, host.target, push.pixels);
-    }
-    fn check(_binding: &'static str) -> Check {
-        CHECK
-    }
-}
-
-impl Reference for frame_masked::Kernel {
-    fn reference(host: frame_masked::Host<'_>, push: frame_masked::Push, (): ()) {
-        target(host.picture, host.target, push.pixels);
-        choose(host.picture, host.weight, push.pixels, |_, share| mix(push.outside, push.inside, share));
-    }
-    fn check(_binding: &'static str) -> Check {
-        CHECK
-    }
-}
-
-impl Reference for frame_masked_depth::Kernel {
-    fn reference(host: frame_masked_depth::Host<'_>, push: frame_masked_depth::Push, (): ()) {
-        target(host.picture, host.target, push.pixels);
-        choose(host.picture, host.weight, push.pixels, |_, share| mix(push.outside, push.inside, share));
-        let has = |pixel: usize| host.prior[pixel] > NO_PRIOR;
-        choose(host.picture, host.given, push.pixels, |pixel, _| if has(pixel) { 1.0 } else { 0.0 });
-        let valid = |pixel, share| if has(pixel) && share == 0.0 { 1.0 } else { 0.0 };
-        choose(host.picture, host.valid, push.pixels, valid);
-        choose(host.picture, host.depth_weight, push.pixels, |pixel, share| {
+        let pixels = push.pixels as usize;
+        for (out, word) in host.target.iter_mut().zip(host.picture).take(pixels) {
+            let [r, g, b, _] = word.to_le_bytes();
+            *out = [r, g, b].map(|v| (f64::from(v) / 255.0) as f32);
+        }
+        let choose = |out: Option<&mut [f32]>, value: &dyn Fn(usize, f64) -> f32| {
+            for (pixel, (out, word)) in out.into_iter().flatten().zip(host.picture).enumerate().take(pixels) {
+                *out = value(pixel, f64::from(word >> 24) / 255.0);
+            }
+        };
+        let has = |pixel: usize| host.prior.is_some_and(|prior| prior[pixel] > NO_PRIOR);
+        choose(host.weight, &|_, share| mix(push.outside, push.inside, share));
+        choose(host.given, &|pixel, _| if has(pixel) { 1.0 } else { 0.0 });
+        choose(host.valid, &|pixel, share| if has(pixel) && share == 0.0 { 1.0 } else { 0.0 });
+        choose(host.depth_weight, &|pixel, share| {
             let at = [pixel as u32 % push.width, pixel as u32 / push.width];
             let added = (0..2).all(|i| (push.low[i]..push.high[i]).contains(&at[i]));
             let weight = mix(push.depth_outside, push.depth_inside, share) + if added { push.depth_added } else { 0.0 };
             if has(pixel) { weight } else { 0.0 }
         });
     }
+    /// A division, two products and two sums of positive terms.
     fn check(_binding: &'static str) -> Check {
-        CHECK
+        Check { relative: 5e-7, absolute: 0.0, band: 0.0 }
     }
 }
 
@@ -159,28 +133,21 @@ impl Frame {
         let Self { size: [width, height], target, masked } = self;
         let pixels = width * height;
         let Weights { outside, inside } = weights;
-        let Some(Masked { weight, depth: arrays }) = masked else {
-            return rec.run(frame::Kernel, frame::Buffers { picture, target }, frame::Push { pixels }, pixels);
-        };
-        let (Some(arrays), Some((depth, rectangle, prior))) = (arrays, depth) else {
-            let buffers = frame_masked::Buffers { picture, target, weight };
-            return rec.run(frame_masked::Kernel, buffers, frame_masked::Push { pixels, outside, inside }, pixels);
-        };
-        let Rectangle { low, high, added } = rectangle.unwrap_or(Rectangle { low: [0; 2], high: [0; 2], added: 0.0 });
-        let push = frame_masked_depth::Push {
-            pixels,
-            outside,
-            inside,
-            depth_outside: depth.outside,
-            depth_inside: depth.inside,
-            depth_added: added,
-            width: *width,
-            low,
-            high,
-        };
-        let MaskedDepth { valid, given, weight: depth_weight } = arrays;
-        let buffers = frame_masked_depth::Buffers { picture, target, weight, valid, depth_weight, prior, given };
-        rec.run(frame_masked_depth::Kernel, buffers, push, pixels);
+        let mut push = frame::Push { pixels, outside, inside, ..frame::Push::default() };
+        let weight = masked.as_ref().map(|masked| &masked.weight);
+        let mut buffers =
+            frame::Buffers { picture, target, weight, valid: None, depth_weight: None, prior: None, given: None };
+        let arrays = masked.as_ref().and_then(|masked| masked.depth.as_ref());
+        if let (Some(arrays), Some((depth, rectangle, prior))) = (arrays, depth) {
+            let none = Rectangle { low: [0; 2], high: [0; 2], added: 0.0 };
+            let Rectangle { low, high, added } = rectangle.unwrap_or(none);
+            let (depth_outside, depth_inside) = (depth.outside, depth.inside);
+            push = frame::Push { depth_outside, depth_inside, depth_added: added, width: *width, low, high, ..push };
+            let MaskedDepth { valid, given, weight } = arrays;
+            let (valid, given, depth_weight, prior) = (Some(valid), Some(given), Some(weight), Some(prior));
+            buffers = frame::Buffers { valid, given, depth_weight, prior, ..buffers };
+        }
+        rec.run(frame::Kernel, buffers, push, pixels);
     }
 
     /// The photograph \[pixel\], rgb in 0 to 1.
@@ -227,25 +194,10 @@ mod tests {
                 .collect();
             let target = vec![[UNWRITTEN; 3]; n];
             let unwritten = vec![UNWRITTEN; n];
-            let case = frame::Arrays { picture: picture.clone(), target: target.clone() };
-            testing::assert_twin(frame::Kernel, &gpu, case, frame::Push { pixels }, pixels);
-            let case =
-                frame_masked::Arrays { picture: picture.clone(), target: target.clone(), weight: unwritten.clone() };
-            let push = frame_masked::Push { pixels, outside: 1.0, inside: 20.0 };
-            testing::assert_twin(frame_masked::Kernel, &gpu, case, push, pixels);
-            let case = frame_masked_depth::Arrays {
-                picture,
-                target,
-                weight: unwritten.clone(),
-                valid: unwritten.clone(),
-                given: unwritten.clone(),
-                depth_weight: unwritten,
-                prior: (0..n).map(|_| if rng.random::<f32>() < 0.2 { NO_PRIOR } else { rng.random() }).collect(),
-            };
-            let push = frame_masked_depth::Push {
+            let push = frame::Push {
                 pixels,
                 outside: 1.0,
-                inside: 0.0,
+                inside: 20.0,
                 depth_outside: 0.1,
                 depth_inside: 0.0,
                 depth_added: 99.0,
@@ -253,7 +205,15 @@ mod tests {
                 low: [2, 1],
                 high: [width.saturating_sub(3), 30],
             };
-            testing::assert_twin(frame_masked_depth::Kernel, &gpu, case, push, pixels);
+            let mut case = frame::Arrays { picture, target, ..frame::Arrays::default() };
+            testing::assert_twin(frame::Kernel, &gpu, case.clone(), push, pixels);
+            case.weight = Some(unwritten.clone());
+            testing::assert_twin(frame::Kernel, &gpu, case.clone(), push, pixels);
+            let prior = (0..n).map(|_| if rng.random::<f32>() < 0.2 { NO_PRIOR } else { rng.random() }).collect();
+            (case.valid, case.given, case.depth_weight) =
+                (Some(unwritten.clone()), Some(unwritten.clone()), Some(unwritten));
+            case.prior = Some(prior);
+            testing::assert_twin(frame::Kernel, &gpu, case, push, pixels);
         }
     }
 
@@ -262,8 +222,15 @@ mod tests {
         let gpu = testing::gpu();
         let bytes: Vec<u8> = (0..=255).collect();
         let picture = bytes.iter().map(|&v| pack([v, 255 - v, v ^ 0x55], 255 * (v % 2))).collect();
-        let case = frame::Arrays { picture, target: vec![[UNWRITTEN; 3]; 256] };
-        let got = testing::run_once::<frame::Kernel>(&gpu, &case, frame::Push { pixels: 256 }, 256u32).target;
+        let case = frame::Arrays { picture, target: vec![[UNWRITTEN; 3]; 256], ..frame::Arrays::default() };
+        let got = testing::run_once(
+            frame::Kernel,
+            &gpu,
+            &case,
+            frame::Push { pixels: 256, ..frame::Push::default() },
+            256u32,
+        )
+        .target;
         for (v, got) in bytes.iter().zip(got) {
             assert_eq!(got.map(|c| (c * 255.0).round() as u8), [*v, 255 - v, v ^ 0x55]);
         }

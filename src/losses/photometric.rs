@@ -6,12 +6,8 @@
 use super::Term;
 use crate::cost::{Formula, if_so, work};
 use crate::gpu::kernels::losses::{
-    photometric_adjoint as adjoint, photometric_columns as columns, photometric_columns_weighted as columns_weighted,
-    photometric_gradient as gradient, photometric_gradient_l1 as gradient_l1,
-    photometric_gradient_l1_weighted as gradient_l1_weighted, photometric_gradient_weighted as gradient_weighted,
-    photometric_gradient_weighted_outside as gradient_outside, photometric_rows as rows,
-    photometric_rows_outside as rows_outside, photometric_rows_outside_wide as rows_outside_wide,
-    photometric_rows_wide as rows_wide,
+    photometric_adjoint as adjoint, photometric_columns as columns, photometric_gradient as gradient,
+    photometric_rows as rows,
 };
 use crate::gpu::{Buffer, Check, Error, Form, Gpu, Recorder, Reference};
 use crate::math::ssim;
@@ -62,115 +58,71 @@ const RUN: usize = 8;
 /// Pixels of a thread in the form for GPUs of `photometric_rows`.
 const WIDE_RUN: u32 = 4;
 
-/// With `weight` both pictures agree where it is 0.
-fn rows_reference(
-    [rendered, target]: [&[[f32; 3]]; 2],
-    weight: Option<&[f32]>,
-    moments: &mut [[f32; 4]],
-    size: [u32; 2],
-) {
-    let [width, height] = size.map(|v| v as usize);
-    for y in 0..height {
-        for x in 0..width {
-            for c in 0..3 {
-                let a = |x: usize| f64::from(rendered[y * width + x][c]);
-                let b = |x: usize| match weight {
-                    Some(weight) if weight[y * width + x] == 0.0 => a(x),
-                    _ => f64::from(target[y * width + x][c]),
-                };
-                let blur = |value: &dyn Fn(usize) -> f64| ssim::blur(x, width, value);
-                let e = |x| a(x) - b(x);
-                let (ma, mb, me) = (blur(&a), blur(&b), blur(&e));
-                let sum = blur(&|x| a(x) * a(x) + b(x) * b(x)) - ma * ma - mb * mb;
-                let variance = blur(&|x| e(x) * e(x)) - me * me;
-                moments[(y * width + x) * 3 + c] = [ma, me, sum.max(0.0), variance.max(0.0)].map(|v| v as f32);
+impl Reference for rows::Kernel {
+    /// With a weight both pictures agree where it is 0.
+    fn reference(host: rows::Host<'_>, push: rows::Push, (): ()) {
+        let [width, height] = push.size.map(|v| v as usize);
+        for y in 0..height {
+            for x in 0..width {
+                for c in 0..3 {
+                    let a = |x: usize| f64::from(host.rendered[y * width + x][c]);
+                    let b = |x: usize| match host.weight {
+                        Some(weight) if weight[y * width + x] == 0.0 => a(x),
+                        _ => f64::from(host.target[y * width + x][c]),
+                    };
+                    let blur = |value: &dyn Fn(usize) -> f64| ssim::blur(x, width, value);
+                    let e = |x| a(x) - b(x);
+                    let (ma, mb, me) = (blur(&a), blur(&b), blur(&e));
+                    let sum = blur(&|x| a(x) * a(x) + b(x) * b(x)) - ma * ma - mb * mb;
+                    let variance = blur(&|x| e(x) * e(x)) - me * me;
+                    let moments = [ma, me, sum.max(0.0), variance.max(0.0)];
+                    host.moments[(y * width + x) * 3 + c] = moments.map(|v| v as f32);
+                }
             }
         }
     }
-}
-
-/// At most 18 roundings of 6e-8 each of terms no larger than the squared contrast of the run's surroundings.
-const ROWS: Check = Check { relative: 1e-5, absolute: 2e-6, band: 0.0 };
-
-macro_rules! rows_twin {
-    ($module:ident $(, $weight:ident)?) => {
-        impl Reference for $module::Kernel {
-            fn reference(host: $module::Host<'_>, push: $module::Push, (): ()) {
-                let mut _weight = None;
-                $(_weight = Some(host.$weight);)?
-                rows_reference([host.rendered, host.target], _weight, host.moments, push.size);
-            }
-            fn check(_binding: &'static str) -> Check {
-                ROWS
-            }
-            fn cancels(_binding: &'static str) -> bool {
-                true // variances of flat surroundings
-            }
-        }
-    };
-}
-rows_twin!(rows);
-rows_twin!(rows_wide);
-rows_twin!(rows_outside, weight);
-rows_twin!(rows_outside_wide, weight);
-
-fn columns_reference(
-    moments: &[[f32; 4]],
-    grad_moments: &mut [[f32; 3]],
-    partial: &mut [f32],
-    weight: Option<&[f32]>,
-    push: columns::Push,
-) {
-    let [width, height] = push.size.map(|v| v as usize);
-    let line = 3 * width;
-    let mut losses = vec![0.0; column_groups(push.size)[0]];
-    for y in 0..height {
-        for x in 0..line {
-            let at = |y: usize, i: usize| f64::from(moments[y * line + x][i]);
-            let blur = |value: &dyn Fn(usize) -> f64| ssim::blur(y, height, value);
-            let b = |y| at(y, 0) - at(y, 1);
-            let (ma, mb, me) = (blur(&|y| at(y, 0)), blur(&b), blur(&|y| at(y, 1)));
-            // Law of total variance.
-            let sum = blur(&|y| at(y, 2) + at(y, 0) * at(y, 0) + b(y) * b(y)) - ma * ma - mb * mb;
-            let variance = blur(&|y| at(y, 3) + at(y, 1) * at(y, 1)) - me * me;
-            let (value, by) = ssim::derivatives([ma, me, sum.max(0.0), variance.max(0.0)]);
-            let scale = f64::from(push.factor) * weight.map_or(1.0, |w| f64::from(w[(y * line + x) / 3]));
-            grad_moments[y * line + x] = by.map(|d| (-scale * d) as f32);
-            losses[(y / RUN * line + x) / 64] += scale * value;
-        }
+    /// At most 18 roundings of 6e-8 each of terms no larger than the squared contrast of the run's surroundings.
+    fn check(_binding: &'static str) -> Check {
+        Check { relative: 1e-5, absolute: 2e-6, band: 0.0 }
     }
-    for (partial, loss) in partial.iter_mut().zip(losses) {
-        *partial = loss as f32;
-    }
-}
-
-fn columns_check(binding: &str) -> Check {
-    match binding {
-        // 1 - SSIM is rounded at 6e-8 of one; the tensor's largest partial sum has terms of that size.
-        "partial" => Check { relative: 1e-5, absolute: 1e-5, band: 0.0 },
-        // Variance and covariance have an error of 12 roundings of the window's squared distance from the run's middle
-        // value, against C2 = 9e-4 in the denominator: at most 12 * 6e-8 / 9e-4 = 8e-4 beside the strongest edge,
-        // far less where the contrast is the window's own. The derivatives are quotients of these, their sums cancel.
-        _ => Check { relative: 1e-4, absolute: 1e-4, band: 0.0 },
+    fn cancels(_binding: &'static str) -> bool {
+        true // variances of flat surroundings
     }
 }
 
 impl Reference for columns::Kernel {
     fn reference(host: columns::Host<'_>, push: columns::Push, (): ()) {
-        columns_reference(host.moments, host.grad_moments, host.partial, None, push);
+        let [width, height] = push.size.map(|v| v as usize);
+        let line = 3 * width;
+        let mut losses = vec![0.0; column_groups(push.size)[0]];
+        for y in 0..height {
+            for x in 0..line {
+                let at = |y: usize, i: usize| f64::from(host.moments[y * line + x][i]);
+                let blur = |value: &dyn Fn(usize) -> f64| ssim::blur(y, height, value);
+                let b = |y| at(y, 0) - at(y, 1);
+                let (ma, mb, me) = (blur(&|y| at(y, 0)), blur(&b), blur(&|y| at(y, 1)));
+                // Law of total variance.
+                let sum = blur(&|y| at(y, 2) + at(y, 0) * at(y, 0) + b(y) * b(y)) - ma * ma - mb * mb;
+                let variance = blur(&|y| at(y, 3) + at(y, 1) * at(y, 1)) - me * me;
+                let (value, by) = ssim::derivatives([ma, me, sum.max(0.0), variance.max(0.0)]);
+                let scale = f64::from(push.factor) * host.weight.map_or(1.0, |w| f64::from(w[(y * line + x) / 3]));
+                host.grad_moments[y * line + x] = by.map(|d| (-scale * d) as f32);
+                losses[(y / RUN * line + x) / 64] += scale * value;
+            }
+        }
+        for (partial, loss) in host.partial.iter_mut().zip(losses) {
+            *partial = loss as f32;
+        }
     }
     fn check(binding: &'static str) -> Check {
-        columns_check(binding)
-    }
-}
-
-impl Reference for columns_weighted::Kernel {
-    fn reference(host: columns_weighted::Host<'_>, push: columns_weighted::Push, (): ()) {
-        let push = bytemuck::cast(push);
-        columns_reference(host.moments, host.grad_moments, host.partial, Some(host.weight), push);
-    }
-    fn check(binding: &'static str) -> Check {
-        columns_check(binding)
+        match binding {
+            // 1 - SSIM is rounded at 6e-8 of one; the tensor's largest partial sum has terms of that size.
+            "partial" => Check { relative: 1e-5, absolute: 1e-5, band: 0.0 },
+            // Variance and covariance have an error of 12 roundings of the window's squared distance from the run's middle
+            // value, against C2 = 9e-4 in the denominator: at most 12 * 6e-8 / 9e-4 = 8e-4 beside the strongest edge,
+            // far less where the contrast is the window's own. The derivatives are quotients of these, their sums cancel.
+            _ => Check { relative: 1e-4, absolute: 1e-4, band: 0.0 },
+        }
     }
 }
 
@@ -191,116 +143,43 @@ impl Reference for adjoint::Kernel {
     }
 }
 
-struct Pictures<'a> {
-    grad_rows: Option<&'a [[f32; 3]]>,
-    rendered: &'a [[f32; 3]],
-    target: &'a [[f32; 3]],
-    weight: Option<&'a [f32]>,
-    /// No gradient where the weight is 0.
-    outside: bool,
-}
-
-fn gradient_reference(from: &Pictures<'_>, grad_rendered: &mut [[f32; 3]], partial: &mut [f32], push: gradient::Push) {
-    let [width, height] = push.size.map(|v| v as usize);
-    let mut losses = vec![0.0; column_groups(push.size)[1]];
-    for y in 0..height {
-        for x in 0..width {
-            let pixel = y * width + x;
-            let scale = f64::from(push.factor) * from.weight.map_or(1.0, |w| f64::from(w[pixel]));
-            for (c, grad) in grad_rendered[pixel].iter_mut().enumerate() {
-                let (a, b) = (f64::from(from.rendered[pixel][c]), f64::from(from.target[pixel][c]));
-                let s: [f64; 3] = from.grad_rows.map_or([0.0; 3], |rows| {
-                    let row = |k: usize| move |y: usize| f64::from(rows[(y * width + x) * 3 + c][k]);
-                    std::array::from_fn(|k| ssim::blur(y, height, row(k)))
-                });
-                losses[(y / RUN * width + x) / 64] += scale * (a - b).abs();
-                let sign = if a == b { 0.0 } else { (a - b).signum() };
-                if from.outside && scale == 0.0 {
-                    *grad = 0.0;
-                    continue;
+impl Reference for gradient::Kernel {
+    /// `Outside`: no gradient where the weight is 0.
+    fn reference(host: gradient::Host<'_>, push: gradient::Push, (): ()) {
+        let [width, height] = push.size.map(|v| v as usize);
+        let mut losses = vec![0.0; column_groups(push.size)[1]];
+        for y in 0..height {
+            for x in 0..width {
+                let pixel = y * width + x;
+                let scale = f64::from(push.factor) * host.weight.map_or(1.0, |w| f64::from(w[pixel]));
+                for (c, grad) in host.grad_rendered[pixel].iter_mut().enumerate() {
+                    let (a, b) = (f64::from(host.rendered[pixel][c]), f64::from(host.target[pixel][c]));
+                    let s: [f64; 3] = host.grad_rows.map_or([0.0; 3], |rows| {
+                        let row = |k: usize| move |y: usize| f64::from(rows[(y * width + x) * 3 + c][k]);
+                        std::array::from_fn(|k| ssim::blur(y, height, row(k)))
+                    });
+                    losses[(y / RUN * width + x) / 64] += scale * (a - b).abs();
+                    let sign = if a == b { 0.0 } else { (a - b).signum() };
+                    if host.kernel == gradient::Kernel::Outside && scale == 0.0 {
+                        *grad = 0.0;
+                        continue;
+                    }
+                    let value = s[0] + 2.0 * ((a - 0.5) * s[1] + (a - b) * s[2]) + scale * sign;
+                    *grad = value as f32;
                 }
-                let value = s[0] + 2.0 * ((a - 0.5) * s[1] + (a - b) * s[2]) + scale * sign;
-                *grad = value as f32;
             }
         }
-    }
-    for (partial, loss) in partial[push.first as usize..].iter_mut().zip(losses) {
-        *partial = loss as f32;
-    }
-}
-
-fn gradient_check(binding: &str) -> Check {
-    match binding {
-        "partial" => Check::default(),
-        // 14 roundings of 6e-8 of the blurred terms, which are up to 1 / C2 of SSIM's share and cancel where a flat
-        // picture meets another: at most 14 * 6e-8 * 0.2 / 0.8 / C2 = 2e-4 of L1's part of the gradient.
-        _ => Check { relative: 1e-5, absolute: 1e-4, band: 0.0 },
-    }
-}
-
-impl Reference for gradient::Kernel {
-    fn reference(host: gradient::Host<'_>, push: gradient::Push, (): ()) {
-        let from = Pictures {
-            grad_rows: Some(host.grad_rows),
-            rendered: host.rendered,
-            target: host.target,
-            weight: None,
-            outside: false,
-        };
-        gradient_reference(&from, host.grad_rendered, host.partial, push);
+        for (partial, loss) in host.partial[push.first as usize..].iter_mut().zip(losses) {
+            *partial = loss as f32;
+        }
     }
     fn check(binding: &'static str) -> Check {
-        gradient_check(binding)
-    }
-}
-
-impl Reference for gradient_weighted::Kernel {
-    fn reference(host: gradient_weighted::Host<'_>, push: gradient_weighted::Push, (): ()) {
-        let weight = Some(host.weight);
-        let from = Pictures {
-            grad_rows: Some(host.grad_rows),
-            rendered: host.rendered,
-            target: host.target,
-            weight,
-            outside: false,
-        };
-        gradient_reference(&from, host.grad_rendered, host.partial, bytemuck::cast(push));
-    }
-    fn check(binding: &'static str) -> Check {
-        gradient_check(binding)
-    }
-}
-
-impl Reference for gradient_outside::Kernel {
-    fn reference(host: gradient_outside::Host<'_>, push: gradient_outside::Push, (): ()) {
-        let (grad_rows, weight) = (Some(host.grad_rows), Some(host.weight));
-        let from = Pictures { grad_rows, rendered: host.rendered, target: host.target, weight, outside: true };
-        gradient_reference(&from, host.grad_rendered, host.partial, bytemuck::cast(push));
-    }
-    fn check(binding: &'static str) -> Check {
-        gradient_check(binding)
-    }
-}
-
-impl Reference for gradient_l1::Kernel {
-    fn reference(host: gradient_l1::Host<'_>, push: gradient_l1::Push, (): ()) {
-        let from =
-            Pictures { grad_rows: None, rendered: host.rendered, target: host.target, weight: None, outside: false };
-        gradient_reference(&from, host.grad_rendered, host.partial, bytemuck::cast(push));
-    }
-    fn check(binding: &'static str) -> Check {
-        gradient_check(binding)
-    }
-}
-
-impl Reference for gradient_l1_weighted::Kernel {
-    fn reference(host: gradient_l1_weighted::Host<'_>, push: gradient_l1_weighted::Push, (): ()) {
-        let weight = Some(host.weight);
-        let from = Pictures { grad_rows: None, rendered: host.rendered, target: host.target, weight, outside: false };
-        gradient_reference(&from, host.grad_rendered, host.partial, bytemuck::cast(push));
-    }
-    fn check(binding: &'static str) -> Check {
-        gradient_check(binding)
+        match binding {
+            "partial" => Check::default(),
+            // 14 roundings of 6e-8 of the blurred terms, which are up to 1 / C2 of SSIM's share and cancel where a flat
+            // picture meets another: at most 14 * 6e-8 * 0.2 / 0.8 / C2 = 2e-4 of L1's part of the gradient.
+            _ => Check { relative: 1e-5, absolute: 1e-4, band: 0.0 },
+        }
     }
 }
 
@@ -390,67 +269,29 @@ impl Photometric {
         let per_value = 1.0 / (3.0 * f64::from(size[0]) * f64::from(size[1]));
         let share = f64::from(self.ssim_weight);
         let (of_ssim, of_l1) = ((share * per_value) as f32, ((1.0 - share) * per_value) as f32);
-        let (across, down) = (row_runs(size), column_runs(size));
+        let down = column_runs(size);
         let [first, last] = column_groups(size).map(|n| n as u32);
-        let Some(Ssim { moments, grad_moments, grad_rows }) = ssim else {
-            let (factor, first) = (of_l1, 0);
-            match weight {
-                None => {
-                    let buffers = gradient_l1::Buffers { rendered, target, grad_rendered, partial };
-                    rec.run(gradient_l1::Kernel, buffers, gradient_l1::Push { size, factor, first }, down);
-                }
-                Some(weight) => {
-                    let buffers = gradient_l1_weighted::Buffers { rendered, target, grad_rendered, partial, weight };
-                    let push = gradient_l1_weighted::Push { size, factor, first };
-                    rec.run(gradient_l1_weighted::Kernel, buffers, push, down);
-                }
-            }
-            sum::record(rec, partial, last, 1, losses, slot);
-            return grad_rendered;
-        };
+        let first = if ssim.is_some() { first } else { 0 };
         let outside = weight.filter(|_| !self.across);
-        macro_rules! rows {
-            ($module:ident, $threads:expr $(, $weight:ident)?) => {{
-                let buffers = $module::Buffers { rendered, target, moments $(, $weight)? };
-                rec.run($module::Kernel, buffers, $module::Push { size }, $threads);
-            }};
-        }
-        match (outside, rec.gpu().form()) {
-            (None, Form::Cpu) => rows!(rows, across),
-            (None, Form::Gpu) => rows!(rows_wide, wide_runs(size)),
-            (Some(weight), Form::Cpu) => rows!(rows_outside, across, weight),
-            (Some(weight), Form::Gpu) => rows!(rows_outside_wide, wide_runs(size), weight),
-        }
-        match weight {
-            None => {
-                let push = columns::Push { size, factor: of_ssim };
-                rec.run(columns::Kernel, columns::Buffers { moments, grad_moments, partial }, push, 3 * down);
-            }
-            Some(weight) => {
-                let push = columns_weighted::Push { size, factor: of_ssim };
-                let buffers = columns_weighted::Buffers { moments, grad_moments, partial, weight };
-                rec.run(columns_weighted::Kernel, buffers, push, 3 * down);
+        let mut kernel = gradient::Kernel::Plain;
+        if let Some(Ssim { moments, grad_moments, grad_rows }) = ssim {
+            let (of_rows, runs) = match rec.gpu().form() {
+                Form::Cpu => (rows::Kernel::Plain, row_runs(size)),
+                Form::Gpu => (rows::Kernel::Run4, wide_runs(size)),
+            };
+            let buffers = rows::Buffers { rendered, target, moments, weight: outside };
+            rec.run(of_rows, buffers, rows::Push { size }, runs);
+            let buffers = columns::Buffers { moments, grad_moments, partial, weight };
+            rec.run(columns::Kernel, buffers, columns::Push { size, factor: of_ssim }, 3 * down);
+            let buffers = adjoint::Buffers { grad_moments, grad_rows };
+            rec.run(adjoint::Kernel, buffers, adjoint::Push { size }, 3 * row_runs(size));
+            if outside.is_some() {
+                kernel = gradient::Kernel::Outside;
             }
         }
-        rec.run(adjoint::Kernel, adjoint::Buffers { grad_moments, grad_rows }, adjoint::Push { size }, 3 * across);
-        match weight {
-            None => {
-                let push = gradient::Push { size, factor: of_l1, first };
-                let buffers = gradient::Buffers { grad_rows, rendered, target, grad_rendered, partial };
-                rec.run(gradient::Kernel, buffers, push, down);
-            }
-            Some(weight) if outside.is_some() => {
-                let push = gradient_outside::Push { size, factor: of_l1, first };
-                let buffers = gradient_outside::Buffers { grad_rows, rendered, target, grad_rendered, partial, weight };
-                rec.run(gradient_outside::Kernel, buffers, push, down);
-            }
-            Some(weight) => {
-                let push = gradient_weighted::Push { size, factor: of_l1, first };
-                let buffers =
-                    gradient_weighted::Buffers { grad_rows, rendered, target, grad_rendered, partial, weight };
-                rec.run(gradient_weighted::Kernel, buffers, push, down);
-            }
-        }
+        let grad_rows = ssim.as_ref().map(|ssim| &ssim.grad_rows);
+        let buffers = gradient::Buffers { grad_rows, rendered, target, grad_rendered, partial, weight };
+        rec.run(kernel, buffers, gradient::Push { size, factor: of_l1, first }, down);
         sum::record(rec, partial, first + last, 1, losses, slot);
         grad_rendered
     }
@@ -459,7 +300,6 @@ impl Photometric {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::Kernel as _;
     use crate::gpu::testing::{self, UNWRITTEN};
     use rand::{RngExt, SeedableRng};
 
@@ -498,84 +338,53 @@ mod tests {
             let n = 3 * (size[0] * size[1]) as usize;
             let first = column_groups(size)[0] as u32;
             for [rendered, target] in pictures(size) {
-                let case = rows::Arrays {
+                let [plain, weighted] = [None, Some(weights(size))];
+                let mut case = rows::Arrays {
                     rendered: rendered.clone(),
                     target: target.clone(),
                     moments: vec![[UNWRITTEN; 4]; n + 2],
+                    weight: None,
                 };
-                testing::assert_twin(rows::Kernel, &gpu, case.clone(), rows::Push { size }, row_runs(size));
-                let wide = rows_wide::Kernel::arrays(&rows::Kernel::words(case.clone()));
-                testing::assert_twin(rows_wide::Kernel, &gpu, wide, rows_wide::Push { size }, wide_runs(size));
-                let moments =
-                    testing::run_once::<rows::Kernel>(&gpu, &case, rows::Push { size }, row_runs(size)).moments;
-                let case = columns::Arrays {
-                    moments: moments.clone(),
-                    grad_moments: vec![[UNWRITTEN; 3]; n],
-                    partial: vec![UNWRITTEN; column_groups(size).iter().sum()],
-                };
+                let push = rows::Push { size };
+                let moments = testing::run_once(rows::Kernel::Plain, &gpu, &case, push, row_runs(size)).moments;
+                for weight in [plain.clone(), weighted.clone()] {
+                    case.weight = weight;
+                    testing::assert_twin(rows::Kernel::Plain, &gpu, case.clone(), push, row_runs(size));
+                    testing::assert_twin(rows::Kernel::Run4, &gpu, case.clone(), push, wide_runs(size));
+                }
+                let partial = vec![UNWRITTEN; column_groups(size).iter().sum()];
+                let grad_moments = vec![[UNWRITTEN; 3]; n];
+                let mut case = columns::Arrays { moments, grad_moments, partial: partial.clone(), weight: None };
                 let push = columns::Push { size, factor: 0.3 };
                 let down = column_runs(size);
-                testing::assert_twin(columns::Kernel, &gpu, case.clone(), push, 3 * down);
-                let grad_moments = testing::run_once::<columns::Kernel>(&gpu, &case, push, 3 * down).grad_moments;
-                let case = columns_weighted::Arrays {
-                    moments,
-                    grad_moments: case.grad_moments,
-                    partial: case.partial,
-                    weight: weights(size),
-                };
-                let push = columns_weighted::Push { size, factor: 0.3 };
-                testing::assert_twin(columns_weighted::Kernel, &gpu, case, push, 3 * down);
+                let grad_moments = testing::run_once(columns::Kernel, &gpu, &case, push, 3 * down).grad_moments;
+                for weight in [plain.clone(), weighted.clone()] {
+                    case.weight = weight;
+                    testing::assert_twin(columns::Kernel, &gpu, case.clone(), push, 3 * down);
+                }
                 let case = adjoint::Arrays { grad_moments, grad_rows: vec![[UNWRITTEN; 3]; n] };
-                testing::assert_twin(adjoint::Kernel, &gpu, case.clone(), adjoint::Push { size }, 3 * row_runs(size));
-                let grad_rows =
-                    testing::run_once::<adjoint::Kernel>(&gpu, &case, adjoint::Push { size }, 3 * row_runs(size))
-                        .grad_rows;
-                let case = gradient::Arrays {
-                    grad_rows,
-                    rendered,
-                    target,
-                    grad_rendered: vec![[UNWRITTEN; 3]; n / 3],
-                    partial: vec![UNWRITTEN; column_groups(size).iter().sum()],
-                };
-                testing::assert_twin(
-                    gradient::Kernel,
-                    &gpu,
-                    case.clone(),
-                    gradient::Push { size, factor: 0.7, first },
-                    down,
-                );
-                let gradient::Arrays { grad_rows, rendered, target, grad_rendered, partial } = case;
-                let l1 = gradient_l1::Arrays {
-                    rendered: rendered.clone(),
-                    target: target.clone(),
-                    grad_rendered: grad_rendered.clone(),
-                    partial: partial.clone(),
-                };
-                let push = gradient_l1::Push { size, factor: 0.7, first };
-                testing::assert_twin(gradient_l1::Kernel, &gpu, l1.clone(), push, down);
-                let gradient_l1::Arrays { rendered: a, target: b, grad_rendered: g, partial: p } = l1;
-                let weight = weights(size);
-                let l1 = gradient_l1_weighted::Arrays { rendered: a, target: b, grad_rendered: g, partial: p, weight };
-                let push = gradient_l1_weighted::Push { size, factor: 0.7, first };
-                testing::assert_twin(gradient_l1_weighted::Kernel, &gpu, l1, push, down);
-                let weight = weights(size);
-                let case = gradient_weighted::Arrays { grad_rows, rendered, target, grad_rendered, partial, weight };
-                let push = gradient_weighted::Push { size, factor: 0.7, first };
-                testing::assert_twin(gradient_weighted::Kernel, &gpu, case.clone(), push, down);
-                let gradient_weighted::Arrays { grad_rows, rendered, target, grad_rendered, partial, weight } = case;
-                let outside = rows_outside::Arrays {
-                    rendered: rendered.clone(),
-                    target: target.clone(),
-                    moments: vec![[UNWRITTEN; 4]; 3 * rendered.len()],
-                    weight: weight.clone(),
-                };
-                let wide = rows_outside_wide::Kernel::arrays(&rows_outside::Kernel::words(outside.clone()));
-                testing::assert_twin(rows_outside::Kernel, &gpu, outside, rows_outside::Push { size }, row_runs(size));
-                let push = rows_outside_wide::Push { size };
-                testing::assert_twin(rows_outside_wide::Kernel, &gpu, wide, push, wide_runs(size));
-                let case = gradient_outside::Arrays { grad_rows, rendered, target, grad_rendered, partial, weight };
-                let push = gradient_outside::Push { size, factor: 0.7, first };
-                testing::assert_twin(gradient_outside::Kernel, &gpu, case, push, down);
+                let (push, across) = (adjoint::Push { size }, 3 * row_runs(size));
+                testing::assert_twin(adjoint::Kernel, &gpu, case.clone(), push, across);
+                let grad_rows = testing::run_once(adjoint::Kernel, &gpu, &case, push, across).grad_rows;
+                let (plain_kernel, outside) = (gradient::Kernel::Plain, gradient::Kernel::Outside);
+                for (kernel, grad_rows, weight) in [
+                    (plain_kernel, Some(&grad_rows), &plain),
+                    (plain_kernel, Some(&grad_rows), &weighted),
+                    (outside, Some(&grad_rows), &weighted),
+                    (plain_kernel, None, &plain),
+                    (plain_kernel, None, &weighted),
+                ] {
+                    let case = gradient::Arrays {
+                        grad_rows: grad_rows.cloned(),
+                        rendered: rendered.clone(),
+                        target: target.clone(),
+                        grad_rendered: vec![[UNWRITTEN; 3]; n / 3],
+                        partial: partial.clone(),
+                        weight: weight.clone(),
+                    };
+                    let push = gradient::Push { size, factor: 0.7, first };
+                    testing::assert_twin(kernel, &gpu, case, push, down);
+                }
             }
         }
     }

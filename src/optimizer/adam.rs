@@ -186,7 +186,7 @@ mod tests {
         let mut before = case(100, 9);
         before.overflow[0] = 3;
         let push = Config::default().push(1, 0.1, 0, 100);
-        let after = testing::run_once::<adam::Kernel>(&gpu, &before, push, threads(0, 100));
+        let after = testing::run_once(adam::Kernel, &gpu, &before, push, threads(0, 100));
         assert_eq!((after.value, after.first, after.root), (before.value, before.first, before.root));
     }
 
@@ -209,7 +209,7 @@ mod tests {
         let mut exact = vec![math::adam::State::default(); n];
         for step in 1..=20 {
             let push = Config::default().push(step, 1.0, 0, n as u32);
-            arrays = testing::run_once::<adam::Kernel>(&gpu, &arrays, push, threads(0, push.n));
+            arrays = testing::run_once(adam::Kernel, &gpu, &arrays, push, threads(0, push.n));
             let (b1, b2): (f64, f64) = (0.9, 0.999);
             let factors = math::adam::Factors {
                 rate: 1.0,

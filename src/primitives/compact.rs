@@ -1,6 +1,6 @@
 //! Indices of what is kept, in order.
 
-use crate::gpu::kernels::primitives::{compact, scan_sums_nonzero, scan_totals};
+use crate::gpu::kernels::primitives::{compact, scan_sums, scan_totals};
 use crate::gpu::{Buffer, Error, Gpu, Recorder, Reference};
 
 use super::dispatch::{Blocks, Count};
@@ -66,8 +66,8 @@ impl Compact {
         let (count, most, threads) = self.blocks.record(rec, count);
         // Never beyond a buffer, whatever the count on the device says.
         let capacity = most.min(flags.len() as u32);
-        let counting = scan_sums_nonzero::Buffers { count, terms: flags, sums };
-        rec.run(scan_sums_nonzero::Kernel, counting, scan_sums_nonzero::Push { capacity }, threads);
+        let counting = scan_sums::Buffers { count, terms: flags, sums };
+        rec.run(scan_sums::Kernel::Nonzero, counting, scan_sums::Push { capacity }, threads);
         let top = scan_totals::Buffers { count, terms: sums, prefix: before, total: found };
         rec.run(scan_totals::Kernel, top, scan_totals::Push { capacity, items: BLOCK }, 64u32);
         let gather = compact::Buffers { count, flags, before, indices };

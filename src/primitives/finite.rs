@@ -1,6 +1,6 @@
 //! Whether floats are finite, noted in a sticky flag that the device itself obeys.
 
-use crate::gpu::kernels::primitives::{finite, finite_gated};
+use crate::gpu::kernels::primitives::finite;
 use crate::gpu::{Buffer, Recorder, Reference};
 
 /// Bit of the sticky flag that says that a value is NaN or infinite; those below it are [`super::limit::Counter`]'s.
@@ -14,23 +14,13 @@ fn threads(n: u32) -> u32 {
     n.div_ceil(4 * GROUP * VECTORS) * GROUP
 }
 
-fn look(values: &[[u32; 4]], flag: &mut u32, n: u32, bit: u32) {
-    let finite = |word: &u32| f32::from_bits(*word).is_finite();
-    if *flag == 0 && !values.as_flattened()[..n as usize].iter().all(finite) {
-        *flag |= 1 << bit;
-    }
-}
-
 impl Reference for finite::Kernel {
     fn reference(host: finite::Host<'_>, push: finite::Push, (): ()) {
-        look(host.values, &mut host.flag[0], push.n, push.bit);
-    }
-}
-
-impl Reference for finite_gated::Kernel {
-    fn reference(host: finite_gated::Host<'_>, push: finite_gated::Push, (): ()) {
-        if host.gate[0] != 0 {
-            look(host.values, &mut host.flag[0], push.n, push.bit);
+        let shut = host.gate.is_some_and(|gate| gate[0] == 0);
+        let finite = |word: &u32| f32::from_bits(*word).is_finite();
+        let looks = host.flag[0] == 0 && !shut;
+        if looks && !host.values.as_flattened()[..push.n as usize].iter().all(finite) {
+            host.flag[0] |= 1 << push.bit;
         }
     }
 }
@@ -42,17 +32,8 @@ impl Reference for finite_gated::Kernel {
 /// When there are fewer values.
 pub fn record(rec: &mut Recorder<'_>, values: &Buffer<f32>, n: u32, flag: &Buffer<u32>, gate: Option<&Buffer<u32>>) {
     assert!(n as usize <= values.len(), "{n} of {values:?}");
-    let values = &values.view();
-    match gate {
-        None => {
-            let push = finite::Push { n, bit: NOT_FINITE };
-            rec.run(finite::Kernel, finite::Buffers { values, flag }, push, threads(n));
-        }
-        Some(gate) => {
-            let push = finite_gated::Push { n, bit: NOT_FINITE };
-            rec.run(finite_gated::Kernel, finite_gated::Buffers { values, flag, gate }, push, threads(n));
-        }
-    }
+    let buffers = finite::Buffers { values: &values.view(), flag, gate };
+    rec.run(finite::Kernel, buffers, finite::Push { n, bit: NOT_FINITE }, threads(n));
 }
 
 #[cfg(test)]
@@ -83,10 +64,10 @@ mod tests {
                 }
                 for flag in [0, 2] {
                     let values: Vec<[u32; 4]> = bytemuck::cast_vec(words.clone());
-                    let case = finite::Arrays { values, flag: vec![flag] };
+                    let case = finite::Arrays { values, flag: vec![flag], gate: None };
                     let push = finite::Push { n: n as u32, bit: NOT_FINITE };
                     let raised = hit.is_some_and(|at| at < n) && flag == 0;
-                    let after = testing::run_once::<finite::Kernel>(&gpu, &case, push, threads(push.n));
+                    let after = testing::run_once(finite::Kernel, &gpu, &case, push, threads(push.n));
                     assert_eq!(after.flag[0], flag | u32::from(raised) << NOT_FINITE, "{n}, {place:?}, {bad}");
                     testing::assert_twin(finite::Kernel, &gpu, case, push, threads(push.n));
                 }
@@ -99,11 +80,11 @@ mod tests {
         let gpu = testing::gpu();
         for (gate, flag, want) in [(0, 0, 0), (1, 0, 1 << NOT_FINITE), (7, 0, 1 << NOT_FINITE), (1, 1, 1)] {
             let values = vec![[0, 0, f32::NAN.to_bits(), 0]; 100];
-            let case = finite_gated::Arrays { values, flag: vec![flag], gate: vec![gate] };
-            let push = finite_gated::Push { n: 400, bit: NOT_FINITE };
-            let after = testing::run_once::<finite_gated::Kernel>(&gpu, &case, push, threads(400));
+            let case = finite::Arrays { values, flag: vec![flag], gate: Some(vec![gate]) };
+            let push = finite::Push { n: 400, bit: NOT_FINITE };
+            let after = testing::run_once(finite::Kernel, &gpu, &case, push, threads(400));
             assert_eq!(after.flag, [want]);
-            testing::assert_twin(finite_gated::Kernel, &gpu, case, push, threads(400));
+            testing::assert_twin(finite::Kernel, &gpu, case, push, threads(400));
         }
     }
 }

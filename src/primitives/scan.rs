@@ -4,7 +4,7 @@
 //! Sums of blocks, their scan by one workgroup, and a second walk over the terms: three passes, two reads and one write
 //! per term. Few terms are scanned by one workgroup alone.
 
-use crate::gpu::kernels::primitives::{scan_spread, scan_sums, scan_sums_nonzero, scan_totals};
+use crate::gpu::kernels::primitives::{scan_spread, scan_sums, scan_totals};
 use crate::gpu::{Buffer, Error, Gpu, Recorder, Reference};
 
 use super::dispatch::{Blocks, Count, Shape};
@@ -16,22 +16,16 @@ pub const SHAPE: Shape = Shape { tile: BLOCK / 64, factor: 1 };
 /// Up to this capacity one workgroup does it alone.
 const ALONE: u32 = 4 * BLOCK;
 
-fn block_sums(count: &[u32], capacity: u32, terms: &[u32], sums: &mut [u32], term: impl Fn(u32) -> u32) {
-    let n = count[0].min(capacity) as usize;
-    for (sum, block) in sums.iter_mut().zip(terms[..n].chunks(BLOCK as usize)) {
-        *sum = block.iter().fold(0, |sum: u32, &x| sum.wrapping_add(term(x)));
-    }
-}
-
 impl Reference for scan_sums::Kernel {
     fn reference(host: scan_sums::Host<'_>, push: scan_sums::Push, (): ()) {
-        block_sums(host.count, push.capacity, host.terms, host.sums, |x| x);
-    }
-}
-
-impl Reference for scan_sums_nonzero::Kernel {
-    fn reference(host: scan_sums_nonzero::Host<'_>, push: scan_sums_nonzero::Push, (): ()) {
-        block_sums(host.count, push.capacity, host.terms, host.sums, |x| u32::from(x != 0));
+        let n = host.count[0].min(push.capacity) as usize;
+        let term = |x: u32| match host.kernel {
+            scan_sums::Kernel::Plain => x,
+            scan_sums::Kernel::Nonzero => u32::from(x != 0),
+        };
+        for (sum, block) in host.sums.iter_mut().zip(host.terms[..n].chunks(BLOCK as usize)) {
+            *sum = block.iter().fold(0, |sum: u32, &x| sum.wrapping_add(term(x)));
+        }
     }
 }
 
@@ -129,7 +123,8 @@ impl Scan {
         };
         let (count, most, threads) = self.blocks.record(rec, count);
         let capacity = most.min(room);
-        rec.run(scan_sums::Kernel, scan_sums::Buffers { count, terms, sums }, scan_sums::Push { capacity }, threads);
+        let buffers = scan_sums::Buffers { count, terms, sums };
+        rec.run(scan_sums::Kernel::Plain, buffers, scan_sums::Push { capacity }, threads);
         let top = scan_totals::Buffers { count, terms: sums, prefix: before, total };
         rec.run(scan_totals::Kernel, top, scan_totals::Push { capacity, items: BLOCK }, 64u32);
         let spread = scan_spread::Buffers { count, terms, before, prefix };
@@ -166,11 +161,11 @@ mod tests {
             let count = vec![n as u32];
             let capacity = n as u32 + 60;
             let blocks = terms.len().div_ceil(1024);
-            let case = scan_sums::Arrays { count: count.clone(), terms: terms.clone(), sums: vec![PATTERN; blocks] };
-            testing::assert_twin(scan_sums::Kernel, &gpu, case, scan_sums::Push { capacity }, n + 70);
-            let case =
-                scan_sums_nonzero::Arrays { count: count.clone(), terms: terms.clone(), sums: vec![PATTERN; blocks] };
-            testing::assert_twin(scan_sums_nonzero::Kernel, &gpu, case, scan_sums_nonzero::Push { capacity }, n + 70);
+            for kernel in [scan_sums::Kernel::Plain, scan_sums::Kernel::Nonzero] {
+                let sums = vec![PATTERN; blocks];
+                let case = scan_sums::Arrays { count: count.clone(), terms: terms.clone(), sums };
+                testing::assert_twin(kernel, &gpu, case, scan_sums::Push { capacity }, n + 70);
+            }
             for items in [1, 7] {
                 let case = scan_totals::Arrays {
                     count: count.clone(),

@@ -6,7 +6,7 @@
 
 use std::ops::Range;
 
-use crate::gpu::kernels::primitives::{sort_count, sort_scan, sort_scatter, sort_scatter_index};
+use crate::gpu::kernels::primitives::{sort_count, sort_scan, sort_scatter};
 use crate::gpu::{Buffer, Error, Form, Gpu, Recorder, Reference};
 
 use super::dispatch::{Blocks, Count, Shape};
@@ -60,67 +60,27 @@ impl Reference for sort_scan::Kernel {
     }
 }
 
-/// What a scatter moves: where the counts say a block's first key with a digit goes, then one behind the other.
-struct Scatter<'a> {
-    block: u32,
-    stride: u32,
-    shift: u32,
-    mask: u32,
-    before: &'a [u32],
-    totals: &'a [u32],
-}
-
-impl Scatter<'_> {
-    fn run(&self, keys: &[u32], mut place: impl FnMut(usize, usize)) {
-        for (block, run) in keys.chunks(self.block as usize).enumerate() {
+impl Reference for sort_scatter::Kernel {
+    /// Where the counts say a block's first key with a digit goes, then one behind the other.
+    fn reference(host: sort_scatter::Host<'_>, push: sort_scatter::Push, constants: sort_scatter::Constants) {
+        let n = host.count[0].min(push.capacity) as usize;
+        let length = (GROUP * constants.items) as usize;
+        // Behind the digits in use lies what other sorts, or nobody, wrote.
+        let totals = &host.totals[..1 << constants.digit_bits];
+        for (block, run) in host.keys.as_flattened()[..n].chunks(length).enumerate() {
             let mut smaller = 0;
             let mut places: Vec<u32> = vec![];
-            for (digit, total) in self.totals.iter().enumerate() {
-                places.push(smaller + self.before[digit * self.stride as usize + block]);
+            for (digit, total) in totals.iter().enumerate() {
+                places.push(smaller + host.before[digit * push.stride as usize + block]);
                 smaller += total;
             }
-            for (i, &key) in run.iter().enumerate() {
-                let at = &mut places[digit(key, self.shift, self.mask)];
-                place(block * self.block as usize + i, *at as usize);
-                *at += 1;
+            for (from, &key) in (block * length..).zip(run) {
+                let place = &mut places[digit(key, push.shift, push.mask)];
+                host.sorted_keys[*place as usize] = key;
+                host.sorted_values[*place as usize] = host.values.map_or(from as u32, |v| v.as_flattened()[from]);
+                *place += 1;
             }
         }
-    }
-}
-
-impl Reference for sort_scatter::Kernel {
-    fn reference(host: sort_scatter::Host<'_>, push: sort_scatter::Push, constants: sort_scatter::Constants) {
-        let sort_scatter::Push { stride, shift, mask, .. } = push;
-        let n = host.count[0].min(push.capacity) as usize;
-        let block = GROUP * constants.items;
-        // Behind the digits in use lies what other sorts, or nobody, wrote.
-        let totals = &host.totals[..1 << constants.digit_bits];
-        let scatter = Scatter { block, stride, shift, mask, before: host.before, totals };
-        let keys = &host.keys.as_flattened()[..n];
-        scatter.run(keys, |from, to| {
-            host.sorted_keys[to] = keys[from];
-            host.sorted_values[to] = host.values.as_flattened()[from];
-        });
-    }
-}
-
-impl Reference for sort_scatter_index::Kernel {
-    fn reference(
-        host: sort_scatter_index::Host<'_>,
-        push: sort_scatter_index::Push,
-        constants: sort_scatter_index::Constants,
-    ) {
-        let sort_scatter_index::Push { stride, shift, mask, .. } = push;
-        let n = host.count[0].min(push.capacity) as usize;
-        let block = GROUP * constants.items;
-        // Behind the digits in use lies what other sorts, or nobody, wrote.
-        let totals = &host.totals[..1 << constants.digit_bits];
-        let scatter = Scatter { block, stride, shift, mask, before: host.before, totals };
-        let keys = &host.keys.as_flattened()[..n];
-        scatter.run(keys, |from, to| {
-            host.sorted_keys[to] = keys[from];
-            host.sorted_values[to] = from as u32;
-        });
     }
 }
 
@@ -255,38 +215,22 @@ impl Sort {
                 sort_scan::Push { capacity, stride, block: GROUP * items, digits: 1 << digit_bits },
                 rec.gpu().info().subgroup_size << digit_bits,
             );
-            if indices && pass == 0 {
-                rec.run_with(
-                    sort_scatter_index::Kernel,
-                    sort_scatter_index::Constants { digit_bits, items },
-                    sort_scatter_index::Buffers {
-                        count,
-                        before: counts,
-                        totals,
-                        keys: &from.keys.view(),
-                        sorted_keys: to.keys,
-                        sorted_values: to.values,
-                    },
-                    sort_scatter_index::Push { capacity, stride, shift, mask },
-                    threads,
-                );
-            } else {
-                rec.run_with(
-                    sort_scatter::Kernel,
-                    sort_scatter::Constants { digit_bits, items },
-                    sort_scatter::Buffers {
-                        count,
-                        before: counts,
-                        totals,
-                        keys: &from.keys.view(),
-                        sorted_keys: to.keys,
-                        sorted_values: to.values,
-                        values: &from.values.view(),
-                    },
-                    sort_scatter::Push { capacity, stride, shift, mask },
-                    threads,
-                );
-            }
+            let values = &from.values.view();
+            rec.run_with(
+                sort_scatter::Kernel,
+                sort_scatter::Constants { digit_bits, items },
+                sort_scatter::Buffers {
+                    count,
+                    before: counts,
+                    totals,
+                    keys: &from.keys.view(),
+                    sorted_keys: to.keys,
+                    sorted_values: to.values,
+                    values: (!indices || pass > 0).then_some(values),
+                },
+                sort_scatter::Push { capacity, stride, shift, mask },
+                threads,
+            );
             std::mem::swap(&mut from, &mut to);
         }
         from
@@ -296,7 +240,7 @@ impl Sort {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::{Kernel, Options, testing};
+    use crate::gpu::{Options, testing};
     use proptest::prelude::*;
     use rand::{RngExt, SeedableRng};
 
@@ -327,39 +271,28 @@ mod tests {
                 let threads = stride * 64;
                 testing::assert_twin_with(sort_count::Kernel, &gpu, constants, case.clone(), push, threads);
 
-                let mut words = sort_count::Kernel::words(case);
-                sort_count::Kernel::reference(sort_count::Kernel::host(&mut words), push, constants);
+                let counts = testing::run_twin(sort_count::Kernel, constants, case, push).counts;
                 let totals = vec![PATTERN; 1 << digit_bits];
-                let case = sort_scan::Arrays { count: count.clone(), counts: words[2].clone(), totals };
+                let case = sort_scan::Arrays { count: count.clone(), counts, totals };
                 let push = sort_scan::Push { capacity, stride, block, digits: 1 << digit_bits };
                 let scanning = gpu.info().subgroup_size << digit_bits;
                 testing::assert_twin(sort_scan::Kernel, &gpu, case.clone(), push, scanning);
 
-                let mut words = sort_scan::Kernel::words(case);
-                sort_scan::Kernel::reference(sort_scan::Kernel::host(&mut words), push, ());
-                let case = sort_scatter::Arrays {
-                    count: count.clone(),
-                    before: words[1].clone(),
-                    totals: words[2].clone(),
-                    keys: keys.clone(),
-                    sorted_keys: vec![PATTERN; length],
-                    sorted_values: vec![PATTERN; length],
-                    values: random(length, 31).as_chunks().0.to_vec(),
-                };
-                let constants = sort_scatter::Constants { digit_bits, items };
-                let push = sort_scatter::Push { capacity, stride, shift, mask };
-                testing::assert_twin_with(sort_scatter::Kernel, &gpu, constants, case, push, threads);
-                let case = sort_scatter_index::Arrays {
-                    count,
-                    before: words[1].clone(),
-                    totals: words[2].clone(),
-                    keys,
-                    sorted_keys: vec![PATTERN; length],
-                    sorted_values: vec![PATTERN; length],
-                };
-                let constants = sort_scatter_index::Constants { digit_bits, items };
-                let push = sort_scatter_index::Push { capacity, stride, shift, mask };
-                testing::assert_twin_with(sort_scatter_index::Kernel, &gpu, constants, case, push, threads);
+                let scanned = testing::run_twin(sort_scan::Kernel, (), case, push);
+                for values in [Some(random(length, 31).as_chunks().0.to_vec()), None] {
+                    let case = sort_scatter::Arrays {
+                        count: count.clone(),
+                        before: scanned.counts.clone(),
+                        totals: scanned.totals.clone(),
+                        keys: keys.clone(),
+                        sorted_keys: vec![PATTERN; length],
+                        sorted_values: vec![PATTERN; length],
+                        values,
+                    };
+                    let constants = sort_scatter::Constants { digit_bits, items };
+                    let push = sort_scatter::Push { capacity, stride, shift, mask };
+                    testing::assert_twin_with(sort_scatter::Kernel, &gpu, constants, case, push, threads);
+                }
             }
         }
     }

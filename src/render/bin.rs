@@ -10,7 +10,7 @@ use super::project::listed;
 use super::rasterize::Projected;
 use super::slots::Slots;
 use crate::gpu::kernels::render::{bin_count, bin_depth_keys, bin_expand, bin_ranges, bin_rank, cpu};
-use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
+use crate::gpu::{Buffer, Check, Error, Form, Gpu, Groups, Recorder, Reference};
 use crate::math::tiles::Support;
 use crate::primitives::compact::Compact;
 use crate::primitives::dispatch::Shape;
@@ -149,6 +149,13 @@ impl Tiling {
     /// The better shape for a device: narrow where kernels of lanes are taken.
     pub fn of(gpu: &Gpu) -> Self {
         if gpu.lanes() { Self::Narrow } else { Self::Wide }
+    }
+    /// The form of the kernels that work on such tiles.
+    pub fn form(self) -> Form {
+        match self {
+            Self::Wide => Form::Gpu,
+            Self::Narrow => Form::Cpu,
+        }
     }
     /// Side of a tile in pixels.
     pub fn side(self) -> u32 {

@@ -129,7 +129,7 @@ mod tests {
             ([50.0, 0.0, 2.0], 1e30),
             ([f32::NAN, 0.0, 2.0], 0.1),
         ];
-        let got = testing::run_once::<cull::Kernel>(&gpu, &case(&anchors), push(&camera, NEAR, 11), 11u32);
+        let got = testing::run_once(cull::Kernel, &gpu, &case(&anchors), push(&camera, NEAR, 11), 11u32);
         assert_eq!(got.flags, [1, 1, 0, 1, 0, 1, 0, 0, 0, 1, 0]);
         let mut want = case(&anchors);
         let host = cull::Host { position: &want.position, log_scaling: &want.log_scaling, flags: &mut want.flags };
@@ -150,7 +150,7 @@ mod tests {
                     flags: vec![7; n + 2],
                 };
                 let push = push(&camera(distortion), NEAR, n as u32);
-                let got = testing::run_once::<cull::Kernel>(&gpu, &arrays, push, n + 70);
+                let got = testing::run_once(cull::Kernel, &gpu, &arrays, push, n + 70);
                 assert_eq!(got.flags[n..], [7, 7], "anchors beyond the number are left alone");
                 let kept = got.flags[..n].iter().filter(|&&f| f == 1).count();
                 assert!(n < 1000 || (n / 50..n / 2).contains(&kept), "{kept} of {n} kept: the case tests too little");

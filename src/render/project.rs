@@ -7,7 +7,7 @@
 //! Positions are seen from the camera's centre, covariances are factored: see [`crate::math::camera`].
 
 use super::slots::Slots;
-use crate::gpu::kernels::render::{project, project_backward, project_backward_color};
+use crate::gpu::kernels::render::{project, project_backward};
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::math::camera::{Camera, Lens, Splat};
 use crate::math::camera::{project as project_one, project_backward as project_one_backward};
@@ -102,36 +102,27 @@ impl Reference for project::Kernel {
     }
 }
 
-macro_rules! backward_twin {
-    ($module:ident $(, $grad_depth:ident)?) => {
-        impl Reference for $module::Kernel {
-            fn reference(host: $module::Host<'_>, push: $module::Push, (): ()) {
-                let lens: Lens = lens!(push);
-                for s in listed(host.count, host.list) {
-                    let bounds = lens.bounds(lens.to_camera_f32(host.position[s]));
-                    let [position, scale, covariance] =
-                        [host.position[s], host.scale[s], host.grad_covariance[s]].map(|v| v.map(f64::from));
-                    let upstream = Splat {
-                        mean: host.grad_mean[s].map(f64::from),
-                        covariance,
-                        depth: [$(host.$grad_depth[s].into())?].first().copied().unwrap_or(0.0),
-                    };
-                    let rotation = host.rotation[s].map(f64::from);
-                    let grad = project_one_backward(&lens, position, scale, rotation, bounds, upstream);
-                    host.grad_position[s] = grad.position.map(|v| v as f32);
-                    host.grad_scale[s] = grad.scale.map(|v| v as f32);
-                    host.grad_rotation[s] = grad.rotation.map(|v| v as f32);
-                }
-            }
-
-            fn check(binding: &'static str) -> Check {
-                check(if binding == "grad_position" { 4.0 } else { 3.0 })
-            }
+impl Reference for project_backward::Kernel {
+    fn reference(host: project_backward::Host<'_>, push: project_backward::Push, (): ()) {
+        let lens: Lens = lens!(push);
+        for s in listed(host.count, host.list) {
+            let bounds = lens.bounds(lens.to_camera_f32(host.position[s]));
+            let [position, scale, covariance] =
+                [host.position[s], host.scale[s], host.grad_covariance[s]].map(|v| v.map(f64::from));
+            let depth = host.grad_depth.map_or(0.0, |depth| f64::from(depth[s]));
+            let upstream = Splat { mean: host.grad_mean[s].map(f64::from), covariance, depth };
+            let rotation = host.rotation[s].map(f64::from);
+            let grad = project_one_backward(&lens, position, scale, rotation, bounds, upstream);
+            host.grad_position[s] = grad.position.map(|v| v as f32);
+            host.grad_scale[s] = grad.scale.map(|v| v as f32);
+            host.grad_rotation[s] = grad.rotation.map(|v| v as f32);
         }
-    };
+    }
+
+    fn check(binding: &'static str) -> Check {
+        check(if binding == "grad_position" { 4.0 } else { 3.0 })
+    }
 }
-backward_twin!(project_backward, grad_depth);
-backward_twin!(project_backward_color);
 
 /// What [`Project::record`] reads: one element per slot.
 #[derive(Clone, Copy)]
@@ -232,29 +223,20 @@ impl ProjectBackward {
         camera: &Camera,
         near: f32,
     ) {
-        macro_rules! back {
-            ($module:ident $(, $grad_depth:ident)?) => {{
-                let buffers = $module::Buffers {
-                    count: &drawn.count,
-                    list: &drawn.list,
-                    position: of.position,
-                    scale: of.scale,
-                    rotation: of.rotation,
-                    grad_mean: grad.mean,
-                    grad_covariance: grad.covariance,
-                    grad_position: &self.grad_position,
-                    grad_scale: &self.grad_scale,
-                    grad_rotation: &self.grad_rotation,
-                    $($grad_depth,)?
-                };
-                let push = camera_push!($module::Push, camera, near);
-                rec.run($module::Kernel, buffers, push, &drawn.groups);
-            }};
-        }
-        match grad.depth {
-            Some(grad_depth) => back!(project_backward, grad_depth),
-            None => back!(project_backward_color),
-        }
+        let buffers = project_backward::Buffers {
+            count: &drawn.count,
+            list: &drawn.list,
+            position: of.position,
+            scale: of.scale,
+            rotation: of.rotation,
+            grad_mean: grad.mean,
+            grad_covariance: grad.covariance,
+            grad_position: &self.grad_position,
+            grad_scale: &self.grad_scale,
+            grad_rotation: &self.grad_rotation,
+            grad_depth: grad.depth,
+        };
+        rec.run(project_backward::Kernel, buffers, push_backward(camera, near), &drawn.groups);
     }
 }
 
@@ -264,7 +246,7 @@ mod tests {
     use rand_pcg::Pcg64;
 
     use super::*;
-    use crate::gpu::{Kernel, testing};
+    use crate::gpu::testing;
 
     fn uniform(rng: &mut Pcg64, low: f32, high: f32) -> f32 {
         low + (high - low) * rng.random::<f32>()
@@ -320,7 +302,7 @@ mod tests {
             rotation: forward.rotation.clone(),
             grad_mean: (0..n).map(|_| std::array::from_fn(|_| uniform(rng, -1.0, 1.0))).collect(),
             grad_covariance: (0..n).map(|_| std::array::from_fn(|_| uniform(rng, -1.0, 1.0))).collect(),
-            grad_depth: (0..n).map(|_| uniform(rng, -1.0, 1.0)).collect(),
+            grad_depth: Some((0..n).map(|_| uniform(rng, -1.0, 1.0)).collect()),
             grad_position: vec![[testing::UNWRITTEN; 3]; n],
             grad_scale: vec![[testing::UNWRITTEN; 3]; n],
             grad_rotation: vec![[testing::UNWRITTEN; 4]; n],
@@ -338,7 +320,7 @@ mod tests {
             for slots in [0, 1, 63, 64, 65, 1000, 5001] {
                 let case = case(&mut rng, slots, 3);
                 testing::assert_twin(project::Kernel, &gpu, case.clone(), push(&camera, NEAR), slots + 2);
-                let forward = testing::run_once::<project::Kernel>(&gpu, &case, push(&camera, NEAR), slots);
+                let forward = testing::run_once(project::Kernel, &gpu, &case, push(&camera, NEAR), slots);
                 let alone = |s: usize| s >= slots || s % 7 == 3;
                 assert!((0..slots + 3).all(|s| !alone(s) || forward.depth[s].is_nan()), "others are left alone");
                 if slots == 1000 {
@@ -346,7 +328,10 @@ mod tests {
                     assert!((100..900).contains(&present), "{present} of {slots} present: the case tests too little");
                 }
                 let case = backward_case(&mut rng, &forward);
-                testing::assert_twin(project_backward::Kernel, &gpu, case, push_backward(&camera, NEAR), slots + 2);
+                let color = project_backward::Arrays { grad_depth: None, ..case.clone() };
+                for case in [case, color] {
+                    testing::assert_twin(project_backward::Kernel, &gpu, case, push_backward(&camera, NEAR), slots + 2);
+                }
             }
         }
     }
@@ -358,16 +343,11 @@ mod tests {
         let mut rng = Pcg64::seed_from_u64(6);
         let camera = camera(LENSES[1]);
         let case = case(&mut rng, 4000, 0);
-        let got = testing::run_once::<project::Kernel>(&gpu, &case, push(&camera, NEAR), 4000u32);
+        let got = testing::run_once(project::Kernel, &gpu, &case, push(&camera, NEAR), 4000u32);
         let upstream = backward_case(&mut rng, &got);
-        let back =
-            testing::run_once::<project_backward::Kernel>(&gpu, &upstream, push_backward(&camera, NEAR), 4000u32);
-        let (mut want, mut want_back) =
-            (project::Kernel::words(case), project_backward::Kernel::words(upstream.clone()));
-        project::Kernel::reference(project::Kernel::host(&mut want), push(&camera, NEAR), ());
-        let host = project_backward::Kernel::host(&mut want_back);
-        project_backward::Kernel::reference(host, push_backward(&camera, NEAR), ());
-        let (want, want_back) = (project::Kernel::arrays(&want), project_backward::Kernel::arrays(&want_back));
+        let back = testing::run_once(project_backward::Kernel, &gpu, &upstream, push_backward(&camera, NEAR), 4000u32);
+        let want = testing::run_twin(project::Kernel, (), case, push(&camera, NEAR));
+        let want_back = testing::run_twin(project_backward::Kernel, (), upstream.clone(), push_backward(&camera, NEAR));
         // Relative to the terms before they cancel: |t|^2 s^2 with t = J R and the Gaussian's longest s. The camera's
         // focal lengths are at most 92, the rays' slopes lengthen a row of J by less than 1.6.
         let slots: Vec<(f64, f64, f64)> = (0..4000)
@@ -422,7 +402,7 @@ mod tests {
             [0.0, 0.0, 2.0],
         ];
         case.scale[5] = [1e30, 0.1, 0.1];
-        let got = testing::run_once::<project::Kernel>(&gpu, &case, push(&camera, NEAR), 7u32);
+        let got = testing::run_once(project::Kernel, &gpu, &case, push(&camera, NEAR), 7u32);
         assert_eq!(got.depth, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0]);
         assert_eq!(got.mean[..6], [[0.0; 2]; 6]);
         assert_eq!(got.covariance[..6], [[0.0; 3]; 6]);
@@ -505,10 +485,10 @@ mod tests {
         let slots = 770;
         let camera = camera(LENSES[1]);
         let arrays = case(&mut rng, slots, 0);
-        let want = testing::run_once::<project::Kernel>(&gpu, &arrays, push(&camera, NEAR), slots);
+        let want = testing::run_once(project::Kernel, &gpu, &arrays, push(&camera, NEAR), slots);
         let upstream = backward_case(&mut rng, &want);
         let push = push_backward(&camera, NEAR);
-        let want_backward = testing::run_once::<project_backward::Kernel>(&gpu, &upstream, push, slots);
+        let want_backward = testing::run_once(project_backward::Kernel, &gpu, &upstream, push, slots);
 
         let fine = "the device runs a test";
         let forward = Project::new(&gpu, 86, 10).expect(fine);
@@ -525,9 +505,9 @@ mod tests {
         let rotation = gpu.upload("rotation", &arrays.rotation).expect(fine);
         let mean = gpu.upload("grad_mean", &upstream.grad_mean).expect(fine);
         let covariance = gpu.upload("grad_covariance", &upstream.grad_covariance).expect(fine);
-        let depth = gpu.upload("grad_depth", &upstream.grad_depth).expect(fine);
+        let depth = upstream.grad_depth.as_ref().map(|depth| gpu.upload("grad_depth", depth).expect(fine));
         let of = Gaussians { position: &position, scale: &scale, rotation: &rotation };
-        let grad = SplatGradients { mean: &mean, covariance: &covariance, depth: Some(&depth) };
+        let grad = SplatGradients { mean: &mean, covariance: &covariance, depth: depth.as_ref() };
         let mut rec = gpu.recorder().expect(fine);
         existing.dispatch(&mut rec);
         drawn.dispatch(&mut rec);

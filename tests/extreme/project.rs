@@ -154,7 +154,7 @@ fn run(gpu: &Gpu, camera: &Camera, near: f32, gaussians: &[Gaussian]) -> Outcome
         covariance: vec![[testing::UNWRITTEN; 3]; n],
         depth: vec![testing::UNWRITTEN; n],
     };
-    let forward = testing::run_once::<project::Kernel>(gpu, &arrays, stage::push(camera, near), n);
+    let forward = testing::run_once(project::Kernel, gpu, &arrays, stage::push(camera, near), n);
     let mut rng = Pcg64Mcg::seed_from_u64(5);
     let upstream: Vec<Splat> = (0..n)
         .map(|s| {
@@ -177,13 +177,13 @@ fn run(gpu: &Gpu, camera: &Camera, near: f32, gaussians: &[Gaussian]) -> Outcome
         rotation: arrays.rotation,
         grad_mean: upstream.iter().map(|g| g.mean.map(|v| v as f32)).collect(),
         grad_covariance: upstream.iter().map(|g| g.covariance.map(|v| v as f32)).collect(),
-        grad_depth: upstream.iter().map(|g| g.depth as f32).collect(),
+        grad_depth: Some(upstream.iter().map(|g| g.depth as f32).collect()),
         grad_position: vec![[0.0; 3]; n],
         grad_scale: vec![[0.0; 3]; n],
         grad_rotation: vec![[0.0; 4]; n],
     };
     let push = stage::push_backward(camera, near);
-    let back = testing::run_once::<project_backward::Kernel>(gpu, &case, push, n);
+    let back = testing::run_once(project_backward::Kernel, gpu, &case, push, n);
     Outcome {
         mean: forward.mean,
         covariance: forward.covariance,

@@ -52,7 +52,7 @@ fn project() {
         };
         // The oracle has no near plane (its points are all in front of the camera) and lets the lens fold back.
         let push = project::Push { max_radius2: f32::INFINITY, ..stage::push(&camera, 0.0) };
-        let forward = testing::run_once::<project::Kernel>(&gpu, &arrays, push, n);
+        let forward = testing::run_once(project::Kernel, &gpu, &arrays, push, n);
         let check = |binding| <project::Kernel as gscream_vk::gpu::Reference>::check(binding);
         let backward_check = |binding| <project_backward::Kernel as gscream_vk::gpu::Reference>::check(binding);
         case.compare("mean", forward.mean.as_flattened(), check("mean"));
@@ -72,13 +72,13 @@ fn project() {
                 .zip(&forward.covariance)
                 .map(|(g, c)| narrow(entries_backward(c.map(f64::from), [g[0], g[1], g[2]])))
                 .collect(),
-            grad_depth: case.f32("upstream.depth"),
+            grad_depth: Some(case.f32("upstream.depth")),
             grad_position: vec![[testing::UNWRITTEN; 3]; n],
             grad_scale: vec![[testing::UNWRITTEN; 3]; n],
             grad_rotation: vec![[testing::UNWRITTEN; 4]; n],
         };
         let push = stage::push_backward(&camera, 0.0);
-        let got = testing::run_once::<project_backward::Kernel>(&gpu, &arrays, push, n);
+        let got = testing::run_once(project_backward::Kernel, &gpu, &arrays, push, n);
         let compare = |tensor: &'static str, got: &[f32]| {
             let Check { relative, absolute, band } = backward_check(tensor);
             // The sum of two float32 upstream entries was rounded once more.

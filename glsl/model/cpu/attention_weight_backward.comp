@@ -20,8 +20,8 @@ layout(push_constant, scalar) uniform Push {
   uint capacity; // tokens at most
   uint rows;     // vec4 of an output
   uint columns;  // vec4 of an input
-  uint matrix;   // vec4 offset of the matrix in the weights
   uint bias;     // 1: a bias follows
+  uint matrix;   // vec4 offset of the matrix in the weights
 } push;
 void main() {
   uint n = sides(tokens[push.own], tokens[1u - push.own], push.capacity).x;

@@ -16,7 +16,7 @@ use crate::gpu::kernels::model::{
     attention_backward, attention_forward, attention_output, attention_output_backward, attention_project,
     attention_project_backward, attention_skip, attention_weight_backward, attention_weight_sum, cpu,
 };
-use crate::gpu::{Buffer, Error, Gpu, Recorder};
+use crate::gpu::{Buffer, Error, Form, Gpu, Recorder};
 use crate::math::attention::{FEATURE, HEADS, INNER, Offsets, SIDES};
 pub use crate::math::attention::{TENSORS, WEIGHTS};
 use rand::{Rng, RngExt};
@@ -155,21 +155,6 @@ fn partials(gpu: &Gpu) -> Result<[Buffer<[f32; 4]>; 6], Error> {
     ])
 }
 
-/// Records one of the two forms of a kernel, which share bindings and push constants. Of each: so many tokens (rounded up)
-/// take so many threads.
-macro_rules! run {
-    ($self:ident, $rec:ident, $lanes:path: $many:literal tokens $wide:literal,
-     $other:path: $few:literal tokens $narrow:literal, $buffers:tt, $push:tt) => {
-        if $self.sharing != Sharing::Blocks {
-            use $lanes as kernel;
-            $rec.run(kernel::Kernel, kernel::Buffers $buffers, kernel::Push $push, $self.threads($many, $wide));
-        } else {
-            use $other as kernel;
-            $rec.run(kernel::Kernel, kernel::Buffers $buffers, kernel::Push $push, $self.threads($few, $narrow));
-        }
-    };
-}
-
 impl Attention {
     /// Room for `capacity` tokens a side.
     ///
@@ -238,6 +223,15 @@ impl Attention {
         self.capacity.div_ceil(tokens) * parts
     }
 
+    /// The form of a kernel, and its threads: tokens and parts as in [`Self::threads`], of lanes and of blocks.
+    fn share(&self, lanes: [u32; 2], blocks: [u32; 2]) -> (Form, u32) {
+        let (form, [tokens, parts]) = match self.sharing {
+            Sharing::Blocks => (Form::Gpu, blocks),
+            Sharing::Lanes | Sharing::Pairs => (Form::Cpu, lanes),
+        };
+        (form, self.threads(tokens, parts))
+    }
+
     /// Records the attended features of both sides (n, 32). `weights` is `[WEIGHTS]`, tensors as in [`TENSORS`].
     pub fn forward(
         &self,
@@ -252,21 +246,27 @@ impl Attention {
             let Offsets { to_qk, to_v, .. } = SIDES[own as usize];
             let (to_qk, to_v) = ((to_qk / 4) as u32, (to_v / 4) as u32);
             let Side { qk, value, .. } = side;
-            run!(self, rec, cpu::attention_project: 32 tokens 128, attention_project: 32 tokens 2048,
-                { tokens, feature, weights, qk, value }, { own, capacity, to_qk, to_v });
+            let (form, threads) = self.share([32, 128], [32, 2048]);
+            let buffers = attention_project::Buffers { tokens, feature, weights, qk, value };
+            let push = attention_project::Push { own, capacity, to_qk, to_v };
+            rec.run(attention_project::Kernel::from(form), buffers, push, threads);
         }
         for own in 0..2u32 {
             let (side, other) = (&self.sides[own as usize], &self.sides[1 - own as usize]);
             let (query, mixed, softmax) = (&side.qk, &side.mixed, &side.softmax);
             let (key, value) = (&other.qk, &other.value);
-            run!(self, rec, cpu::attention_forward: 32 tokens 64, attention_forward: 32 tokens 1024,
-                { tokens, query, key, value, mixed, softmax }, { own, capacity });
+            let (form, threads) = self.share([32, 64], [32, 1024]);
+            let buffers = attention_forward::Buffers { tokens, query, key, value, mixed, softmax };
+            let push = attention_forward::Push { own, capacity };
+            rec.run(attention_forward::Kernel::from(form), buffers, push, threads);
         }
         for (own, side) in (0..).zip(&self.sides) {
             let to_out = (SIDES[own as usize].to_out / 4) as u32;
             let updated = &side.updated.view();
-            run!(self, rec, cpu::attention_output: 32 tokens 16, attention_output: 16 tokens 256,
-                { tokens, mixed: &side.mixed, weights, updated }, { own, capacity, to_out });
+            let (form, threads) = self.share([32, 16], [16, 256]);
+            let buffers = attention_output::Buffers { tokens, mixed: &side.mixed, weights, updated };
+            let push = attention_output::Push { own, capacity, to_out };
+            rec.run(attention_output::Kernel::from(form), buffers, push, threads);
         }
         Pair { inside: &self.sides[0].updated, around: &self.sides[1].updated }
     }
@@ -288,8 +288,11 @@ impl Attention {
         for ((own, side), grad_updated) in (0..).zip(&self.sides).zip(&grad_updated) {
             let to_out = (SIDES[own as usize].to_out / 4) as u32;
             let Side { mixed, softmax, grad_mixed, rows, .. } = side;
-            run!(self, rec, cpu::attention_output_backward: 32 tokens 64, attention_output_backward: 32 tokens 1024,
-                { tokens, grad_updated, weights, mixed, softmax, grad_mixed, rows }, { own, capacity, to_out });
+            let (form, threads) = self.share([32, 64], [32, 1024]);
+            let buffers =
+                attention_output_backward::Buffers { tokens, grad_updated, weights, mixed, softmax, grad_mixed, rows };
+            let push = attention_output_backward::Push { own, capacity, to_out };
+            rec.run(attention_output_backward::Kernel::from(form), buffers, push, threads);
         }
         self.shares_backward(rec, tokens);
         for (own, side) in (0..).zip(&self.sides) {
@@ -297,8 +300,10 @@ impl Attention {
             let (to_qk, to_v) = ((to_qk / 4) as u32, (to_v / 4) as u32);
             let grad_feature = &side.grad_feature.view();
             let Side { grad_qk, grad_value, .. } = side;
-            run!(self, rec, cpu::attention_project_backward: 32 tokens 16, attention_project_backward: 16 tokens 256,
-                { tokens, weights, grad_qk, grad_value, grad_feature }, { own, capacity, to_qk, to_v });
+            let (form, threads) = self.share([32, 16], [16, 256]);
+            let buffers = attention_project_backward::Buffers { tokens, weights, grad_qk, grad_value, grad_feature };
+            let push = attention_project_backward::Push { own, capacity, to_qk, to_v };
+            rec.run(attention_project_backward::Kernel::from(form), buffers, push, threads);
         }
         self.weights_backward(rec, tokens, &features, &grad_updated, &grad_weights.view());
         Pair { inside: &self.sides[0].grad_feature, around: &self.sides[1].grad_feature }
@@ -327,10 +332,22 @@ impl Attention {
             let Side { qk, value, grad_mixed, rows, grad_qk, grad_value, .. } = &self.sides[own as usize];
             let Side { qk: other_qk, value: other_value, grad_mixed: other_grad_mixed, rows: other_rows, .. } =
                 &self.sides[1 - own as usize];
-            run!(self, rec, cpu::attention_backward: 16 tokens 64, attention_backward: 32 tokens 1024, {
-                tokens, qk, value, grad_mixed, rows, other_qk, other_value, other_grad_mixed, other_rows,
-                grad_qk, grad_value
-            }, { own, capacity });
+            let (form, threads) = self.share([16, 64], [32, 1024]);
+            let buffers = attention_backward::Buffers {
+                tokens,
+                qk,
+                value,
+                grad_mixed,
+                rows,
+                other_qk,
+                other_value,
+                other_grad_mixed,
+                other_rows,
+                grad_qk,
+                grad_value,
+            };
+            let push = attention_backward::Push { own, capacity };
+            rec.run(attention_backward::Kernel::from(form), buffers, push, threads);
         }
     }
 
@@ -357,16 +374,16 @@ impl Attention {
         for (pairs, other, applied) in
             [(grad_s, &around.qk, &inside.grad_qk), (around_share, &around.grad_mixed, &inside.grad_value)]
         {
-            let buffers = cpu::attention_pairs_apply_inside::Buffers { tokens, pairs, other, applied };
-            let push = cpu::attention_pairs_apply_inside::Push { capacity, stride };
-            rec.run(cpu::attention_pairs_apply_inside::Kernel, buffers, push, self.threads(32, 64));
+            let buffers = cpu::attention_pairs_apply::Buffers { tokens, pairs, other, applied };
+            let push = cpu::attention_pairs_apply::Push { capacity, stride };
+            rec.run(cpu::attention_pairs_apply::Kernel::Inside, buffers, push, self.threads(32, 64));
         }
         for (pairs, other, applied) in
             [(grad_s, &inside.qk, &around.grad_qk), (inside_share, &inside.grad_mixed, &around.grad_value)]
         {
             let buffers = cpu::attention_pairs_apply::Buffers { tokens, pairs, other, applied };
             let push = cpu::attention_pairs_apply::Push { capacity, stride };
-            rec.run(cpu::attention_pairs_apply::Kernel, buffers, push, self.threads(32, 64));
+            rec.run(cpu::attention_pairs_apply::Kernel::Plain, buffers, push, self.threads(32, 64));
         }
     }
 
@@ -388,17 +405,16 @@ impl Attention {
                 (&grad_updated[at], narrow, &side.mixed, inner, to_out, 1),
             ];
             for (grad_output, rows, inputs, columns, matrix, bias) in products {
-                if let Some(partial) = partials.next() {
-                    let push = attention_weight_backward::Push { own, capacity, rows, columns, bias };
-                    let buffers = attention_weight_backward::Buffers { tokens, grad_output, inputs, partial };
-                    let threads = rows / 8 * (columns / 8) * SLICES as u32 * 64;
-                    rec.run(attention_weight_backward::Kernel, buffers, push, threads);
-                } else {
-                    let matrix = (matrix / 4) as u32;
-                    let push = cpu::attention_weight_backward::Push { own, capacity, rows, columns, matrix, bias };
-                    let buffers = cpu::attention_weight_backward::Buffers { tokens, grad_output, inputs, grad_weights };
-                    rec.run(cpu::attention_weight_backward::Kernel, buffers, push, rows * columns / 8);
-                }
+                let partial = partials.next();
+                let (kernel, threads) = match partial {
+                    Some(_) => (attention_weight_backward::Kernel::Gpu, rows / 8 * (columns / 8) * SLICES as u32 * 64),
+                    None => (attention_weight_backward::Kernel::Cpu, rows * columns / 8),
+                };
+                let grad_weights = partial.is_none().then_some(grad_weights);
+                let buffers = attention_weight_backward::Buffers { tokens, grad_output, inputs, partial, grad_weights };
+                let matrix = (matrix / 4) as u32;
+                let push = attention_weight_backward::Push { own, capacity, rows, columns, bias, matrix };
+                rec.run(kernel, buffers, push, threads);
             }
         }
         if let Some([inside_qk, inside_value, inside_out, around_qk, around_value, around_out]) = &self.partials {

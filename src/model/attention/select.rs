@@ -369,7 +369,7 @@ mod tests {
             };
             let push = attention_select_take::Push { capacity: 64, too_few: 11 };
             testing::assert_twin(attention_select_take::Kernel, &gpu, case.clone(), push, 64u32);
-            let after = testing::run_once::<attention_select_take::Kernel>(&gpu, &case, push, 64u32);
+            let after = testing::run_once(attention_select_take::Kernel, &gpu, &case, push, 64u32);
             assert_eq!(after.tokens, [n, n]);
         }
     }

@@ -145,7 +145,7 @@ fn skip_flag() {
     ] {
         let case = attention_skip::Arrays { tokens: tokens.to_vec(), overflow: vec![overflow], skip: vec![9; 3] };
         testing::assert_twin(attention_skip::Kernel, &gpu, case.clone(), (), 1u32);
-        assert_eq!(testing::run_once::<attention_skip::Kernel>(&gpu, &case, (), 1u32).skip, want);
+        assert_eq!(testing::run_once(attention_skip::Kernel, &gpu, &case, (), 1u32).skip, want);
     }
 }
 

@@ -3,151 +3,110 @@
 use super::forward::lists;
 use super::*;
 use crate::gpu::kernels::render::{
-    cpu, decode_backward, decode_backward_feature, decode_backward_first, decode_backward_fixed,
-    decode_backward_fixed_offset, decode_backward_fixed_scaling, decode_backward_hidden, decode_backward_second,
+    decode_backward, decode_backward_feature, decode_backward_first, decode_backward_hidden, decode_backward_second,
     decode_backward_weights, decode_backward_weights_second,
 };
-use crate::gpu::{Buffer, Check, Error, Form, Gpu, Kernel, Recorder, Reference};
+use crate::gpu::{Buffer, Check, Error, Form, Gpu, Recorder, Reference};
 use crate::math::decoder::{FEATURE, Gaussian, HEADS, HIDDEN, INPUT, Layout, activate_backward, outputs_of};
 
-/// `offset` and `scaling` name what is trained of the two; `position` the gradient they need.
-macro_rules! backward_twin {
-    ($module:path $(, position: $position:ident)? $(, offset: $offset:ident)? $(, scaling: $scaling:ident)?) => {
-        const _: () = {
-            use $module as kernel;
-
-            impl Reference for kernel::Kernel {
-                fn reference(host: kernel::Host<'_>, push: kernel::Push, constants: kernel::Constants) {
-                    let layout = Layout { offsets: constants.offsets as usize };
-                    let grad_output = host.grad_output.as_flattened_mut();
-                    let n = host.groups[3] as usize;
-                    for v in 0..n {
-                        let anchor = host.visible[v] as usize;
-                        let log_scaling = six(host.log_scaling, anchor);
-                        let mut sum = [0.0; 6];
-                        for k in (0..layout.offsets).filter(|k| host.opacity[k * n + v] > push.above) {
-                            let (slot, at) = (k * n + v, anchor * layout.offsets + k);
-                            let of = Gaussian {
-                                position: [0.0; 3],
-                                opacity: host.opacity[slot].into(),
-                                color: wide(host.color[slot]),
-                                scale: wide(host.scale[slot]),
-                                rotation: wide(host.rotation[slot]),
-                                norm: host.rotation_norm[slot].into(),
-                            };
-                            let (mut _position, mut _offset) = ([0.0; 3], [0.0; 3]);
-                            $(_position = wide(host.$position[slot]);)?
-                            $(
-                                let _ = &host.$scaling;
-                                _offset = wide(host.offset[at]);
-                            )?
-                            let grad = if host.drawn[slot] == 0 { Gaussian::default() } else { Gaussian {
-                                position: _position,
-                                opacity: host.grad_opacity[slot].into(),
-                                color: wide(host.grad_color[slot]),
-                                scale: wide(host.grad_scale[slot]),
-                                rotation: wide(host.grad_rotation[slot]),
-                                norm: 0.0,
-                            } };
-                            let g = activate_backward(&of, _offset, log_scaling, &grad);
-                            let _ = at;
-                            $(host.$offset[at] = narrow(g.offset);)?
-                            sum.iter_mut().zip(g.log_scaling).for_each(|(s, g)| *s += g);
-                            for (raw, (head, output)) in g.raw.into_iter().zip(outputs_of(k)) {
-                                grad_output[v * layout.rows() + layout.row(head) + output] = raw as f32;
-                            }
-                        }
-                        let _ = (anchor, sum);
-                        $(host.$scaling[6 * anchor..][..6].copy_from_slice(&narrow(sum));)?
+impl Reference for decode_backward::Kernel {
+    fn reference(host: decode_backward::Host<'_>, push: decode_backward::Push, constants: decode_backward::Constants) {
+        let decode_backward::Host { mut grad_offset, mut grad_log_scaling, .. } = host;
+        let layout = Layout { offsets: constants.offsets as usize };
+        let grad_output = host.grad_output.as_flattened_mut();
+        let n = host.groups[3] as usize;
+        for v in 0..n {
+            let anchor = host.visible[v] as usize;
+            let log_scaling = six(host.log_scaling, anchor);
+            let mut sum = [0.0; 6];
+            for k in (0..layout.offsets).filter(|k| host.opacity[k * n + v] > push.above) {
+                let (slot, at) = (k * n + v, anchor * layout.offsets + k);
+                let of = Gaussian {
+                    position: [0.0; 3],
+                    opacity: host.opacity[slot].into(),
+                    color: wide(host.color[slot]),
+                    scale: wide(host.scale[slot]),
+                    rotation: wide(host.rotation[slot]),
+                    norm: host.rotation_norm[slot].into(),
+                };
+                let grad = if host.drawn[slot] == 0 {
+                    Gaussian::default()
+                } else {
+                    Gaussian {
+                        position: host.grad_position.map_or([0.0; 3], |grad| wide(grad[slot])),
+                        opacity: host.grad_opacity[slot].into(),
+                        color: wide(host.grad_color[slot]),
+                        scale: wide(host.grad_scale[slot]),
+                        rotation: wide(host.grad_rotation[slot]),
+                        norm: 0.0,
                     }
+                };
+                let offset = host.offset.map_or([0.0; 3], |offset| wide(offset[at]));
+                let g = activate_backward(&of, offset, log_scaling, &grad);
+                if let Some(grad_offset) = &mut grad_offset {
+                    grad_offset[at] = narrow(g.offset);
                 }
-
-                /// Ten products, Vulkan's `exp` (27 units in the last place at e^-12), and `1 - sigmoid`, `g - q (q . g)`,
-                /// which cancel: relative to the largest.
-                fn check(_: &'static str) -> Check {
-                    sums(10 + 27)
+                sum.iter_mut().zip(g.log_scaling).for_each(|(s, g)| *s += g);
+                for (raw, (head, output)) in g.raw.into_iter().zip(outputs_of(k)) {
+                    grad_output[v * layout.rows() + layout.row(head) + output] = raw as f32;
                 }
             }
-        };
-    };
-}
-
-backward_twin!(decode_backward, position: grad_position, offset: grad_offset, scaling: grad_log_scaling);
-
-backward_twin!(decode_backward_fixed_offset, position: grad_position, scaling: grad_log_scaling);
-
-backward_twin!(decode_backward_fixed_scaling, position: grad_position, offset: grad_offset);
-
-backward_twin!(decode_backward_fixed);
-
-macro_rules! backward_hidden_twin {
-    ($module:path) => {
-        const _: () = {
-            use $module as kernel;
-
-            impl Reference for kernel::Kernel {
-                fn reference(host: kernel::Host<'_>, (): (), constants: kernel::Constants) {
-                    let layout = Layout { offsets: constants.offsets as usize };
-                    let packed = host.packed.as_flattened();
-                    let (grad_output, grad_hidden) =
-                        (host.grad_output.as_flattened(), host.grad_hidden.as_flattened_mut());
-                    for v in 0..host.groups[3] as usize {
-                        for unit in 0..HEADS * HIDDEN {
-                            let head = unit / HIDDEN;
-                            let product = |row: usize| {
-                                f64::from(packed[4 * FIRST_VEC4 + row * HIDDEN + unit % HIDDEN])
-                                    * f64::from(grad_output[v * layout.rows() + row])
-                            };
-                            let at = v * HEADS * HIDDEN + unit;
-                            let sum: f64 = (layout.row(head)..layout.row(head + 1)).map(product).sum();
-                            let bits = host.positive[v * POSITIVE + unit / UNITS as usize];
-                            grad_hidden[at] = if bits >> (unit % UNITS as usize) & 1 > 0 { sum as f32 } else { 0.0 };
-                        }
-                    }
-                }
-                fn check(_: &'static str) -> Check {
-                    sums(72)
-                }
+            if let Some(grad_log_scaling) = &mut grad_log_scaling {
+                grad_log_scaling[6 * anchor..][..6].copy_from_slice(&narrow(sum));
             }
-        };
-    };
+        }
+    }
+
+    /// Ten products, Vulkan's `exp` (27 units in the last place at e^-12), and `1 - sigmoid`, `g - q (q . g)`,
+    /// which cancel: relative to the largest.
+    fn check(_: &'static str) -> Check {
+        sums(10 + 27)
+    }
 }
 
-backward_hidden_twin!(decode_backward_hidden);
-
-backward_hidden_twin!(cpu::decode_backward_hidden);
-
-macro_rules! backward_feature_twin {
-    ($module:path) => {
-        const _: () = {
-            use $module as kernel;
-
-            impl Reference for kernel::Kernel {
-                fn reference(host: kernel::Host<'_>, (): (), _: <Self as Kernel>::Constants) {
-                    let (packed, grad_hidden) = (host.packed.as_flattened(), host.grad_hidden.as_flattened());
-                    for v in 0..host.groups[3] as usize {
-                        for i in 0..FEATURE {
-                            let product = |unit: usize| {
-                                f64::from(packed[unit * Layout::PADDED_INPUT + i])
-                                    * f64::from(grad_hidden[v * HEADS * HIDDEN + unit])
-                            };
-                            let sum: f64 = (0..HEADS * HIDDEN).map(product).sum();
-                            let grad_feature: &mut [f32] = bytemuck::cast_slice_mut(host.grad_feature);
-                            grad_feature[FEATURE * host.visible[v] as usize + i] = sum as f32;
-                        }
-                    }
-                }
-                fn check(_: &'static str) -> Check {
-                    sums(HEADS * HIDDEN)
-                }
+impl Reference for decode_backward_hidden::Kernel {
+    fn reference(host: decode_backward_hidden::Host<'_>, (): (), constants: decode_backward_hidden::Constants) {
+        let layout = Layout { offsets: constants.offsets as usize };
+        let packed = host.packed.as_flattened();
+        let (grad_output, grad_hidden) = (host.grad_output.as_flattened(), host.grad_hidden.as_flattened_mut());
+        for v in 0..host.groups[3] as usize {
+            for unit in 0..HEADS * HIDDEN {
+                let head = unit / HIDDEN;
+                let product = |row: usize| {
+                    f64::from(packed[4 * FIRST_VEC4 + row * HIDDEN + unit % HIDDEN])
+                        * f64::from(grad_output[v * layout.rows() + row])
+                };
+                let at = v * HEADS * HIDDEN + unit;
+                let sum: f64 = (layout.row(head)..layout.row(head + 1)).map(product).sum();
+                let bits = host.positive[v * POSITIVE + unit / UNITS as usize];
+                grad_hidden[at] = if bits >> (unit % UNITS as usize) & 1 > 0 { sum as f32 } else { 0.0 };
             }
-        };
-    };
+        }
+    }
+    fn check(_: &'static str) -> Check {
+        sums(72)
+    }
 }
 
-backward_feature_twin!(decode_backward_feature);
-
-backward_feature_twin!(cpu::decode_backward_feature);
+impl Reference for decode_backward_feature::Kernel {
+    fn reference(host: decode_backward_feature::Host<'_>, (): (), _: decode_backward_feature::Constants) {
+        let (packed, grad_hidden) = (host.packed.as_flattened(), host.grad_hidden.as_flattened());
+        let grad_feature = host.grad_feature.as_flattened_mut();
+        for v in 0..host.groups[3] as usize {
+            for i in 0..FEATURE {
+                let product = |unit: usize| {
+                    f64::from(packed[unit * Layout::PADDED_INPUT + i])
+                        * f64::from(grad_hidden[v * HEADS * HIDDEN + unit])
+                };
+                let sum: f64 = (0..HEADS * HIDDEN).map(product).sum();
+                grad_feature[FEATURE * host.visible[v] as usize + i] = sum as f32;
+            }
+        }
+    }
+    fn check(_: &'static str) -> Check {
+        sums(HEADS * HIDDEN)
+    }
+}
 
 /// Chunks of a weight gradient: the anchors of each.
 pub(super) fn chunks(anchors: usize) -> impl Iterator<Item = std::ops::Range<usize>> {
@@ -155,39 +114,27 @@ pub(super) fn chunks(anchors: usize) -> impl Iterator<Item = std::ops::Range<usi
     (0..anchors).step_by(chunk).map(move |from| from..(from + chunk).min(anchors))
 }
 
-macro_rules! backward_first_twin {
-    ($module:path) => {
-        const _: () = {
-            use $module as kernel;
-
-            impl Reference for kernel::Kernel {
-                fn reference(host: kernel::Host<'_>, (): (), (): ()) {
-                    let (inputs, grad_hidden) = (host.inputs.as_flattened(), host.grad_hidden.as_flattened());
-                    let partial = host.partial.as_flattened_mut();
-                    for (part, anchors) in chunks(host.groups[3] as usize).enumerate() {
-                        for unit in 0..HEADS * HIDDEN {
-                            for i in 0..Layout::PADDED_INPUT {
-                                let product = |v: usize| {
-                                    f64::from(grad_hidden[v * HEADS * HIDDEN + unit])
-                                        * f64::from(inputs[v * Layout::PADDED_INPUT + i])
-                                };
-                                partial[4 * FIRST_VEC4 * part + unit * Layout::PADDED_INPUT + i] =
-                                    anchors.clone().map(product).sum::<f64>() as f32;
-                            }
-                        }
-                    }
-                }
-                fn check(_: &'static str) -> Check {
-                    sums(2 * BLOCK)
+impl Reference for decode_backward_first::Kernel {
+    fn reference(host: decode_backward_first::Host<'_>, (): (), (): ()) {
+        let (inputs, grad_hidden) = (host.inputs.as_flattened(), host.grad_hidden.as_flattened());
+        let partial = host.partial.as_flattened_mut();
+        for (part, anchors) in chunks(host.groups[3] as usize).enumerate() {
+            for unit in 0..HEADS * HIDDEN {
+                for i in 0..Layout::PADDED_INPUT {
+                    let product = |v: usize| {
+                        f64::from(grad_hidden[v * HEADS * HIDDEN + unit])
+                            * f64::from(inputs[v * Layout::PADDED_INPUT + i])
+                    };
+                    partial[4 * FIRST_VEC4 * part + unit * Layout::PADDED_INPUT + i] =
+                        anchors.clone().map(product).sum::<f64>() as f32;
                 }
             }
-        };
-    };
+        }
+    }
+    fn check(_: &'static str) -> Check {
+        sums(2 * BLOCK)
+    }
 }
-
-backward_first_twin!(decode_backward_first);
-
-backward_first_twin!(cpu::decode_backward_first);
 
 /// Chunks of the lists: k, and the visible anchors of each.
 pub(super) fn listed_chunks(segments: &[u32], listed: &[u32], offsets: usize) -> Vec<(usize, Vec<usize>)> {
@@ -197,41 +144,29 @@ pub(super) fn listed_chunks(segments: &[u32], listed: &[u32], offsets: usize) ->
         .collect()
 }
 
-/// Of the head that the constants name, or of all.
-macro_rules! backward_second_twin {
-    ($module:path $(, $head:ident)?) => {
-        const _: () = {
-            use $module as kernel;
-
-            impl Reference for kernel::Kernel {
-                fn reference(host: kernel::Host<'_>, (): (), constants: kernel::Constants) {
-                    let layout = Layout { offsets: constants.offsets as usize };
-                    let wanted = |_of: usize| true $(&& _of == constants.$head as usize)?;
-                    let (hidden, partial) = (host.hidden.as_flattened(), host.partial.as_flattened_mut());
-                    let chunks = listed_chunks(host.segments, host.listed, layout.offsets);
-                    for (part, (k, anchors)) in chunks.into_iter().enumerate() {
-                        let partial = &mut partial[4 * SECOND_VEC4 * part..][..4 * SECOND_VEC4];
-                        for (at, (of, output)) in outputs_of(k).enumerate().filter(|(_, (of, _))| wanted(*of)) {
-                            let grad = |v: usize| f64::from(host.grad_output[v * layout.rows() + layout.row(of) + output]);
-                            for j in 0..HIDDEN {
-                                let product = |&v: &usize| grad(v) * f64::from(hidden[(v * HEADS + of) * HIDDEN + j]);
-                                partial[at * HIDDEN + j] = anchors.iter().map(product).sum::<f64>() as f32;
-                            }
-                            partial[11 * HIDDEN + at] = anchors.iter().map(|&v| grad(v)).sum::<f64>() as f32;
-                        }
-                    }
+impl Reference for decode_backward_second::Kernel {
+    /// `Cpu`: of the head that the constants name, otherwise of all.
+    fn reference(host: decode_backward_second::Host<'_>, (): (), constants: decode_backward_second::Constants) {
+        let layout = Layout { offsets: constants.offsets as usize };
+        let wanted = |of: usize| host.kernel == decode_backward_second::Kernel::Gpu || of == constants.head as usize;
+        let (hidden, partial) = (host.hidden.as_flattened(), host.partial.as_flattened_mut());
+        let chunks = listed_chunks(host.segments, host.listed, layout.offsets);
+        for (part, (k, anchors)) in chunks.into_iter().enumerate() {
+            let partial = &mut partial[4 * SECOND_VEC4 * part..][..4 * SECOND_VEC4];
+            for (at, (of, output)) in outputs_of(k).enumerate().filter(|(_, (of, _))| wanted(*of)) {
+                let grad = |v: usize| f64::from(host.grad_output[v * layout.rows() + layout.row(of) + output]);
+                for j in 0..HIDDEN {
+                    let product = |&v: &usize| grad(v) * f64::from(hidden[(v * HEADS + of) * HIDDEN + j]);
+                    partial[at * HIDDEN + j] = anchors.iter().map(product).sum::<f64>() as f32;
                 }
-                fn check(_: &'static str) -> Check {
-                    sums(2 * BLOCK)
-                }
+                partial[11 * HIDDEN + at] = anchors.iter().map(|&v| grad(v)).sum::<f64>() as f32;
             }
-        };
-    };
+        }
+    }
+    fn check(_: &'static str) -> Check {
+        sums(2 * BLOCK)
+    }
 }
-
-backward_second_twin!(cpu::decode_backward_second, head);
-
-backward_second_twin!(decode_backward_second);
 
 impl Reference for decode_backward_weights::Kernel {
     fn reference(host: decode_backward_weights::Host<'_>, (): (), constants: decode_backward_weights::Constants) {
@@ -345,85 +280,55 @@ impl DecodeBackward {
         let Decode { opacity, color, scale, rotation, rotation_norm, .. } = forward;
         let GaussianGradients { drawn, opacity: grad_opacity, color: grad_color, scale: grad_scale, .. } = grad;
         let (grad_position, grad_rotation) = (grad.position, grad.rotation);
-        macro_rules! back {
-            ($module:path $(, $field:ident)*) => {{
-                use $module as kernel;
-                let buffers = kernel::Buffers {
-                    groups: count, visible, log_scaling, drawn, opacity, color, scale, rotation, rotation_norm,
-                    grad_opacity, grad_color, grad_scale, grad_rotation, grad_output $(, $field)*
-                };
-                let push = kernel::Push { above: forward.above };
-                rec.run_with(kernel::Kernel, kernel::Constants { offsets }, buffers, push, groups);
-            }};
-        }
         rec.zero(grad_output);
-        match (to.offset, to.log_scaling) {
-            (Some(grad_offset), Some(grad_log_scaling)) => {
-                back!(decode_backward, offset, grad_position, grad_offset, grad_log_scaling);
-            }
-            (None, Some(grad_log_scaling)) => {
-                back!(decode_backward_fixed_offset, offset, grad_position, grad_log_scaling);
-            }
-            (Some(grad_offset), None) => back!(decode_backward_fixed_scaling, grad_position, grad_offset),
-            (None, None) => back!(decode_backward_fixed),
-        }
+        let buffers = decode_backward::Buffers {
+            groups: count,
+            visible,
+            offset: to.log_scaling.map(|_| offset),
+            log_scaling,
+            drawn,
+            opacity,
+            color,
+            scale,
+            rotation,
+            rotation_norm,
+            grad_position: (to.offset.is_some() || to.log_scaling.is_some()).then_some(grad_position),
+            grad_opacity,
+            grad_color,
+            grad_scale,
+            grad_rotation,
+            grad_offset: to.offset,
+            grad_log_scaling: to.log_scaling,
+            grad_output,
+        };
+        let push = decode_backward::Push { above: forward.above };
+        rec.run_with(decode_backward::Kernel, decode_backward::Constants { offsets }, buffers, push, groups);
         if to.feature.is_none() && to.weights.is_none() {
             return;
         }
         let grad_hidden = self.grad_hidden.as_ref().expect("made with features or weights");
         let Decode { packed, inputs, hidden, positive, segments, existing, form, lanes, .. } = forward;
-        let listed = &existing.list;
-        let groups = &forward.per_hidden_backward;
-        if *lanes {
-            let buffers =
-                cpu::decode_backward_hidden::Buffers { groups: count, packed, positive, grad_output, grad_hidden };
-            let constants = cpu::decode_backward_hidden::Constants { offsets };
-            rec.run_with(cpu::decode_backward_hidden::Kernel, constants, buffers, (), groups);
-        } else {
-            let buffers = decode_backward_hidden::Buffers { groups: count, packed, positive, grad_output, grad_hidden };
-            let constants = decode_backward_hidden::Constants { offsets };
-            rec.run_with(decode_backward_hidden::Kernel, constants, buffers, (), groups);
-        }
+        let (listed, lanes) = (&existing.list, *lanes);
+        let buffers = decode_backward_hidden::Buffers { groups: count, packed, positive, grad_output, grad_hidden };
+        let kernel = decode_backward_hidden::Kernel::from(lanes);
+        let constants = decode_backward_hidden::Constants { offsets };
+        rec.run_with(kernel, constants, buffers, (), &forward.per_hidden_backward);
         if let Some(grad_feature) = to.feature {
-            let groups = &forward.per_feature;
             let grad_feature = &grad_feature.view();
-            if *lanes {
-                let buffers =
-                    cpu::decode_backward_feature::Buffers { groups: count, visible, packed, grad_hidden, grad_feature };
-                rec.run(cpu::decode_backward_feature::Kernel, buffers, (), groups);
-            } else {
-                let buffers =
-                    decode_backward_feature::Buffers { groups: count, visible, packed, grad_hidden, grad_feature };
-                rec.run(decode_backward_feature::Kernel, buffers, (), groups);
-            }
+            let buffers =
+                decode_backward_feature::Buffers { groups: count, visible, packed, grad_hidden, grad_feature };
+            rec.run(decode_backward_feature::Kernel::from(lanes), buffers, (), &forward.per_feature);
         }
         let Some(grad_weights) = to.weights else { return };
         let Sums { first, second } = self.sums.as_ref().expect("made with weights");
-        if *lanes {
-            let buffers = cpu::decode_backward_first::Buffers { groups: count, inputs, grad_hidden, partial: first };
-            rec.run(cpu::decode_backward_first::Kernel, buffers, (), &forward.per_first);
-        } else {
-            let buffers = decode_backward_first::Buffers { groups: count, inputs, grad_hidden, partial: first };
-            rec.run(decode_backward_first::Kernel, buffers, (), &forward.per_first);
-        }
+        let buffers = decode_backward_first::Buffers { groups: count, inputs, grad_hidden, partial: first };
+        rec.run(decode_backward_first::Kernel::from(lanes), buffers, (), &forward.per_first);
         let rows = &self.grad_output.view();
-        if *form == Form::Gpu {
-            let buffers =
-                decode_backward_second::Buffers { segments, listed, hidden, grad_output: rows, partial: second };
-            let constants = decode_backward_second::Constants { offsets };
-            rec.run_with(decode_backward_second::Kernel, constants, buffers, (), &forward.per_second);
-        } else {
-            for head in 0..HEADS as u32 {
-                let buffers = cpu::decode_backward_second::Buffers {
-                    segments,
-                    listed,
-                    hidden,
-                    grad_output: rows,
-                    partial: second,
-                };
-                let constants = cpu::decode_backward_second::Constants { offsets, head };
-                rec.run_with(cpu::decode_backward_second::Kernel, constants, buffers, (), &forward.per_second);
-            }
+        let buffers = decode_backward_second::Buffers { segments, listed, hidden, grad_output: rows, partial: second };
+        let (kernel, heads) = (decode_backward_second::Kernel::from(*form), if *form == Form::Gpu { 1 } else { HEADS });
+        for head in 0..heads as u32 {
+            let constants = decode_backward_second::Constants { offsets, head };
+            rec.run_with(kernel, constants, buffers, (), &forward.per_second);
         }
         let buffers = decode_backward_weights::Buffers { groups: count, partial: first, grad_weights };
         let constants = decode_backward_weights::Constants { offsets };

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::gpu::kernels::render::{
-    cpu, decode, decode_backward_feature, decode_backward_first, decode_backward_hidden, decode_hidden, decode_input,
+    decode, decode_backward_feature, decode_backward_first, decode_backward_hidden, decode_hidden, decode_input,
     decode_lists, decode_opacity, decode_pack,
 };
 use crate::gpu::{Buffer, Check, Error, Form, Gpu, Groups, Kernel, Recorder, Reference};
@@ -53,42 +53,29 @@ impl Reference for decode_input::Kernel {
     }
 }
 
-macro_rules! hidden_twin {
-    ($module:path) => {
-        const _: () = {
-            use $module as kernel;
-
-            impl Reference for kernel::Kernel {
-                fn reference(host: kernel::Host<'_>, (): (), _: <Self as Kernel>::Constants) {
-                    let (packed, inputs) = (host.packed.as_flattened(), host.inputs.as_flattened());
-                    let hidden = host.hidden.as_flattened_mut();
-                    for v in 0..host.groups[3] as usize {
-                        for unit in 0..HEADS * HIDDEN {
-                            let product = |i: usize| {
-                                f64::from(packed[unit * Layout::PADDED_INPUT + i])
-                                    * f64::from(inputs[v * Layout::PADDED_INPUT + i])
-                            };
-                            let sum: f64 = (0..Layout::PADDED_INPUT).map(product).sum();
-                            let h = sum.max(0.0) as f32;
-                            hidden[v * HEADS * HIDDEN + unit] = h;
-                            let bits = &mut host.positive[v * POSITIVE + unit / UNITS as usize];
-                            *bits = if unit % UNITS as usize == 0 { 0 } else { *bits };
-                            *bits |= u32::from(h > 0.0) << (unit % UNITS as usize);
-                        }
-                    }
-                }
-                /// A unit within rounding of 0 may be positive or not: one in some ten thousand at most.
-                fn check(binding: &'static str) -> Check {
-                    Check { band: if binding == "positive" { 2e-3 } else { 0.0 }, ..sums(Layout::PADDED_INPUT) }
-                }
+impl Reference for decode_hidden::Kernel {
+    fn reference(host: decode_hidden::Host<'_>, (): (), _: decode_hidden::Constants) {
+        let (packed, inputs) = (host.packed.as_flattened(), host.inputs.as_flattened());
+        let hidden = host.hidden.as_flattened_mut();
+        for v in 0..host.groups[3] as usize {
+            for unit in 0..HEADS * HIDDEN {
+                let product = |i: usize| {
+                    f64::from(packed[unit * Layout::PADDED_INPUT + i]) * f64::from(inputs[v * Layout::PADDED_INPUT + i])
+                };
+                let sum: f64 = (0..Layout::PADDED_INPUT).map(product).sum();
+                let h = sum.max(0.0) as f32;
+                hidden[v * HEADS * HIDDEN + unit] = h;
+                let bits = &mut host.positive[v * POSITIVE + unit / UNITS as usize];
+                *bits = if unit % UNITS as usize == 0 { 0 } else { *bits };
+                *bits |= u32::from(h > 0.0) << (unit % UNITS as usize);
             }
-        };
-    };
+        }
+    }
+    /// A unit within rounding of 0 may be positive or not: one in some ten thousand at most.
+    fn check(binding: &'static str) -> Check {
+        Check { band: if binding == "positive" { 2e-3 } else { 0.0 }, ..sums(Layout::PADDED_INPUT) }
+    }
 }
-
-hidden_twin!(decode_hidden);
-
-hidden_twin!(cpu::decode_hidden);
 
 impl Reference for decode_opacity::Kernel {
     fn reference(host: decode_opacity::Host<'_>, push: decode_opacity::Push, constants: decode_opacity::Constants) {
@@ -220,7 +207,8 @@ pub struct Decode {
     pub(super) above: f32,
     pub(super) form: Form,
     pub(super) tile: u32,
-    pub(super) lanes: bool,
+    /// Of the kernels of lanes.
+    pub(super) lanes: Form,
 }
 
 impl Decode {
@@ -244,9 +232,9 @@ impl Decode {
     pub fn of(gpu: &Gpu, capacity: u32, offsets: u32, above: f32) -> Result<Self, Error> {
         let (anchors, layout) = (capacity as usize, Layout { offsets: offsets as usize });
         let slots = anchors * layout.offsets;
-        let lanes = gpu.lanes();
+        let lanes = if gpu.lanes() { Form::Cpu } else { Form::Gpu };
         // Workgroups of the passes over hidden units, back through them, to the features, to the first layer.
-        let [hidden, back, feature, first] = if lanes {
+        let [hidden, back, feature, first] = if lanes == Form::Cpu {
             [LANES; 4]
         } else {
             [
@@ -311,7 +299,7 @@ impl Decode {
 
     /// How many threads the passes over visible anchors have, and those over their slots.
     fn count(&self, rec: &mut Recorder<'_>, visible_count: &Buffer<u32>) {
-        let (offsets, tile, lanes) = (self.layout.offsets as u32, self.tile, self.lanes);
+        let (offsets, tile, lanes) = (self.layout.offsets as u32, self.tile, self.lanes == Form::Cpu);
         let of = |tile: u32, factor: u32| Shape { tile, factor };
         // A workgroup for each tile and part.
         let parts =
@@ -347,13 +335,8 @@ impl Decode {
             inputs,
         };
         rec.run(decode_input::Kernel, buffers, decode_input::Push { center, center_low }, &self.per_anchor);
-        if self.lanes {
-            let buffers = cpu::decode_hidden::Buffers { groups, packed, inputs, hidden, positive };
-            rec.run(cpu::decode_hidden::Kernel, buffers, (), &self.per_hidden);
-        } else {
-            let buffers = decode_hidden::Buffers { groups, packed, inputs, hidden, positive };
-            rec.run(decode_hidden::Kernel, buffers, (), &self.per_hidden);
-        }
+        let buffers = decode_hidden::Buffers { groups, packed, inputs, hidden, positive };
+        rec.run(decode_hidden::Kernel::from(self.lanes), buffers, (), &self.per_hidden);
         let buffers = decode_opacity::Buffers { groups, packed, hidden, opacity, flags };
         let push = decode_opacity::Push { above: self.above };
         let constants = decode_opacity::Constants { offsets, tile };

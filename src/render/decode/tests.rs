@@ -5,10 +5,9 @@ use super::backward::{chunks, listed_chunks};
 use super::*;
 use crate::gpu::Reference;
 use crate::gpu::kernels::render::{
-    cpu, decode, decode_backward, decode_backward_feature, decode_backward_first, decode_backward_fixed,
-    decode_backward_fixed_offset, decode_backward_fixed_scaling, decode_backward_hidden, decode_backward_second,
-    decode_backward_weights, decode_backward_weights_second, decode_hidden, decode_input, decode_lists, decode_opacity,
-    decode_pack,
+    decode, decode_backward, decode_backward_feature, decode_backward_first, decode_backward_hidden,
+    decode_backward_second, decode_backward_weights, decode_backward_weights_second, decode_hidden, decode_input,
+    decode_lists, decode_opacity, decode_pack,
 };
 use crate::gpu::{Difference, Options, Timings, testing};
 use crate::math::camera::split;
@@ -77,9 +76,7 @@ where
     K::Constants: Clone,
 {
     testing::assert_twin_with(kernel, gpu, constants, case.clone(), push, n + 70);
-    let mut words = K::words(case);
-    K::reference(K::host(&mut words), push, constants);
-    K::arrays(&words)
+    testing::run_twin(kernel, constants, case, push)
 }
 
 /// Every kernel against its twin, each fed with the twins before it.
@@ -114,26 +111,20 @@ fn kernels_match_their_twins() {
         let inputs = twin(decode_input::Kernel, &gpu, (), case, push, count).inputs;
         let shared = gpu.runs_lanes();
         let groups_of = |parts: usize| 8 * parts * count.div_ceil(64);
-        macro_rules! hidden {
-            ($module:path) => {{
-                use $module as kernel;
-                kernel::Arrays {
-                    groups: m.counted(),
-                    packed: packed.clone(),
-                    inputs: inputs.clone(),
-                    hidden: unwritten(count * HIDDEN_VEC4 + 3),
-                    positive: vec![7; count * POSITIVE + 3],
-                }
-            }};
-        }
+        let case = decode_hidden::Arrays {
+            groups: m.counted(),
+            packed: packed.clone(),
+            inputs: inputs.clone(),
+            hidden: unwritten(count * HIDDEN_VEC4 + 3),
+            positive: vec![7; count * POSITIVE + 3],
+        };
         if shared {
-            twin(cpu::decode_hidden::Kernel, &gpu, (), hidden!(cpu::decode_hidden), (), groups_of(2));
+            twin(decode_hidden::Kernel::Cpu, &gpu, (), case.clone(), (), groups_of(2));
         }
-        let case = hidden!(decode_hidden);
         let tiles = |n: usize| n.div_ceil(tile as usize);
         let blocks = count.div_ceil(BLOCK_ANCHORS as usize);
         let decode_hidden::Arrays { hidden, positive, .. } =
-            twin(decode_hidden::Kernel, &gpu, (), case, (), blocks * 192);
+            twin(decode_hidden::Kernel::Gpu, &gpu, (), case, (), blocks * 192);
         let case = decode_opacity::Arrays {
             groups: m.counted(),
             packed: packed.clone(),
@@ -184,7 +175,7 @@ fn kernels_match_their_twins() {
         let case = decode_backward::Arrays {
             groups: m.counted(),
             visible: m.visible.clone(),
-            offset: m.offset.clone(),
+            offset: Some(m.offset.clone()),
             log_scaling: m.log_scaling.clone(),
             drawn: touched,
             opacity: flagged.opacity,
@@ -192,65 +183,38 @@ fn kernels_match_their_twins() {
             scale: forward.scale,
             rotation: forward.rotation,
             rotation_norm: forward.rotation_norm,
-            grad_position: random(&mut rng, slots, -1.0, 1.0),
+            grad_position: Some(random(&mut rng, slots, -1.0, 1.0)),
             grad_opacity: flat(&mut rng, slots, -1.0, 1.0),
             grad_color: random(&mut rng, slots, -1.0, 1.0),
             grad_scale: random(&mut rng, slots, -1.0, 1.0),
             grad_rotation: random(&mut rng, slots, -1.0, 1.0),
-            grad_offset: unwritten(m.offset.len()),
-            grad_log_scaling: vec![testing::UNWRITTEN; m.log_scaling.len()],
+            grad_offset: Some(unwritten(m.offset.len())),
+            grad_log_scaling: Some(vec![testing::UNWRITTEN; m.log_scaling.len()]),
             grad_output: vec![[0.0; 4]; count * layout.rows() / 4 + 3],
         };
-        macro_rules! fixed {
-            ($module:path $(, $field:ident)*) => {{
-                use $module as kernel;
-                let c = case.clone();
-                let case = kernel::Arrays {
-                    groups: c.groups, visible: c.visible, log_scaling: c.log_scaling, drawn: c.drawn,
-                    opacity: c.opacity, color: c.color, scale: c.scale, rotation: c.rotation, rotation_norm: c.rotation_norm,
-                    grad_opacity: c.grad_opacity, grad_color: c.grad_color, grad_scale: c.grad_scale,
-                    grad_rotation: c.grad_rotation, grad_output: c.grad_output $(, $field: c.$field)*
-                };
-                twin(kernel::Kernel, &gpu, kernel::Constants { offsets: k }, case, kernel::Push { above }, count);
-            }};
-        }
-        fixed!(decode_backward_fixed_offset, offset, grad_position, grad_log_scaling);
-        fixed!(decode_backward_fixed_scaling, grad_position, grad_offset);
-        fixed!(decode_backward_fixed);
         let constants = decode_backward::Constants { offsets: k };
         let push = decode_backward::Push { above };
+        let c = case.clone();
+        let fixed_offset = decode_backward::Arrays { grad_offset: None, ..c.clone() };
+        let fixed_scaling = decode_backward::Arrays { offset: None, grad_log_scaling: None, ..c };
+        let fixed = decode_backward::Arrays { grad_position: None, grad_offset: None, ..fixed_scaling.clone() };
+        for case in [fixed_offset, fixed_scaling, fixed] {
+            twin(decode_backward::Kernel, &gpu, constants, case, push, count);
+        }
         let grad_output = twin(decode_backward::Kernel, &gpu, constants, case, push, count).grad_output;
-        macro_rules! backward_hidden {
-            ($module:path) => {{
-                use $module as kernel;
-                kernel::Arrays {
-                    groups: m.counted(),
-                    packed: packed.clone(),
-                    positive: positive.clone(),
-                    grad_output: grad_output.clone(),
-                    grad_hidden: unwritten(count * HIDDEN_VEC4 + 3),
-                }
-            }};
-        }
-        if shared {
-            let constants = cpu::decode_backward_hidden::Constants { offsets: k };
-            let case = backward_hidden!(cpu::decode_backward_hidden);
-            twin(cpu::decode_backward_hidden::Kernel, &gpu, constants, case, (), groups_of(3));
-        }
-        let case = backward_hidden!(decode_backward_hidden);
+        let case = decode_backward_hidden::Arrays {
+            groups: m.counted(),
+            packed: packed.clone(),
+            positive: positive.clone(),
+            grad_output: grad_output.clone(),
+            grad_hidden: unwritten(count * HIDDEN_VEC4 + 3),
+        };
         let constants = decode_backward_hidden::Constants { offsets: k };
-        let threads = blocks * 3 * 64;
-        let grad_hidden = twin(decode_backward_hidden::Kernel, &gpu, constants, case, (), threads).grad_hidden;
         if shared {
-            let case = cpu::decode_backward_feature::Arrays {
-                groups: m.counted(),
-                visible: m.visible.clone(),
-                packed: packed.clone(),
-                grad_hidden: grad_hidden.clone(),
-                grad_feature: unwritten(m.feature.len() / 4),
-            };
-            twin(cpu::decode_backward_feature::Kernel, &gpu, (), case, (), groups_of(1));
+            twin(decode_backward_hidden::Kernel::Cpu, &gpu, constants, case.clone(), (), groups_of(3));
         }
+        let threads = blocks * 3 * 64;
+        let grad_hidden = twin(decode_backward_hidden::Kernel::Gpu, &gpu, constants, case, (), threads).grad_hidden;
         let case = decode_backward_feature::Arrays {
             groups: m.counted(),
             visible: m.visible.clone(),
@@ -258,48 +222,35 @@ fn kernels_match_their_twins() {
             grad_hidden: grad_hidden.clone(),
             grad_feature: unwritten(m.feature.len() / 4),
         };
-        twin(decode_backward_feature::Kernel, &gpu, (), case, (), blocks * 64);
-        let parts = count.div_ceil(BLOCK);
         if shared {
-            let case = cpu::decode_backward_first::Arrays {
-                groups: m.counted(),
-                inputs: inputs.clone(),
-                grad_hidden: grad_hidden.clone(),
-                partial: unwritten(parts * FIRST_VEC4 + 3),
-            };
-            twin(cpu::decode_backward_first::Kernel, &gpu, (), case, (), parts * 8);
+            twin(decode_backward_feature::Kernel::Cpu, &gpu, (), case.clone(), (), groups_of(1));
         }
+        twin(decode_backward_feature::Kernel::Gpu, &gpu, (), case, (), blocks * 64);
+        let parts = count.div_ceil(BLOCK);
         let case = decode_backward_first::Arrays {
             groups: m.counted(),
             inputs: inputs.clone(),
             grad_hidden: grad_hidden.clone(),
             partial: unwritten(parts * FIRST_VEC4 + 3),
         };
-        let first = twin(decode_backward_first::Kernel, &gpu, (), case, (), parts * 240).partial;
+        if shared {
+            twin(decode_backward_first::Kernel::Cpu, &gpu, (), case.clone(), (), parts * 8);
+        }
+        let first = twin(decode_backward_first::Kernel::Gpu, &gpu, (), case, (), parts * 240).partial;
         let grad_weights = vec![testing::UNWRITTEN; layout.weights() + 3];
         let chunks = listed_chunks(&segments, &listed, offsets).len();
-        let rows = grad_output.into_flattened();
-        let mut second = unwritten(chunks * SECOND_VEC4 + 3);
-        for head in 0..3 {
-            let case = cpu::decode_backward_second::Arrays {
-                segments: segments.clone(),
-                listed: listed.clone(),
-                hidden: hidden.clone(),
-                grad_output: rows.clone(),
-                partial: second,
-            };
-            let constants = cpu::decode_backward_second::Constants { offsets: k, head };
-            second = twin(cpu::decode_backward_second::Kernel, &gpu, constants, case, (), chunks * 2).partial;
-        }
         let case = decode_backward_second::Arrays {
             segments: segments.clone(),
             listed: listed.clone(),
             hidden: hidden.clone(),
-            grad_output: rows.clone(),
+            grad_output: grad_output.into_flattened(),
             partial: unwritten(chunks * SECOND_VEC4 + 3),
         };
-        let constants = decode_backward_second::Constants { offsets: k };
-        twin(decode_backward_second::Kernel, &gpu, constants, case, (), chunks * SECOND_THREADS as usize);
+        let of_head = |head: u32| decode_backward_second::Constants { offsets: k, head };
+        let kernel = decode_backward_second::Kernel::Gpu;
+        twin(kernel, &gpu, of_head(0), case.clone(), (), chunks * SECOND_THREADS as usize);
+        let by_head = |case, head| twin(decode_backward_second::Kernel::Cpu, &gpu, of_head(head), case, (), chunks * 2);
+        let second = (0..3).fold(case, by_head).partial;
         let case = decode_backward_weights::Arrays { groups: m.counted(), partial: first, grad_weights };
         let constants = decode_backward_weights::Constants { offsets: k };
         let grad_weights = twin(decode_backward_weights::Kernel, &gpu, constants, case, (), FIRST_VEC4).grad_weights;
@@ -327,7 +278,7 @@ fn long_chunks_match_their_twins() {
         grad_hidden: random(&mut rng, count * HIDDEN_VEC4, -1.0, 1.0),
         partial: unwritten(parts * FIRST_VEC4 + 3),
     };
-    let partial = twin(decode_backward_first::Kernel, &gpu, (), case, (), parts * 240).partial;
+    let partial = twin(decode_backward_first::Kernel::Gpu, &gpu, (), case, (), parts * 240).partial;
     let grad_weights = vec![testing::UNWRITTEN; layout.weights() + 3];
     let case = decode_backward_weights::Arrays { groups, partial, grad_weights };
     let constants = decode_backward_weights::Constants { offsets: 9 };
@@ -336,15 +287,15 @@ fn long_chunks_match_their_twins() {
     let segments: Vec<u32> = (0..=9).map(|k| k * count as u32).chain([count as u32]).collect();
     let chunks = listed_chunks(&segments, &listed, offsets).len();
     assert_eq!(chunks, 9 * 513);
-    let case = cpu::decode_backward_second::Arrays {
+    let case = decode_backward_second::Arrays {
         segments: segments.clone(),
         listed,
         hidden: random(&mut rng, count * HIDDEN_VEC4, -1.0, 1.0),
         grad_output: flat(&mut rng, count * layout.rows(), -1.0, 1.0),
         partial: vec![[0.0; 4]; chunks * SECOND_VEC4 + 3],
     };
-    let constants = cpu::decode_backward_second::Constants { offsets: 9, head: 0 };
-    let partial = twin(cpu::decode_backward_second::Kernel, &gpu, constants, case, (), chunks * 2).partial;
+    let constants = decode_backward_second::Constants { offsets: 9, head: 0 };
+    let partial = twin(decode_backward_second::Kernel::Cpu, &gpu, constants, case, (), chunks * 2).partial;
     let case = decode_backward_weights_second::Arrays { segments, partial, grad_weights };
     let constants = decode_backward_weights_second::Constants { offsets: 9 };
     twin(decode_backward_weights_second::Kernel, &gpu, constants, case, (), offsets * SECOND_VEC4);

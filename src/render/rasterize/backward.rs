@@ -1,18 +1,11 @@
 //! Back to front: gradients of pairs.
 
 use super::*;
-use crate::gpu::kernels::render::{
-    cpu, rasterize_backward, rasterize_backward_color, rasterize_backward_depth, rasterize_gather,
-    rasterize_gather_color, rasterize_gather_marked, rasterize_gather_marked_color,
-};
+use crate::gpu::kernels::render::{rasterize_backward, rasterize_gather};
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
-use crate::render::bin::{Binned, Blended, Tiling};
+use crate::render::bin::{Binned, Tiling};
 use crate::render::method::Method;
 use crate::render::slots::Slots;
-
-/// Gradients of a pair: sums over up to 256 pixels with cancellation in `S - A`, of relative size 1e-7 times the sum's
-/// largest term times 1/(1 - alpha) <= 100; a flipped sample moves all ten values of a pair and of those behind it.
-const PAIR: Check = Check { relative: 2e-4, absolute: 2e-5, band: 5e-3 };
 
 /// Gradients of one pair.
 #[derive(Clone, Copy, Default)]
@@ -69,117 +62,77 @@ fn backward(
     pairs
 }
 
-/// A pixel's gradients, and their product with what was rendered there.
-macro_rules! upstream {
-    ($host:ident, $p:ident $(, depth: $depth:ident)? $(, transmittance: $transmittance:ident)?) => {{
-        let rgb = $host.grad_rgb[$p].map(f64::from);
-        let mut _total: f64 = (0..3).map(|c| f64::from($host.rgb[$p][c]) * rgb[c]).sum();
-        let mut _z = 0.0;
-        $(
-            let _ = &$host.$depth;
-            _z = f64::from($host.grad_depth_map[$p]);
-            _total += f64::from($host.depth_map[$p]) * _z;
-        )?
-        $(_total += f64::from($host.$transmittance[$p]) * f64::from($host.grad_transmittance[$p]);)?
-        Upstream { total: _total, rgb, z: _z }
-    }};
-}
-
-/// A pair's gradients to where the kernel writes them.
-macro_rules! write_pair {
-    ($host:ident, $gradients:ident, $pair:expr $(, depth: $depth:ident)?) => {{
-        let (p, g) = ($pair, &$gradients[$pair]);
-        $host.pair_mean[p] = g.mean.map(|v| v as f32);
-        $host.pair_conic[p] = g.conic.map(|v| v as f32);
-        $host.pair_opacity[p] = g.opacity as f32;
-        $host.pair_color[p] = g.color.map(|v| v as f32);
-        $(
-            let _ = &$host.$depth;
-            $host.pair_depth[p] = g.depth as f32;
-        )?
-    }};
-}
-
-macro_rules! backward_twin {
-    ($module:path, $tile:expr $(, depth: $depth:ident)? $(, transmittance: $transmittance:ident)?) => {
-        const _: () = {
-            use $module as kernel;
-
-            impl Reference for kernel::Kernel {
-                fn reference(host: kernel::Host<'_>, push: kernel::Push, constants: kernel::Constants) {
-                    let kernel::Constants { alpha_min, transmittance_min, .. } = constants;
-                    let kernel::Host { ranges, sorted, pair_slot, mean, conic, opacity, color, .. } = host;
-                    let splats = Splats { ranges, sorted, pair_slot, mean, conic, opacity, color, alpha_min, transmittance_min };
-                    let mut _depth: Option<&[f32]> = None;
-                    $(_depth = Some(host.$depth);)?
-                    let gradients = backward(&splats, _depth, push.size, $tile, push.tiles_x, |p| {
-                        upstream!(host, p $(, depth: $depth)? $(, transmittance: $transmittance)?)
-                    });
-                    // The last range is of the pairs that touch no tile: their gradients are 0.
-                    for range in ranges.iter().take((push.tiles_x * push.size[1].div_ceil($tile)) as usize + 1) {
-                        for &pair in &sorted[range[0] as usize..range[1] as usize] {
-                            write_pair!(host, gradients, pair as usize $(, depth: $depth)?);
-                        }
-                    }
-                }
-                fn check(_: &'static str) -> Check {
-                    PAIR
-                }
-            }
+impl Reference for rasterize_backward::Kernel {
+    fn reference(
+        mut host: rasterize_backward::Host<'_>,
+        push: rasterize_backward::Push,
+        constants: rasterize_backward::Constants,
+    ) {
+        let rasterize_backward::Constants { alpha_min, transmittance_min, .. } = constants;
+        let rasterize_backward::Host { ranges, mean, conic, opacity, color, .. } = host;
+        let tile = match host.kernel {
+            rasterize_backward::Kernel::Gpu => Tiling::Wide.side(),
+            rasterize_backward::Kernel::Cpu => Tiling::Narrow.side(),
         };
-    };
-}
-
-backward_twin!(rasterize_backward, 16, depth: depth, transmittance: transmittance);
-
-backward_twin!(rasterize_backward_depth, 16, depth: depth);
-
-backward_twin!(rasterize_backward_color, 16);
-
-macro_rules! narrow_backward_twin {
-    ($module:path $(, depth: $depth:ident)? $(, transmittance: $transmittance:ident)?) => {
-        const _: () = {
-            use $module as kernel;
-
-            impl Reference for kernel::Kernel {
-                fn reference(host: kernel::Host<'_>, push: kernel::Push, constants: kernel::Constants) {
-                    let kernel::Constants { alpha_min, transmittance_min } = constants;
-                    let kernel::Host { ranges, blended, blended_count, mean, conic, opacity, color, .. } = host;
-                    let tiles = (push.tiles_x * push.size[1].div_ceil(8)) as usize;
-                    let lists: Vec<[u32; 2]> =
-                        (0..tiles).map(|t| [ranges[t][0], ranges[t][0] + blended_count[t]]).collect();
-                    let (mut sorted, mut pair_slot) = (vec![0; blended.len()], vec![0; host.pair_mean.len()]);
-                    for i in lists.iter().flat_map(|list| list[0] as usize..list[1] as usize) {
-                        let [pair, slot] = blended[i];
-                        sorted[i] = pair;
-                        pair_slot[pair as usize] = slot;
-                    }
-                    let (ranges, sorted, pair_slot) = (&lists[..], &sorted[..], &pair_slot[..]);
-                    let splats = Splats { ranges, sorted, pair_slot, mean, conic, opacity, color, alpha_min, transmittance_min };
-                    let mut _depth: Option<&[f32]> = None;
-                    $(_depth = Some(host.$depth);)?
-                    let gradients = backward(&splats, _depth, push.size, 8, push.tiles_x, |p| {
-                        upstream!(host, p $(, depth: $depth)? $(, transmittance: $transmittance)?)
-                    });
-                    for pair in lists.iter().flat_map(|list| &sorted[list[0] as usize..list[1] as usize]) {
-                        let p = *pair as usize;
-                        write_pair!(host, gradients, p $(, depth: $depth)?);
-                        host.marks[p / 32] |= 1 << (p % 32);
-                    }
-                }
-                fn check(_: &'static str) -> Check {
-                    PAIR
-                }
+        let tiles = (push.tiles_x * push.size[1].div_ceil(tile)) as usize;
+        let (lists, sorted, pair_slot) = match (host.sorted, host.pair_slot, host.blended, host.blended_count) {
+            // The last range is of the pairs that touch no tile: their gradients are 0.
+            (Some(sorted), Some(pair_slot), ..) => {
+                (ranges[..ranges.len().min(tiles + 1)].to_vec(), sorted.to_vec(), pair_slot.to_vec())
             }
+            (.., Some(blended), Some(count)) => {
+                let lists: Vec<[u32; 2]> = (0..tiles).map(|t| [ranges[t][0], ranges[t][0] + count[t]]).collect();
+                let (mut sorted, mut pair_slot) = (vec![0; blended.len()], vec![0; host.pair_mean.len()]);
+                for i in lists.iter().flat_map(|list| list[0] as usize..list[1] as usize) {
+                    let [pair, slot] = blended[i];
+                    sorted[i] = pair;
+                    pair_slot[pair as usize] = slot;
+                }
+                (lists, sorted, pair_slot)
+            }
+            _ => unreachable!("every variant has lists of pairs"),
         };
-    };
+        let splats = Splats {
+            ranges: &lists,
+            sorted: &sorted,
+            pair_slot: &pair_slot,
+            mean,
+            conic,
+            opacity,
+            color,
+            alpha_min,
+            transmittance_min,
+        };
+        let product = |value: Option<&[f32]>, grad: Option<&[f32]>, p: usize| {
+            value.zip(grad).map_or(0.0, |(value, grad)| f64::from(value[p]) * f64::from(grad[p]))
+        };
+        let gradients = backward(&splats, host.depth, push.size, tile, push.tiles_x, |p| {
+            let rgb = host.grad_rgb[p].map(f64::from);
+            let mut total: f64 = (0..3).map(|c| f64::from(host.rgb[p][c]) * rgb[c]).sum();
+            total += product(host.depth_map, host.grad_depth_map, p);
+            total += product(host.transmittance, host.grad_transmittance, p);
+            Upstream { total, rgb, z: host.grad_depth_map.map_or(0.0, |grad| grad[p].into()) }
+        });
+        for &pair in lists.iter().flat_map(|list| &sorted[list[0] as usize..list[1] as usize]) {
+            let (p, g) = (pair as usize, &gradients[pair as usize]);
+            host.pair_mean[p] = g.mean.map(|v| v as f32);
+            host.pair_conic[p] = g.conic.map(|v| v as f32);
+            host.pair_opacity[p] = g.opacity as f32;
+            host.pair_color[p] = g.color.map(|v| v as f32);
+            if let Some(pair_depth) = &mut host.pair_depth {
+                pair_depth[p] = g.depth as f32;
+            }
+            if let Some(marks) = &mut host.marks {
+                marks[p / 32] |= 1 << (p % 32);
+            }
+        }
+    }
+    /// Sums over up to 256 pixels with cancellation in `S - A`, of relative size 1e-7 times the sum's largest term times
+    /// 1/(1 - alpha) <= 100; a flipped sample moves all ten values of a pair and of those behind it.
+    fn check(_: &'static str) -> Check {
+        Check { relative: 2e-4, absolute: 2e-5, band: 5e-3 }
+    }
 }
-
-narrow_backward_twin!(cpu::rasterize_backward, depth: depth, transmittance: transmittance);
-
-narrow_backward_twin!(cpu::rasterize_backward_depth, depth: depth);
-
-narrow_backward_twin!(cpu::rasterize_backward_color);
 
 /// Gradients with respect to the picture.
 #[derive(Clone, Copy)]
@@ -258,120 +211,67 @@ impl Backward {
         gradient: PictureGradient<'_>,
     ) {
         let Projected { mean, depth, opacity, color, .. } = gaussians;
-        let Binned { ranges, sorted, pair_slot, conic, tiles, drawn, pair_count, first_pair, .. } = binned;
+        let Binned { ranges, sorted, pair_slot, conic, tiles, drawn, pair_count, first_pair, blended, .. } = binned;
         let Slots { list: drawn, count: drawn_count, groups: drawn_groups } = drawn;
-        let Self {
-            pair_mean,
-            pair_conic,
-            pair_opacity,
-            pair_color,
-            grad_mean,
-            grad_covariance,
-            grad_opacity,
-            grad_color,
-            ..
-        } = self;
+        let Self { pair_mean, pair_conic, pair_opacity, pair_color, .. } = self;
         let Method { tiling, alpha_min, transmittance_min, .. } = method.into();
         let size = picture.size;
         let grid = tiling.grid(size);
         let threads = [grid[0] * tiling.threads(), grid[1], 1];
-        let subgroups = subgroups(rec.gpu());
-        let (rgb, grad_rgb) = (&picture.rgb, gradient.rgb);
-        macro_rules! back {
-            ($module:path $([$constant:ident])? $(, $field:ident)*) => {{
-                use $module as kernel;
-                let buffers = kernel::Buffers {
-                    ranges, mean, conic, opacity, color, rgb, grad_rgb, pair_mean, pair_conic, pair_opacity, pair_color
-                    $(, $field)*
-                };
-                let constants = kernel::Constants { alpha_min, transmittance_min $(, $constant)? };
-                rec.run_with(kernel::Kernel, constants, buffers, kernel::Push { size, tiles_x: grid[0] }, threads);
-            }};
-        }
-        macro_rules! gather {
-            ($module:path $(, $field:ident)*) => {{
-                use $module as kernel;
-                let buffers = kernel::Buffers {
-                    drawn_count, drawn, tiles, pair_count, first_pair, conic, pair_mean, pair_conic, pair_opacity,
-                    pair_color, grad_mean, grad_covariance, grad_opacity, grad_color $(, $field)*
-                };
-                rec.run(kernel::Kernel, buffers, (), drawn_groups);
-            }};
-        }
-        let narrow = binned.blended.zip(self.marks.as_ref());
-        if let Some((_, marks)) = narrow {
+        // Depth has gradients where the picture has it, the scratch is there for them, and a loss looks at it.
+        let maps = picture.depth.as_ref().zip(gradient.depth).filter(|_| self.grad_depth.is_some());
+        let left = maps.and(picture.transmittance.as_ref().zip(gradient.transmittance));
+        let pair_depth = maps.and(self.pair_depth.as_ref());
+        let marks = blended.and(self.marks.as_ref());
+        if let Some(marks) = marks {
             rec.zero(marks);
         }
-        match (&picture.depth, &self.pair_depth, &self.grad_depth, gradient.depth) {
-            (Some(depth_map), Some(pair_depth), Some(grad_depth), Some(grad_depth_map)) => {
-                match (picture.transmittance.as_ref().zip(gradient.transmittance), narrow) {
-                    (Some((transmittance, grad_transmittance)), None) => {
-                        back!(
-                            rasterize_backward[subgroups],
-                            sorted,
-                            pair_slot,
-                            depth,
-                            depth_map,
-                            grad_depth_map,
-                            pair_depth,
-                            transmittance,
-                            grad_transmittance
-                        );
-                    }
-                    (Some((transmittance, grad_transmittance)), Some((lists, marks))) => {
-                        let Blended { pairs: blended, count: blended_count } = lists;
-                        back!(
-                            cpu::rasterize_backward,
-                            blended,
-                            blended_count,
-                            marks,
-                            depth,
-                            depth_map,
-                            grad_depth_map,
-                            pair_depth,
-                            transmittance,
-                            grad_transmittance
-                        );
-                    }
-                    (None, None) => {
-                        back!(
-                            rasterize_backward_depth[subgroups],
-                            sorted,
-                            pair_slot,
-                            depth,
-                            depth_map,
-                            grad_depth_map,
-                            pair_depth
-                        );
-                    }
-                    (None, Some((Blended { pairs: blended, count: blended_count }, marks))) => {
-                        back!(
-                            cpu::rasterize_backward_depth,
-                            blended,
-                            blended_count,
-                            marks,
-                            depth,
-                            depth_map,
-                            grad_depth_map,
-                            pair_depth
-                        );
-                    }
-                }
-                match narrow {
-                    Some((_, marks)) => gather!(rasterize_gather_marked, pair_depth, grad_depth, marks),
-                    None => gather!(rasterize_gather, pair_depth, grad_depth),
-                }
-            }
-            _ => match narrow {
-                Some((Blended { pairs: blended, count: blended_count }, marks)) => {
-                    back!(cpu::rasterize_backward_color, blended, blended_count, marks);
-                    gather!(rasterize_gather_marked_color, marks);
-                }
-                None => {
-                    back!(rasterize_backward_color[subgroups], sorted, pair_slot);
-                    gather!(rasterize_gather_color);
-                }
-            },
-        }
+        let buffers = rasterize_backward::Buffers {
+            ranges,
+            sorted: blended.is_none().then_some(sorted),
+            pair_slot: blended.is_none().then_some(pair_slot),
+            mean,
+            conic,
+            opacity,
+            color,
+            depth: maps.map(|_| depth),
+            rgb: &picture.rgb,
+            depth_map: maps.map(|(map, _)| map),
+            transmittance: left.map(|(map, _)| map),
+            grad_rgb: gradient.rgb,
+            grad_depth_map: maps.map(|(_, grad)| grad),
+            grad_transmittance: left.map(|(_, grad)| grad),
+            pair_mean,
+            pair_conic,
+            pair_opacity,
+            pair_color,
+            pair_depth,
+            blended: blended.map(|lists| lists.pairs),
+            blended_count: blended.map(|lists| lists.count),
+            marks,
+        };
+        let constants = rasterize_backward::Constants { alpha_min, transmittance_min, subgroups: subgroups(rec.gpu()) };
+        let push = rasterize_backward::Push { size, tiles_x: grid[0] };
+        rec.run_with(rasterize_backward::Kernel::from(tiling.form()), constants, buffers, push, threads);
+        let buffers = rasterize_gather::Buffers {
+            drawn_count,
+            drawn,
+            tiles,
+            pair_count,
+            first_pair,
+            conic,
+            pair_mean,
+            pair_conic,
+            pair_opacity,
+            pair_color,
+            pair_depth,
+            marks,
+            grad_mean: &self.grad_mean,
+            grad_covariance: &self.grad_covariance,
+            grad_opacity: &self.grad_opacity,
+            grad_color: &self.grad_color,
+            grad_depth: maps.and(self.grad_depth.as_ref()),
+        };
+        rec.run(rasterize_gather::Kernel, buffers, (), drawn_groups);
     }
 }

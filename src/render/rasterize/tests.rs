@@ -1,9 +1,6 @@
 use super::backward::subgroups;
 use super::*;
-use crate::gpu::kernels::render::{
-    cpu, rasterize, rasterize_backward, rasterize_backward_color, rasterize_backward_depth, rasterize_color,
-    rasterize_depth, rasterize_gather, rasterize_gather_color, rasterize_gather_marked, rasterize_gather_marked_color,
-};
+use crate::gpu::kernels::render::{rasterize, rasterize_backward, rasterize_gather};
 use crate::gpu::testing::{self, UNWRITTEN};
 use crate::math::camera::factors;
 use crate::math::tiles::Support;
@@ -71,30 +68,34 @@ fn scene(seed: u64, n: usize, size: [u32; 2], tiling: Tiling, alpha_min: f32) ->
     s
 }
 
-/// What the forward pass of narrow tiles lists.
-struct Lists {
-    blended: Vec<[u32; 2]>,
-    blended_count: Vec<u32>,
-}
-
-impl Lists {
-    fn new(scene: &Scene) -> Self {
-        Self { blended: vec![[7; 2]; scene.pair_slot.len()], blended_count: vec![7; scene.ranges.len()] }
+/// A case of the forward pass, with what the outputs and the tiles ask for.
+fn forward_case(s: &Scene, tiling: Tiling, size: [u32; 2], outputs: Outputs) -> rasterize::Arrays {
+    let pixels = (size[0] * size[1]) as usize;
+    let (map, narrow) = (vec![UNWRITTEN; pixels], tiling == Tiling::Narrow);
+    let depth = outputs != Outputs::Color;
+    rasterize::Arrays {
+        ranges: s.ranges.clone(),
+        sorted: s.sorted.clone(),
+        pair_slot: s.pair_slot.clone(),
+        mean: s.mean.clone(),
+        conic: s.conic.clone(),
+        opacity: s.opacity.clone(),
+        color: s.color.clone(),
+        rgb: vec![[UNWRITTEN; 3]; pixels],
+        depth: depth.then(|| s.depth.clone()),
+        depth_map: depth.then(|| map.clone()),
+        transmittance: (outputs == Outputs::Transmittance).then_some(map),
+        blended: narrow.then(|| vec![[7; 2]; s.pair_slot.len()]),
+        blended_count: narrow.then(|| vec![7; s.ranges.len()]),
     }
 }
 
-/// Bindings that only some variants have.
-struct Extra {
-    sorted: Vec<u32>,
-    pair_slot: Vec<u32>,
-    marks: Vec<u32>,
-    depth: Vec<f32>,
-    pair_depth: Vec<f32>,
-    depth_map: Vec<f32>,
-    transmittance: Vec<f32>,
-    grad_depth_map: Vec<f32>,
-    grad_transmittance: Vec<f32>,
+/// The tiles that a device can have.
+fn tilings(gpu: &Gpu) -> impl Iterator<Item = Tiling> {
+    [Tiling::Wide].into_iter().chain(gpu.runs_lanes().then_some(Tiling::Narrow))
 }
+
+const OUTPUTS: [Outputs; 3] = [Outputs::Color, Outputs::Depth, Outputs::Transmittance];
 
 /// Alpha and transmittance thresholds.
 const THRESHOLDS: [(f32, f32); 3] = [(1.0 / 255.0, 1e-4), (1e-3, 0.0), (0.05, 0.02)];
@@ -106,34 +107,16 @@ fn forward_matches_its_twin() {
     let gpu = testing::gpu();
     for (i, size) in SIZES.into_iter().enumerate() {
         let (alpha_min, transmittance_min) = THRESHOLDS[i % THRESHOLDS.len()];
-        for n in [0, 1, 65, 700] {
-            macro_rules! check {
-                ($module:path, $tiling:expr, [$($list:ident),*] $(, $depth:ident $(, $transmittance:ident)?)?) => {{
-                    use $module as kernel;
-                    let s = scene(i as u64, n, size, $tiling, alpha_min);
-                    let _lists = Lists::new(&s);
-                    let pixels = (size[0] * size[1]) as usize;
-                    let grid = $tiling.grid(size);
-                    let case = kernel::Arrays {
-                        ranges: s.ranges, sorted: s.sorted, pair_slot: s.pair_slot, mean: s.mean, conic: s.conic,
-                        opacity: s.opacity, color: s.color, rgb: vec![[UNWRITTEN; 3]; pixels],
-                        $($list: _lists.$list,)*
-                        $($depth: s.depth, depth_map: vec![UNWRITTEN; pixels],
-                        $($transmittance: vec![UNWRITTEN; pixels],)?)?
-                    };
-                    let push = kernel::Push { size, tiles_x: grid[0], background: [0.1, 0.2, 0.3] };
-                    let threads = [grid[0] * $tiling.threads(), grid[1], 1];
-                    let constants = kernel::Constants { alpha_min, transmittance_min };
-                    testing::assert_twin_with(kernel::Kernel, &gpu, constants, case, push, threads);
-                }};
-            }
-            check!(rasterize, Tiling::Wide, [], depth, transmittance);
-            check!(rasterize_depth, Tiling::Wide, [], depth);
-            check!(rasterize_color, Tiling::Wide, []);
-            if gpu.runs_lanes() {
-                check!(cpu::rasterize, Tiling::Narrow, [blended, blended_count], depth, transmittance);
-                check!(cpu::rasterize_depth, Tiling::Narrow, [blended, blended_count], depth);
-                check!(cpu::rasterize_color, Tiling::Narrow, [blended, blended_count]);
+        for (n, tiling) in [0, 1, 65, 700].into_iter().flat_map(|n| tilings(&gpu).map(move |tiling| (n, tiling))) {
+            let s = scene(i as u64, n, size, tiling, alpha_min);
+            let grid = tiling.grid(size);
+            for outputs in OUTPUTS {
+                let case = forward_case(&s, tiling, size, outputs);
+                let push = rasterize::Push { size, tiles_x: grid[0], background: [0.1, 0.2, 0.3] };
+                let threads = [grid[0] * tiling.threads(), grid[1], 1];
+                let constants = rasterize::Constants { alpha_min, transmittance_min };
+                let kernel = rasterize::Kernel::from(tiling.form());
+                testing::assert_twin_with(kernel, &gpu, constants, case, push, threads);
             }
         }
     }
@@ -145,101 +128,50 @@ fn backward_matches_its_twin() {
     let subgroups = subgroups(&gpu);
     for (i, size) in SIZES.into_iter().enumerate() {
         let (alpha_min, transmittance_min) = THRESHOLDS[i % THRESHOLDS.len()];
-        for n in [0, 1, 65, 300] {
-            macro_rules! check {
-                ($forward:path, $module:path $([$constant:ident])?, $tiling:expr, [$($list:ident),*] $(, $field:ident)*) => {{
-                    use $forward as forward;
-                    use $module as module;
-                    let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(i as u64);
-                    let s = scene(i as u64, n, size, $tiling, alpha_min);
-                    let pixels = (size[0] * size[1]) as usize;
-                    let grid = $tiling.grid(size);
-                    let mut random = || (0..pixels).map(|_| rng.random_range(-1f32..1.0)).collect::<Vec<f32>>();
-                    let threads = [grid[0] * $tiling.threads(), grid[1], 1];
-                    let mut _lists = Lists::new(&s);
-                    let picture = forward::Arrays {
-                        ranges: s.ranges.clone(), sorted: s.sorted.clone(), pair_slot: s.pair_slot.clone(),
-                        mean: s.mean.clone(), conic: s.conic.clone(), opacity: s.opacity.clone(),
-                        color: s.color.clone(), depth: s.depth.clone(), rgb: vec![[0.0; 3]; pixels],
-                        depth_map: vec![0.0; pixels], transmittance: vec![0.0; pixels],
-                        $($list: _lists.$list,)*
-                    };
-                    let push = forward::Push { size, tiles_x: grid[0], background: [0.1, 0.2, 0.3] };
-                    let constants = forward::Constants { alpha_min, transmittance_min };
-                    let picture = testing::run_once_with::<forward::Kernel>(&gpu, &picture, push, constants, threads);
-                    $(_lists.$list = picture.$list;)*
-                    let pairs = s.pair_slot.len();
-                    let extra = Extra {
-                        sorted: s.sorted, pair_slot: s.pair_slot, marks: vec![0; pairs.div_ceil(32)],
-                        depth: s.depth, pair_depth: vec![UNWRITTEN; pairs], depth_map: picture.depth_map,
-                        transmittance: picture.transmittance, grad_depth_map: random(), grad_transmittance: random(),
-                    };
-                    let grad_rgb = (0..pixels).map(|p| [extra.grad_depth_map[p], -extra.grad_transmittance[p], 0.5]).collect();
-                    let case = module::Arrays {
-                        ranges: s.ranges, mean: s.mean, conic: s.conic,
-                        opacity: s.opacity, color: s.color, rgb: picture.rgb, grad_rgb, $($list: _lists.$list,)*
-                        pair_mean: vec![[UNWRITTEN; 2]; pairs], pair_conic: vec![[UNWRITTEN; 3]; pairs],
-                        pair_opacity: vec![UNWRITTEN; pairs], pair_color: vec![[UNWRITTEN; 3]; pairs],
-                        $($field: extra.$field,)*
-                    };
-                    let push = module::Push { size, tiles_x: grid[0] };
-                    let constants = module::Constants { alpha_min, transmittance_min $(, $constant)? };
-                    testing::assert_twin_with(module::Kernel, &gpu, constants, case, push, threads);
-                }};
-            }
-            check!(
-                rasterize,
-                rasterize_backward[subgroups],
-                Tiling::Wide,
-                [],
-                sorted,
-                pair_slot,
-                depth,
-                depth_map,
-                grad_depth_map,
-                pair_depth,
-                transmittance,
-                grad_transmittance
-            );
-            check!(
-                rasterize,
-                rasterize_backward_depth[subgroups],
-                Tiling::Wide,
-                [],
-                sorted,
-                pair_slot,
-                depth,
-                depth_map,
-                grad_depth_map,
-                pair_depth
-            );
-            check!(rasterize, rasterize_backward_color[subgroups], Tiling::Wide, [], sorted, pair_slot);
-            if gpu.runs_lanes() {
-                check!(
-                    cpu::rasterize,
-                    cpu::rasterize_backward,
-                    Tiling::Narrow,
-                    [blended, blended_count],
-                    marks,
-                    depth,
-                    depth_map,
-                    grad_depth_map,
-                    pair_depth,
-                    transmittance,
-                    grad_transmittance
-                );
-                check!(
-                    cpu::rasterize,
-                    cpu::rasterize_backward_depth,
-                    Tiling::Narrow,
-                    [blended, blended_count],
-                    marks,
-                    depth,
-                    depth_map,
-                    grad_depth_map,
-                    pair_depth
-                );
-                check!(cpu::rasterize, cpu::rasterize_backward_color, Tiling::Narrow, [blended, blended_count], marks);
+        for (n, tiling) in [0, 1, 65, 300].into_iter().flat_map(|n| tilings(&gpu).map(move |tiling| (n, tiling))) {
+            let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(i as u64);
+            let s = scene(i as u64, n, size, tiling, alpha_min);
+            let (pixels, pairs) = ((size[0] * size[1]) as usize, s.pair_slot.len());
+            let grid = tiling.grid(size);
+            let threads = [grid[0] * tiling.threads(), grid[1], 1];
+            let push = rasterize::Push { size, tiles_x: grid[0], background: [0.1, 0.2, 0.3] };
+            let constants = rasterize::Constants { alpha_min, transmittance_min };
+            let case = forward_case(&s, tiling, size, Outputs::Transmittance);
+            let kernel = rasterize::Kernel::from(tiling.form());
+            let picture = testing::run_once_with(kernel, &gpu, constants, &case, push, threads);
+            let mut random = || (0..pixels).map(|_| rng.random_range(-1f32..1.0)).collect::<Vec<f32>>();
+            let (grad_depth_map, grad_transmittance) = (random(), random());
+            for outputs in OUTPUTS {
+                let (depth, left) = (outputs != Outputs::Color, outputs == Outputs::Transmittance);
+                let wide = tiling == Tiling::Wide;
+                let case = rasterize_backward::Arrays {
+                    ranges: s.ranges.clone(),
+                    sorted: wide.then(|| s.sorted.clone()),
+                    pair_slot: wide.then(|| s.pair_slot.clone()),
+                    mean: s.mean.clone(),
+                    conic: s.conic.clone(),
+                    opacity: s.opacity.clone(),
+                    color: s.color.clone(),
+                    rgb: picture.rgb.clone(),
+                    grad_rgb: (0..pixels).map(|p| [grad_depth_map[p], -grad_transmittance[p], 0.5]).collect(),
+                    pair_mean: vec![[UNWRITTEN; 2]; pairs],
+                    pair_conic: vec![[UNWRITTEN; 3]; pairs],
+                    pair_opacity: vec![UNWRITTEN; pairs],
+                    pair_color: vec![[UNWRITTEN; 3]; pairs],
+                    depth: depth.then(|| s.depth.clone()),
+                    depth_map: picture.depth_map.clone().filter(|_| depth),
+                    grad_depth_map: depth.then(|| grad_depth_map.clone()),
+                    pair_depth: depth.then(|| vec![UNWRITTEN; pairs]),
+                    transmittance: picture.transmittance.clone().filter(|_| left),
+                    grad_transmittance: left.then(|| grad_transmittance.clone()),
+                    blended: picture.blended.clone(),
+                    blended_count: picture.blended_count.clone(),
+                    marks: (!wide).then(|| vec![0; pairs.div_ceil(32)]),
+                };
+                let push = rasterize_backward::Push { size, tiles_x: grid[0] };
+                let constants = rasterize_backward::Constants { alpha_min, transmittance_min, subgroups };
+                let kernel = rasterize_backward::Kernel::from(tiling.form());
+                testing::assert_twin_with(kernel, &gpu, constants, case, push, threads);
             }
         }
     }
@@ -255,28 +187,16 @@ fn lists_hold_what_is_blended() {
         return;
     }
     let size = [129, 97];
-    let pixels = (size[0] * size[1]) as usize;
     for (alpha_min, transmittance_min) in THRESHOLDS {
         let s = scene(3, 2000, size, Tiling::Narrow, alpha_min);
-        let lists = Lists::new(&s);
-        let case = cpu::rasterize_color::Arrays {
-            ranges: s.ranges,
-            sorted: s.sorted,
-            pair_slot: s.pair_slot,
-            mean: s.mean,
-            conic: s.conic,
-            opacity: s.opacity,
-            color: s.color,
-            rgb: vec![[0.0; 3]; pixels],
-            blended: lists.blended,
-            blended_count: lists.blended_count,
-        };
+        let case = forward_case(&s, Tiling::Narrow, size, Outputs::Color);
         let grid = Tiling::Narrow.grid(size);
-        let push = cpu::rasterize_color::Push { size, tiles_x: grid[0], background: [0.0; 3] };
-        let constants = cpu::rasterize_color::Constants { alpha_min, transmittance_min };
+        let push = rasterize::Push { size, tiles_x: grid[0], background: [0.0; 3] };
+        let constants = rasterize::Constants { alpha_min, transmittance_min };
         let threads = [grid[0] * Tiling::Narrow.threads(), grid[1], 1];
-        type K = cpu::rasterize_color::Kernel;
-        let got = testing::run_once_with::<K>(&gpu, &case, push, constants, threads);
+        let got = testing::run_once_with(rasterize::Kernel::Cpu, &gpu, constants, &case, push, threads);
+        let lists = got.blended.zip(got.blended_count);
+        let (blended, blended_count) = lists.expect("the form for CPU drivers lists what it blends");
         let splats = Splats {
             ranges: &case.ranges,
             sorted: &case.sorted,
@@ -297,7 +217,7 @@ fn lists_hold_what_is_blended() {
         let (mut listed, mut other) = (0, 0);
         for tile in 0..(grid[0] * grid[1]) as usize {
             let [first, end] = case.ranges[tile].map(|i| i as usize);
-            let list = &got.blended[first..][..got.blended_count[tile] as usize];
+            let list = &blended[first..][..blended_count[tile] as usize];
             assert!(list.iter().all(|[pair, slot]| case.pair_slot[*pair as usize] == *slot));
             let numbers: Vec<u32> = list.iter().map(|[pair, _]| *pair).collect();
             let mut rest = numbers.iter().peekable();
@@ -332,71 +252,28 @@ fn gather_matches_its_twin() {
             pair_conic: (0..pairs).map(|_| [random(), random(), random()]).collect(),
             pair_opacity: (0..pairs).map(|_| random()).collect(),
             pair_color: (0..pairs).map(|_| [random(), random(), random()]).collect(),
-            pair_depth: (0..pairs).map(|_| random()).collect(),
+            pair_depth: Some((0..pairs).map(|_| random()).collect()),
             grad_mean: vec![[UNWRITTEN; 2]; n],
             grad_covariance: vec![[UNWRITTEN; 3]; n],
             grad_opacity: vec![UNWRITTEN; n],
             grad_color: vec![[UNWRITTEN; 3]; n],
-            grad_depth: vec![UNWRITTEN; n],
+            grad_depth: Some(vec![UNWRITTEN; n]),
+            marks: None,
         };
-        testing::assert_twin(rasterize_gather::Kernel, &gpu, case.clone(), (), n);
         let mut bits = || rng.random::<u32>() & rng.random::<u32>();
-        let c = case.clone();
-        let marked = rasterize_gather_marked::Arrays {
-            drawn_count: c.drawn_count,
-            drawn: c.drawn,
-            tiles: c.tiles,
-            pair_count: c.pair_count,
-            first_pair: c.first_pair,
-            conic: c.conic,
-            pair_mean: c.pair_mean,
-            pair_conic: c.pair_conic,
-            pair_opacity: c.pair_opacity,
-            pair_color: c.pair_color,
-            grad_mean: c.grad_mean,
-            grad_covariance: c.grad_covariance,
-            grad_opacity: c.grad_opacity,
-            grad_color: c.grad_color,
-            pair_depth: c.pair_depth,
-            grad_depth: c.grad_depth,
-            marks: (0..pairs.div_ceil(32)).map(|_| bits()).collect(),
-        };
-        testing::assert_twin(rasterize_gather_marked::Kernel, &gpu, marked.clone(), (), n);
-        let c = marked;
-        let marked = rasterize_gather_marked_color::Arrays {
-            drawn_count: c.drawn_count,
-            drawn: c.drawn,
-            tiles: c.tiles,
-            pair_count: c.pair_count,
-            first_pair: c.first_pair,
-            conic: c.conic,
-            pair_mean: c.pair_mean,
-            pair_conic: c.pair_conic,
-            pair_opacity: c.pair_opacity,
-            pair_color: c.pair_color,
-            grad_mean: c.grad_mean,
-            grad_covariance: c.grad_covariance,
-            grad_opacity: c.grad_opacity,
-            grad_color: c.grad_color,
-            marks: c.marks,
-        };
-        testing::assert_twin(rasterize_gather_marked_color::Kernel, &gpu, marked, (), n);
-        let color = rasterize_gather_color::Arrays {
-            drawn_count: case.drawn_count,
-            drawn: case.drawn,
-            tiles: case.tiles,
-            pair_count: vec![0],
-            first_pair: case.first_pair,
-            conic: case.conic,
-            pair_mean: case.pair_mean,
-            pair_conic: case.pair_conic,
-            pair_opacity: case.pair_opacity,
-            pair_color: case.pair_color,
-            grad_mean: case.grad_mean,
-            grad_covariance: case.grad_covariance,
-            grad_opacity: case.grad_opacity,
-            grad_color: case.grad_color,
-        };
-        testing::assert_twin(rasterize_gather_color::Kernel, &gpu, color, (), n);
+        let marks = Some((0..pairs.div_ceil(32)).map(|_| bits()).collect());
+        for (marks, depth, pair_count) in
+            [(&None, true, pairs), (&marks, true, pairs), (&marks, false, pairs), (&None, false, 0)]
+        {
+            let (pair_depth, grad_depth) = (case.pair_depth.clone(), case.grad_depth.clone());
+            let case = rasterize_gather::Arrays {
+                marks: marks.clone(),
+                pair_count: vec![pair_count as u32],
+                pair_depth: pair_depth.filter(|_| depth),
+                grad_depth: grad_depth.filter(|_| depth),
+                ..case.clone()
+            };
+            testing::assert_twin(rasterize_gather::Kernel, &gpu, case, (), n);
+        }
     }
 }
