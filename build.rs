@@ -375,7 +375,7 @@ fn camel(define: &str) -> String {
 }
 
 impl Kernel {
-    /// Every variant's bindings, by number, those that only the form for CPU drivers has behind the others.
+    /// Every variant's bindings by number; after them those that only the form for CPU drivers has.
     fn bindings(&self) -> Result<Vec<Binding>> {
         let mut all: Vec<(bool, Binding)> = vec![];
         for (variant, b) in self.variants.iter().flat_map(|v| v.interface.bindings.iter().map(move |b| (v, b))) {
