@@ -166,9 +166,14 @@ impl Losses {
         rgb: &Buffer<[f32; 3]>,
         depth: Option<&Buffer<f32>>,
     ) -> Gradients<'_> {
+        self.expand(rec, view);
+        self.compare(rec, view.depth, rgb, depth)
+    }
+
+    /// Records the expansion of a view into the frame's arrays, which [`Losses::compare`] reads.
+    pub fn expand(&self, rec: &mut Recorder<'_>, view: &View<'_>) {
         rec.stage(photometric::TERM.stage);
         self.frame.forward(rec, view.picture, view.weights, view.depth.map(|d| (d.weights, d.rectangle, d.prior)));
-        self.compare(rec, view.depth, rgb, depth)
     }
 
     /// The arrays of the current view, which [`Losses::compare`] reads.

@@ -12,7 +12,7 @@ pub use rates::Rates;
 use crate::config::Settings;
 use crate::densify::{Drawn, Statistics};
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
-use crate::losses::{self, DepthView, Losses};
+use crate::losses::{self, DepthView, Losses, View};
 use crate::math::decoder::Layout;
 use crate::model::anchors::Anchors;
 use crate::model::files;
@@ -231,13 +231,8 @@ impl Step {
     /// Records step `step` (counted from 1) on a photograph.
     pub fn record(&self, rec: &mut Recorder<'_>, photograph: &Photograph, step: u32, rates: Rates) {
         let view = self.view(photograph, step);
-        let compared = (&photograph.camera, view.depth.is_some());
-        rec.overlapped(|rec| {
-            self.line(rec, compared, Some(photograph), step, rates, |rec, canvas| {
-                let Canvas { picture, losses } = canvas;
-                losses.forward_backward(rec, &view, &picture.rgb, picture.depth.as_ref())
-            });
-        });
+        let compared = (&photograph.camera, view.depth);
+        rec.overlapped(|rec| self.line(rec, compared, Some((photograph, &view)), step, rates));
     }
 
     /// Records a step against the arrays that the losses' frame holds already: for tests.
@@ -249,30 +244,24 @@ impl Step {
         step: u32,
         rates: Rates,
     ) {
-        rec.overlapped(|rec| {
-            self.line(rec, (camera, depth.is_some()), None, step, rates, |rec, canvas| {
-                let Canvas { picture, losses } = canvas;
-                losses.compare(rec, depth, &picture.rgb, picture.depth.as_ref())
-            });
-        });
+        rec.overlapped(|rec| self.line(rec, (camera, depth), None, step, rates));
     }
 
-    /// The straight line of one step.
-    fn line<'s>(
-        &'s self,
+    /// The straight line of one step. Without a photograph it has no attention, and the losses' frame holds its arrays already.
+    fn line(
+        &self,
         rec: &mut Recorder<'_>,
-        (camera, depth): (&Camera, bool),
-        photograph: Option<&Photograph>,
+        (camera, depth): (&Camera, Option<DepthView<'_>>),
+        photographed: Option<(&Photograph, &View<'_>)>,
         step: u32,
         rates: Rates,
-        compare: impl FnOnce(&mut Recorder<'_>, &'s Canvas) -> losses::Gradients<'s>,
     ) {
         let Self { anchors, limits, near, .. } = self;
         let Stages { forward, rasterize: backward, project: project_backward, decode: decode_backward } = self.stages();
         let canvas = self.canvas(camera.size);
         // Depth is drawn for views alone whose depth is compared.
         let color_alone = canvas.picture.color();
-        let picture = if depth { &canvas.picture } else { &color_alone };
+        let picture = if depth.is_some() { &canvas.picture } else { &color_alone };
         rec.stage(stage::DECODE_BACKWARD);
         // Rows of anchors that are not drawn are not written.
         for gradient in anchors.parameters().iter().filter_map(|parameter| parameter.gradient.as_ref()) {
@@ -283,8 +272,8 @@ impl Step {
         // A step may be recorded again after later ones: the stage is there then, but its time has not come.
         let attend = self.attend.as_ref().filter(|_| step >= self.config.model.attention.start);
         rec.stage(stage::ATTENTION);
-        let (feature, attended) = match attend.zip(photograph) {
-            Some((attend, photograph)) => attend.forward(rec, anchors, &forward.visible, photograph, *near, step),
+        let (feature, attended) = match attend.zip(photographed) {
+            Some((attend, (photograph, _))) => attend.forward(rec, anchors, &forward.visible, photograph, *near, step),
             None => (&anchors.feature().value, None),
         };
         let offset = anchors.offset().value.view();
@@ -305,8 +294,10 @@ impl Step {
         rec.stage(stage::RASTERIZE);
         rasterize::forward(rec, forward.method(), forward.projected(), binned, self.background, picture);
 
-        let gradient = compare(rec, canvas);
-
+        if let Some((_, view)) = photographed {
+            canvas.losses.expand(rec, view);
+        }
+        let gradient = canvas.losses.compare(rec, depth, &canvas.picture.rgb, canvas.picture.depth.as_ref());
         let gradient = PictureGradient { rgb: gradient.rgb, depth: gradient.depth, transmittance: None };
         rec.stage(stage::RASTERIZE_BACKWARD);
         backward.record(rec, forward.method(), forward.projected(), binned, picture, gradient);
