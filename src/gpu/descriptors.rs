@@ -65,11 +65,12 @@ impl Sets {
         let layouts = [layout];
         let allocate =
             vk::DescriptorSetAllocateInfo::default().descriptor_pool(self.pools[self.current]).set_layouts(&layouts);
-        // SAFETY: live handles; the pool belongs to this recording alone and has room.
+        // SAFETY: live handles. The pool belongs to this recording alone, and the counts in `taken` say that it has room for a set
+        // and its buffers.
         let set = unsafe { device.allocate_descriptor_sets(&allocate) }?[0];
         self.taken = [self.taken[0] + 1, self.taken[1] + buffers];
         with_writes(bindings, slots, set, |writes| {
-            // SAFETY: a fresh set; the buffers outlive the recording.
+            // SAFETY: a fresh set, which no command uses yet; a buffer that is dropped before the recording has ended waits in the trash.
             unsafe { device.update_descriptor_sets(writes, &[]) }
         });
         self.made.insert(key, set);

@@ -179,8 +179,13 @@ impl Gpu {
         let mut device = Device::open(&instance, &found, wanted)?;
         let stored = options.cache.as_deref().map(|path| cache::read(path, found.identity)).unwrap_or_default();
         let create = vk::PipelineCacheCreateInfo::default().initial_data(&stored);
-        // SAFETY: a live device; the data are what this driver wrote, as far as a hash can tell.
-        device.cache = unsafe { device.create_pipeline_cache(&create, None) }.named("creating a pipeline cache")?;
+        let empty = vk::PipelineCacheCreateInfo::default();
+        // SAFETY: a live device. `cache::read` has compared the data's hash and the device, driver and version in their header:
+        // they are what this driver wrote, unless somebody who can write the user's cache folder forged them with their hash.
+        let made = unsafe { device.create_pipeline_cache(&create, None) };
+        // SAFETY: a live device, no data.
+        let made = made.or_else(|_| unsafe { device.create_pipeline_cache(&empty, None) });
+        device.cache = made.named("creating a pipeline cache")?;
         let allocator = Allocator::new(&AllocatorCreateDesc {
             instance: instance.raw.clone(),
             device: device.raw.clone(),
@@ -195,7 +200,7 @@ impl Gpu {
             device: info.name.clone(),
             source,
         })?;
-        // SAFETY: the device has one queue of this family.
+        // SAFETY: `Device::open` asked for one queue of this family, so that index 0 is there.
         let queue = unsafe { device.get_device_queue(device.family, 0) };
         let inner = Inner {
             push_descriptor: push.then(|| ash::khr::push_descriptor::Device::new(&instance.raw, &device)),
@@ -246,13 +251,9 @@ impl Gpu {
         }
         let mut budget = vk::PhysicalDeviceMemoryBudgetPropertiesEXT::default();
         let mut memory = vk::PhysicalDeviceMemoryProperties2::default().push_next(&mut budget);
-        // SAFETY: a plain query of a live instance; the extension was listed by the device.
+        // SAFETY: a plain query of a live instance; `memory_budget` says that the device lists the extension of the chained structure.
         unsafe { instance.raw.get_physical_device_memory_properties2(*physical, &mut memory) };
-        let heaps = memory.memory_properties;
-        let local = heaps.memory_heaps[..heaps.memory_heap_count as usize].iter().enumerate();
-        let local = local.filter(|(_, h)| h.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL));
-        let largest = local.max_by_key(|(_, h)| h.size).map(|(i, _)| i);
-        largest.map_or(0, |i| budget.heap_budget[i].saturating_sub(budget.heap_usage[i]))
+        free_bytes(&memory.memory_properties, &budget)
     }
 
     /// Names of the kernels of all pipelines made so far, each once; in a rehearsal, of those that a device would make.
@@ -284,7 +285,7 @@ impl Gpu {
     /// When the device is lost.
     pub fn wait_idle(&self) -> Result<(), Error> {
         let _queue = lock(&self.inner.queue);
-        // SAFETY: nobody else uses the only queue meanwhile.
+        // SAFETY: the guard of the only queue is held, so that nobody else uses it meanwhile.
         unsafe { self.inner.device.device_wait_idle() }.named("waiting for the device")
     }
 
@@ -296,6 +297,17 @@ impl Gpu {
     pub(super) fn inner(&self) -> &Arc<Inner> {
         &self.inner
     }
+}
+
+/// What is left of the largest heap on the device: its budget less what is in use already.
+fn free_bytes(
+    heaps: &vk::PhysicalDeviceMemoryProperties,
+    budget: &vk::PhysicalDeviceMemoryBudgetPropertiesEXT<'_>,
+) -> u64 {
+    let local = heaps.memory_heaps[..heaps.memory_heap_count as usize].iter().enumerate();
+    let local = local.filter(|(_, h)| h.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL));
+    let largest = local.max_by_key(|(_, h)| h.size).map(|(i, _)| i);
+    largest.map_or(0, |i| budget.heap_budget[i].saturating_sub(budget.heap_usage[i]))
 }
 
 /// What a device is opened with beyond what every device has.
@@ -346,7 +358,8 @@ impl Device {
         if wanted.executables {
             create = create.push_next(&mut statistics);
         }
-        // SAFETY: the instance and physical device are live; names and features are listed by the device.
+        // SAFETY: the instance and physical device are live. Every extension's name is one that the device lists, and
+        // `physical::choose` refuses a device that lacks one of the features; all arrays outlive the call.
         let raw = unsafe { instance.raw.create_device(found.raw, &create, None) }.named("opening the device")?;
         Ok(Self { raw, family, cache: vk::PipelineCache::null() })
     }
@@ -361,7 +374,7 @@ impl std::ops::Deref for Device {
 
 impl Drop for Device {
     fn drop(&mut self) {
-        // SAFETY: nothing else that was made from the device is left.
+        // SAFETY: whatever else was made from the device is destroyed in `Inner::drop`, which runs before its fields drop.
         unsafe {
             self.raw.destroy_pipeline_cache(self.cache, None);
             self.raw.destroy_device(None);
@@ -394,7 +407,10 @@ impl Inner {
     /// Frees a buffer once nothing in flight can use it.
     pub(super) fn discard(&self, raw: vk::Buffer, allocation: Allocation) {
         lock(&self.trash).push((raw, allocation));
-        if *lock(&self.in_flight) == 0 {
+        // Held until the trash is empty: a recording that began meanwhile could use a buffer and discard it, and that one
+        // would be freed with the others.
+        let in_flight = lock(&self.in_flight);
+        if *in_flight == 0 {
             self.empty_trash();
         }
     }
@@ -411,12 +427,13 @@ impl Inner {
         }
     }
 
+    /// Frees what was discarded. The caller holds `in_flight` at zero, or is the device's last owner.
     fn empty_trash(&self) {
         let mut allocator = lock(&self.allocator);
         let Some(allocator) = allocator.as_mut() else { return };
         for (raw, allocation) in lock(&self.trash).drain(..) {
             self.ledger.give(allocation.size());
-            // SAFETY: nothing in flight uses the buffer, and its owner is gone.
+            // SAFETY: its owner discarded the buffer, nothing is in flight, and nothing begins while the caller holds the count.
             unsafe { self.device.destroy_buffer(raw, None) };
             if let Err(error) = allocator.free(allocation) {
                 log::error!("freeing device memory: {error}");
@@ -530,7 +547,9 @@ impl Inner {
         let words = ash::util::read_spv(&mut std::io::Cursor::new(kernel.spirv)).expect("build.rs wrote whole words");
         // From SPIR-V 1.6 on a subgroup's size may vary from the driver's own without being allowed to.
         assert!(words[1] < 0x1_0600, "{}: a kernel knows its subgroups' size", kernel.name);
-        // SAFETY: the SPIR-V comes from shaderc, the layout from its reflection; all handles are live.
+        // SAFETY: the SPIR-V comes from shaderc and the layout, the push constants' size and the constants' ids from its
+        // reflection, so that they agree; `constants` has 4 bytes for each id. The module goes after the pipeline is made, and
+        // what was made before a failure the caller destroys.
         unsafe {
             let module_info = vk::ShaderModuleCreateInfo::default().code(&words);
             let module = self.device.create_shader_module(&module_info, None)?;
@@ -568,7 +587,8 @@ impl Inner {
     }
 
     fn destroy(&self, pipeline: &Pipeline) {
-        // SAFETY: nothing in flight uses it. What was never made is null, which is nothing to destroy.
+        // SAFETY: the caller has either just failed to make it or is the device's last owner after a wait for the device. What was
+        // never made is null, which is nothing to destroy.
         unsafe {
             self.device.destroy_pipeline(pipeline.made.get().map_or(vk::Pipeline::null(), |made| made.raw), None);
             self.device.destroy_pipeline_layout(pipeline.layout, None);
@@ -578,7 +598,7 @@ impl Inner {
 
     fn save_cache(&self) {
         let Some(path) = &self.options.cache else { return };
-        // SAFETY: the cache is live.
+        // SAFETY: the cache lives as long as the device, and the driver synchronises its own reads of it.
         let Ok(data) = (unsafe { self.device.get_pipeline_cache_data(self.device.cache) }) else { return };
         if let Err(error) = cache::write(path, &data) {
             log::warn!("{}: the pipeline cache could not be written: {error}", path.display());
@@ -588,7 +608,8 @@ impl Inner {
 
 impl Drop for Inner {
     fn drop(&mut self) {
-        // SAFETY: the last owner is going; buffers and recorders hold an Arc, so none is left. Device and instance follow.
+        // SAFETY: the last owner is going: buffers, recorders and submissions hold an Arc, so none is left, and nothing runs after
+        // the wait. The device and then the instance follow as fields.
         unsafe {
             // Mesa's null device has no queue to wait for.
             if self.info.heap_bytes > 0 {
@@ -610,8 +631,8 @@ impl Drop for Inner {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::mpsc;
-    use std::time::Duration;
+    use std::sync::{TryLockError, mpsc};
+    use std::time::{Duration, Instant};
 
     use super::*;
     use crate::gpu::kernels::primitives::{dispatch, limit};
@@ -639,5 +660,47 @@ mod tests {
         assert!(slow.made.get().is_none());
         gpu.inner().compile(&slow).expect("it compiles");
         assert_eq!(gpu.pipelines(), [dispatch::Kernel::NAME, limit::Kernel::NAME]);
+    }
+
+    /// Of the device's own heaps the largest counts, and what others have taken of it is gone.
+    #[test]
+    fn what_is_in_use_is_not_free() {
+        let mut heaps = vk::PhysicalDeviceMemoryProperties { memory_heap_count: 3, ..Default::default() };
+        let local = vk::MemoryHeapFlags::DEVICE_LOCAL;
+        heaps.memory_heaps[0] = vk::MemoryHeap { size: 64 << 30, flags: vk::MemoryHeapFlags::empty() };
+        heaps.memory_heaps[1] = vk::MemoryHeap { size: 1 << 28, flags: local };
+        heaps.memory_heaps[2] = vk::MemoryHeap { size: 8 << 30, flags: local };
+        let mut budget = vk::PhysicalDeviceMemoryBudgetPropertiesEXT::default();
+        budget.heap_budget[..3].copy_from_slice(&[60 << 30, 1 << 28, 7 << 30]);
+        budget.heap_usage[..3].copy_from_slice(&[1 << 30, 1 << 20, 5 << 30]);
+        assert_eq!(free_bytes(&heaps, &budget), 2 << 30);
+        budget.heap_usage[2] = 9 << 30;
+        assert_eq!(free_bytes(&heaps, &budget), 0, "taken beyond the budget");
+    }
+
+    /// A recording that begins between the look at the count and the freeing could use a buffer and discard it, and it
+    /// would be freed in flight. Freeing waits for the allocator, which is taken here.
+    #[test]
+    fn no_recording_begins_while_buffers_are_freed() {
+        let gpu = testing::gpu();
+        let buffer = gpu.upload("words", &[1u32, 2, 3]).expect("room");
+        let inner = gpu.inner();
+        let allocator = lock(&inner.allocator);
+        std::thread::scope(|scope| {
+            scope.spawn(|| drop(buffer));
+            let began = Instant::now();
+            // Many looks in a row: a look at the count alone holds it for an instant.
+            let mut held = 0;
+            while held < 20 && began.elapsed() < Duration::from_secs(20) {
+                held = match inner.in_flight.try_lock() {
+                    Err(TryLockError::WouldBlock) => held + 1,
+                    _ => 0,
+                };
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            drop(allocator);
+            assert_eq!(held, 20, "a recording could begin while a buffer was being freed");
+        });
+        assert_eq!(gpu.read(&gpu.upload("words", &[4u32]).expect("room")).expect("readable"), [4]);
     }
 }

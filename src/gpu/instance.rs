@@ -26,7 +26,7 @@ impl Instance {
     /// # Errors
     /// Without a loader, a driver, or the layer that is wanted.
     pub fn open(validate: bool) -> Result<Self, Error> {
-        // SAFETY: loading the system's Vulkan loader, which runs its initialisers.
+        // SAFETY: runs the initialisers of the system's Vulkan loader; `Entry` keeps the library loaded as long as the instance.
         let entry = unsafe { ash::Entry::load() }.map_err(|e| Error::NoLoader(e.to_string()))?;
         // SAFETY: plain queries of a loaded loader.
         let (layers, extensions) = unsafe {
@@ -64,7 +64,7 @@ impl Instance {
         if validate {
             info = info.push_next(&mut features);
         }
-        // SAFETY: every name passed was listed by the loader or is checked by it.
+        // SAFETY: every layer's and extension's name was listed by the loader or is checked by it; the strings outlive the call.
         let raw = unsafe { entry.create_instance(&info, None) };
         // The loader's answer where no driver is installed, or none that can be loaded.
         if raw.as_ref().err() == Some(&vk::Result::ERROR_INCOMPATIBLE_DRIVER) {
@@ -86,7 +86,8 @@ impl Instance {
             .message_type(vk::DebugUtilsMessageTypeFlagsEXT::VALIDATION)
             .pfn_user_callback(Some(on_message))
             .user_data(Arc::as_ptr(&self.messages).cast_mut().cast());
-        // SAFETY: the list outlives the messenger: both are this instance's.
+        // SAFETY: the callback's pointer is to the contents of an Arc that the instance owns: their address stays when the instance
+        // moves, and `drop` destroys the messenger before the Arc goes.
         let raw = unsafe { utils.create_debug_utils_messenger(&create, None) }.named("creating a messenger")?;
         self.messenger = Some((utils, raw));
         Ok(())

@@ -265,7 +265,8 @@ impl Gpu {
             let feature = "memory (a driver without hardware compiles kernels and runs none)".to_owned();
             return Err(Error::Missing { device: self.info().name.clone(), feature });
         }
-        // SAFETY: the device outlives the buffer (the buffer holds an Arc of it), and the memory is bound before use.
+        // SAFETY: the device outlives the buffer, which holds an Arc of it; the size is positive and below the limit of a binding
+        // where kernels use it; memory is bound before anybody else sees it.
         let (raw, requirements) = unsafe {
             let raw = inner.device.create_buffer(&info, None).named("creating a buffer")?;
             (raw, inner.device.get_buffer_memory_requirements(raw))
@@ -285,7 +286,7 @@ impl Gpu {
                 return Err(Error::OutOfMemory { name, bytes, device: self.info().name.clone(), source });
             }
         };
-        // SAFETY: fresh buffer, memory that meets its requirements.
+        // SAFETY: a fresh buffer; the allocator was given its size, alignment and memory types.
         let bound = unsafe { inner.device.bind_buffer_memory(raw, allocation.memory(), allocation.offset()) };
         if let Err(result) = bound {
             inner.discard(raw, allocation);

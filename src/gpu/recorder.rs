@@ -722,7 +722,8 @@ impl Submission<'_> {
         Commands { inner, raw: context.commands, noted: &mut self.commands }.barrier_to_host();
         let commands = [vk::CommandBufferSubmitInfo::default().command_buffer(context.commands)];
         let submit = [vk::SubmitInfo2::default().command_buffer_infos(&commands)];
-        // SAFETY: the command buffer is in recording and its fence unsignalled.
+        // SAFETY: the command buffer is in recording, its fence is new or was reset when it was last waited for, and the guard of
+        // the queue is held.
         let result = unsafe {
             inner.device.end_command_buffer(context.commands).named("ending a command buffer")?;
             inner.device.queue_submit2(*lock(&inner.queue), &submit, context.fence)
@@ -793,6 +794,12 @@ impl Submission<'_> {
     }
 }
 
+/// Whether a wait for a fence came to its end: nothing runs after it, or the device is lost and nothing runs any more. After
+/// any other failure the work may be in flight still.
+fn is_over(waited: ash::prelude::VkResult<()>) -> bool {
+    matches!(waited, Ok(()) | Err(vk::Result::ERROR_DEVICE_LOST))
+}
+
 impl Drop for Submission<'_> {
     fn drop(&mut self) {
         if let Some(rehearsal) = self.rehearsal.take() {
@@ -802,10 +809,20 @@ impl Drop for Submission<'_> {
             let inner = self.gpu.inner();
             // What never reached the queue signals no fence: waiting for it would not end.
             if self.submitted {
-                // SAFETY: given to the queue in `start`; a failure here means the device is lost and nothing runs any more.
-                unsafe {
-                    let _ = inner.device.wait_for_fences(&[context.fence], true, u64::MAX);
-                    let _ = inner.device.reset_fences(&[context.fence]);
+                // SAFETY: the fence was given to the queue in `start`.
+                let waited = unsafe { inner.device.wait_for_fences(&[context.fence], true, u64::MAX) };
+                if !is_over(waited) {
+                    // It may run still: neither the context nor any buffer may be used again or freed, as long as this
+                    // process has the device.
+                    std::mem::forget(context);
+                    return;
+                }
+                // SAFETY: nothing runs that would signal the fence, and nobody else waits for it.
+                if unsafe { inner.device.reset_fences(&[context.fence]) }.is_err() {
+                    // SAFETY: nothing in flight uses the context. With its fence up it is of no use for another submission.
+                    unsafe { context.destroy(inner) };
+                    inner.ended();
+                    return;
                 }
             }
             lock(&inner.contexts).push(context);
@@ -873,6 +890,16 @@ mod tests {
             saved += barriers - overlapped;
         }
         assert!(saved > 40, "{saved} barriers fewer");
+    }
+
+    #[test]
+    fn a_wait_that_failed_is_no_end_unless_the_device_is_lost() {
+        assert!(is_over(Ok(())) && is_over(Err(vk::Result::ERROR_DEVICE_LOST)));
+        for result in
+            [vk::Result::ERROR_OUT_OF_HOST_MEMORY, vk::Result::ERROR_OUT_OF_DEVICE_MEMORY, vk::Result::TIMEOUT]
+        {
+            assert!(!is_over(Err(result)), "{result}");
+        }
     }
 
     /// Its fence was never given to the queue: waiting for it would not end.

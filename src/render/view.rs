@@ -74,7 +74,9 @@ impl Forward {
             visible: gpu.stage(stage::CULL, || Visible::new(gpu, capacity.anchors, capacity.visible, cull))?,
             decode: gpu.stage(stage::DECODE, || Decode::new(gpu, capacity.visible, offsets))?,
             project: gpu.stage(stage::PROJECT, || Project::new(gpu, capacity.visible, offsets))?,
-            bin: gpu.stage(stage::BIN, || Bin::new(gpu, method, capacity.visible * offsets, capacity.pairs, size))?,
+            bin: gpu.stage(stage::BIN, || {
+                Bin::new(gpu, method, capacity.visible.saturating_mul(offsets), capacity.pairs, size)
+            })?,
             larger: 1.0,
             method,
         })
