@@ -43,6 +43,9 @@ pub mod primitives;
 pub mod render;
 pub mod report;
 pub mod scene;
+#[cfg(test)]
+#[path = "../tests/common/skip.rs"]
+mod skip;
 pub mod stage;
 pub mod train;
 pub mod view;

@@ -7,7 +7,7 @@ use assert_cmd::cargo::cargo_bin_cmd;
 use gscream_vk::capture::{self, Evidence, Request, Step, Watch};
 use gscream_vk::gpu::testing;
 use gscream_vk::scene::{self, Camera, synthetic};
-use image::{GrayImage, Luma, RgbImage};
+use image::{GrayImage, Luma, Rgb, RgbImage};
 use tempfile::TempDir;
 
 const VIEWS: u32 = 10;
@@ -402,6 +402,46 @@ fn run(folder: &Path, arguments: &str) -> Outcome {
         stdout: text(output.stdout),
         stderr: text(output.stderr),
     }
+}
+
+/// Strokes beyond the box of the same view do not count, as typed on the command line.
+#[test]
+#[ignore = "long; .ci/run has it"]
+fn strokes_count_within_the_box() {
+    let folder = capture();
+    let given = VIEWS / 2;
+    let object = mask(&truth(&folder, given));
+    let [x0, y0, x1, y1] = bounds(&object, 6);
+    let near = |x: u32, y: u32| {
+        let around = |v: u32, end: u32| v.saturating_sub(2)..(v + 3).min(end);
+        around(y, object.height()).any(|v| around(x, object.width()).any(|u| object.get_pixel(u, v).0[0] != 0))
+    };
+    let mut strokes = RgbImage::from_fn(object.width(), object.height(), |x, y| {
+        Rgb([match (object.get_pixel(x, y).0[0] != 0, near(x, y)) {
+            (true, _) => 255,
+            (false, true) => 128,
+            (false, false) => 0,
+        }; 3])
+    });
+    // A corner beyond the box, as if it were the object.
+    let left = if x0 > 8 { 0 } else { object.width() - 6 };
+    assert!(left + 6 <= x0 || left >= x1, "the corner is beyond the box");
+    (0..6).for_each(|y| (0..6).for_each(|x| strokes.put_pixel(left + x, y, Rgb([255; 3]))));
+    strokes.save(folder.path().join("strokes.png")).expect("writable");
+    let view = name(given);
+    let command = format!(
+        "prepare photos --out scene --strokes {view}=strokes.png --box {view}={x0},{y0},{x1},{y1} --no-depth --fit-steps 60 \
+         --fit-side 64"
+    );
+    let outcome = run(folder.path(), &command);
+    assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+    let cut = mask(&folder.path().join("scene/masks").join(view + ".png"));
+    let beyond =
+        cut.enumerate_pixels().filter(|(x, y, v)| v.0[0] != 0 && !((x0..x1).contains(x) && (y0..y1).contains(y)));
+    assert_eq!(beyond.count(), 0, "pixels beyond the box");
+    assert!(capture::masks::iou(&cut, &object) > 0.8);
+    let record = fs::read_to_string(folder.path().join("scene/prepare.json")).expect("a record");
+    assert!(record.contains(&format!("--strokes strokes.png within --box {x0},{y0},{x1},{y1}")), "{record}");
 }
 
 #[test]

@@ -1,5 +1,9 @@
 //! The program as its user meets it: help, results, one clear line for every mistake, exit codes.
 
+#[allow(dead_code)]
+#[path = "common/skip.rs"]
+mod skip;
+
 use std::fs;
 use std::path::Path;
 
@@ -12,6 +16,7 @@ use gscream_vk::config::Settings;
 use gscream_vk::model;
 use gscream_vk::scene::synthetic;
 use image::{Rgb, RgbImage};
+use skip::{Lack, skip};
 use tempfile::TempDir;
 
 /// The program, run inside `folder` at a fixed width and with a cache of its own.
@@ -216,7 +221,12 @@ fn render_writes_colour_depth_and_transmittance() {
     let (folder, mut transcript) = (with_scene(), Transcript::default());
     let folder = folder.path();
     with_model(folder);
+    // Left by a killed one.
+    let left = folder.join("model/renders/test/.test_001.exr.a1B2c3");
+    fs::create_dir_all(left.parent().expect("a folder")).expect("writable");
+    fs::write(&left, "half").expect("writable");
     transcript.succeeds(folder, "render model --scene scene --validate");
+    assert!(!left.exists(), "what a killed render was writing is swept");
     transcript.succeeds(folder, "render model --scene scene --views train --downscale 2 --out train");
     transcript.succeeds(folder, "render model --scene scene --views spiral --frames 11 --out film");
     insta::assert_snapshot!("render", transcript.0);
@@ -523,7 +533,7 @@ fn without_room_on_the_disk_it_is_said_which_file_and_how_to_go_on() {
     limited.current_dir(folder.path()).env("XDG_CACHE_HOME", folder.path().join("cache"));
     let output = limited.output().expect("a shell");
     if output.status.signal() == Some(signal_hook::consts::SIGBUS) {
-        println!("skipped: to this driver a limit of files is one of device memory, and ends the program");
+        skip(Lack::MemoryWithoutFiles, "to this driver a limit of files is one of device memory, and ends the program");
         return;
     }
     assert_eq!(output.status.code(), Some(1));
@@ -635,10 +645,19 @@ fn a_run_with_the_truth_as_reference_is_judged_and_judged_again() {
     fs::create_dir(folder.join("millimetres")).expect("writable");
     let path = folder.join("scene/test_depth/test_001.npy");
     let depth: ndarray::Array2<f32> = ndarray_npy::read_npy(path).expect("a depth map");
+    fs::create_dir(folder.join("metres")).expect("writable");
+    ndarray_npy::write_npy(folder.join("metres/test_001.npy"), &depth).expect("writable");
     ndarray_npy::write_npy(folder.join("millimetres/test_001.npy"), &(depth * 1000.0)).expect("writable");
-    succeeds(folder, "eval run --depth-truth millimetres --json millimetres.json");
-    let millimetres = read("millimetres.json");
-    assert!(!millimetres["mean"]["geometry"].is_null(), "{millimetres:#}");
+    let [metres, millimetres] = ["metres", "millimetres"].map(|unit| {
+        succeeds(folder, &format!("eval run --depth-truth {unit} --json {unit}.json"));
+        read(&format!("{unit}.json"))["mean"]["geometry"].clone()
+    });
+    for figure in ["relative_error", "completeness"] {
+        let value = |geometry: &serde_json::Value| geometry[figure].as_f64().expect("a figure");
+        // Both are float32 depths times a factor: a few roundings of 6e-8 each, of which shares may flip with a pixel.
+        let (metres, millimetres) = (value(&metres), value(&millimetres));
+        assert!((metres - millimetres).abs() <= 1e-3 * metres.abs(), "{figure}: {metres} m, {millimetres} mm");
+    }
 
     for (code, arguments, part) in [
         (1, "train scene --out other --truth-reference nobody", "but scene has no such test view (2 of them: test_000"),
@@ -702,11 +721,29 @@ fn ablate_compares_over_seeds_and_scenes() {
     let part = command.replace("neither,priors-same", "neither");
     succeeds(folder, &format!("{part} {few} --resume"));
     assert_eq!(read("ablation.json").as_array().map(Vec::len), Some(8), "no run is forgotten");
+    // Without --resume nothing is replaced, neither a run nor the table.
+    let bytes = || {
+        let of = |name| fs::read(runs.join(name)).expect("written");
+        ["ablation.json", "comparison.json", "scene/neither/seed-0/log.jsonl", "scene/neither/seed-0/run.json"].map(of)
+    };
+    let before = bytes();
+    let held = run(folder, &format!("{part} {few}"));
+    let says = "error: runs/scene/neither/seed-0: holds a run already: choose another --out, go on with the ablation by \
+                --resume, or replace its runs by --overwrite\n";
+    assert_eq!((held.code, held.stderr.as_str()), (1, says));
+    assert!(bytes() == before, "nothing is touched");
+    // Replaced on demand, and the runs of the other variant stay known.
+    succeeds(folder, &format!("{part} {few} --overwrite"));
+    assert!(bytes()[2] != before[2], "its log has other times");
+    assert_eq!(read("ablation.json").as_array().map(Vec::len), Some(8), "no run is forgotten");
     let other = run(folder, &format!("{command} {few} --resume --set losses.ssim_weight=0.1"));
     assert!(other.code == 1 && other.stderr.contains("other settings"), "{}", other.stderr);
 
     let one = succeeds(folder, &format!("ablate scene --out one --only neither {few}"));
     assert!(folder.join("one/neither/run.json").is_file() && !one.stdout.contains('±'), "{}", one.stdout);
+    let last = run(folder, "ablate scene --out last --seed 9223372036854775807 --seeds 2");
+    let says = "error: --seeds 2: the last seed after train.seed = 9223372036854775807 would be above";
+    assert!(last.code == 1 && last.stderr.starts_with(says), "{}", last.stderr);
     let refused = run(folder, "ablate scene --only all");
     assert_eq!(refused.code, 1, "{}", refused.stderr);
 }

@@ -1,5 +1,9 @@
 //! Devices as they are met: threads that share one, drivers that lack something, drivers on top of something else.
 
+#[allow(dead_code)]
+#[path = "common/skip.rs"]
+mod skip;
+
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
@@ -9,11 +13,13 @@ use gscream_vk::primitives::dispatch::Count;
 use gscream_vk::primitives::scan::Scan;
 use predicates::prelude::PredicateBooleanExt as _;
 use predicates::str::contains;
+use skip::{Lack, skip};
 
 /// Chromium's software device, which has no push descriptors, and subgroups of 4.
 const SWIFTSHADER: &str = "/usr/lib/chromium/libvk_swiftshader.so";
 /// Mesa's.
 const LAVAPIPE: &str = "/usr/share/vulkan/icd.d/lvp_icd.x86_64.json";
+const RADV: &str = "/usr/share/vulkan/icd.d/radeon_icd.x86_64.json";
 
 /// The sum of `terms` and the sum before the last of them.
 fn scanned(gpu: &Gpu, scan: &Scan, terms: &[u32]) -> [u32; 2] {
@@ -97,7 +103,7 @@ fn describe(folder: &Path, library: &str, portability: bool) -> PathBuf {
 #[test]
 fn drivers_on_top_of_something_else_are_listed() {
     let Ok(lavapipe) = std::fs::read(LAVAPIPE) else {
-        println!("skipped: no {LAVAPIPE} (Debian: mesa-vulkan-drivers)");
+        skip(Lack::Lavapipe, &format!("no {LAVAPIPE} (Debian: mesa-vulkan-drivers)"));
         return;
     };
     let lavapipe: serde_json::Value = serde_json::from_slice(&lavapipe).expect("JSON");
@@ -107,11 +113,30 @@ fn drivers_on_top_of_something_else_are_listed() {
     with_driver(&icd, &["devices"]).assert().success().stdout(contains("llvmpipe").and(contains("usable")));
 }
 
+/// Mesa's null device is a GPU by its kind: it comes before lavapipe, a CPU, whichever driver the loader asks first.
+#[test]
+fn gpus_are_listed_before_cpus() {
+    for (driver, lack) in [(LAVAPIPE, Lack::Lavapipe), (RADV, Lack::Radv)] {
+        if !Path::new(driver).is_file() {
+            skip(lack, &format!("no {driver} (Debian: mesa-vulkan-drivers)"));
+            return;
+        }
+    }
+    for drivers in [[LAVAPIPE, RADV], [RADV, LAVAPIPE]] {
+        let drivers = std::env::join_paths(drivers).expect("paths without a colon");
+        let mut command = with_driver(Path::new(&drivers), &["devices", "--json"]);
+        let output = command.env("RADV_FORCE_FAMILY", "gfx1100").output().expect("the program starts");
+        let devices: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        let names: Vec<&str> = devices.as_array().expect("a list").iter().filter_map(|d| d["name"].as_str()).collect();
+        assert!(names.len() == 2 && names[1].contains("llvmpipe"), "{drivers:?}: {names:?}");
+    }
+}
+
 #[test]
 #[ignore = "long; .ci/run has it"]
 fn a_device_without_push_descriptors_has_sets() {
     if !Path::new(SWIFTSHADER).is_file() {
-        println!("skipped: no {SWIFTSHADER} (Debian: chromium)");
+        skip(Lack::SwiftShader, &format!("no {SWIFTSHADER} (Debian: chromium)"));
         return;
     }
     let folder = tempfile::tempdir().expect("a temporary folder");

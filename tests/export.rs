@@ -3,12 +3,18 @@
 //! The other programs are npm packages (`npm ci` in tests/viewer) and Chromium. Where they are not installed, the tests
 //! that need them say so and pass.
 
+#[allow(dead_code)]
+#[path = "common/skip.rs"]
+mod skip;
+
 use std::fs;
-use std::io::{BufRead as _, BufReader};
+use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use assert_cmd::cargo::cargo_bin_cmd;
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD;
 use gscream_vk::evaluate::psnr;
 use gscream_vk::export::activate::Static;
 use gscream_vk::export::draw::Drawer;
@@ -22,6 +28,7 @@ use gscream_vk::view;
 use rand::{RngExt as _, SeedableRng as _};
 use rand_pcg::Pcg64;
 use serde_json::Value;
+use skip::{Lack, skip};
 use tempfile::TempDir;
 
 const VIEWER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/viewer");
@@ -30,7 +37,7 @@ const VIEWER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/viewer");
 fn installed(package: &str) -> bool {
     let there = Path::new(VIEWER).join("node_modules").join(package).is_dir();
     if !there {
-        eprintln!("SKIPPED: {package} is not installed: run `npm ci --ignore-scripts` in tests/viewer");
+        skip(Lack::Node, &format!("{package} is not installed: run `npm ci --ignore-scripts` in tests/viewer"));
     }
     there
 }
@@ -225,7 +232,12 @@ fn json(path: &Path) -> Value {
 fn a_run_becomes_files_of_the_same_scene() {
     let folder = with_run(80, 60);
     let folder = folder.path();
+    // Left by a killed one.
+    let left = folder.join("run/export/.scene.spz.a1B2c3");
+    fs::create_dir_all(folder.join("run/export")).expect("writable");
+    fs::write(&left, "half").expect("writable");
     let text = succeeds(folder, "export run --views 12 --steps 200 --validate");
+    assert!(!left.exists(), "what a killed export was writing is swept");
     assert!(text.ends_with("wrote scene.ply, scene.spz, scene.glb, export.json in run/export\n"), "{text}");
     let out = folder.join("run/export");
     let read = |name: &str| fs::read(out.join(name)).expect(name);
@@ -330,8 +342,29 @@ fn mistakes_are_one_sentence() {
     let port = taken.local_addr().expect("bound").port();
     let busy = fails(folder, &format!("view run --port {port}"));
     assert_eq!(busy, format!("error: 127.0.0.1:{port}: another program serves there; --port 0 takes a free one"));
+    // The page holds the export's own bytes, and begins at the camera that is rolled least.
+    let path = folder.join("run/export/export.json");
+    let mut figures = json(&path);
+    let poses = figures["cameras"].as_array_mut().expect("cameras");
+    for (i, pose) in poses.iter_mut().enumerate() {
+        pose["roll"] = if i == 3 { 0.5 } else { 5.0 + i as f64 }.into();
+    }
+    let center: [f64; 3] = serde_json::from_value(poses[3]["center"].clone()).expect("a point");
+    fs::write(&path, figures.to_string()).expect("writable");
     let text = succeeds(folder, "view run --html page.html");
-    assert!(text.starts_with("page.html: ") && fs::metadata(folder.join("page.html")).expect("a page").len() > 900_000);
+    assert!(text.starts_with("page.html: "), "{text}");
+    let page = fs::read_to_string(folder.join("page.html")).expect("a page");
+    let between =
+        |start: &str| page.split_once(start).and_then(|(_, rest)| rest.split_once("</script>")).expect(start).0;
+    let packed = BASE64_STANDARD.decode(between("id=\"asset-scene.ply\">")).expect("base64");
+    let mut ply = vec![];
+    flate2::read::GzDecoder::new(&packed[..]).read_to_end(&mut ply).expect("gzip");
+    assert!(ply == fs::read(folder.join("run/export/scene.ply")).expect("a file"), "the scene is the exported one");
+    let config: Value = serde_json::from_str(between("id=\"config\">")).expect("JSON");
+    let initial = &config["settings"]["cameras"][0]["initial"]["position"];
+    let position: [f64; 3] = serde_json::from_value(initial.clone()).expect("a point");
+    // The viewer's axes are ours after half a turn about z.
+    assert_eq!(position, [-center[0], -center[1], center[2]], "the camera that is rolled least");
 }
 
 fn chromium() -> Option<PathBuf> {
@@ -340,7 +373,7 @@ fn chromium() -> Option<PathBuf> {
     let found =
         std::env::split_paths(&path).flat_map(|folder| names.map(|name| folder.join(name))).find(|p| p.is_file());
     if found.is_none() {
-        eprintln!("SKIPPED: no Chromium: install Debian's package `chromium`");
+        skip(Lack::Browser, "no Chromium: install Debian's package `chromium`");
     }
     found
 }

@@ -1,8 +1,13 @@
 //! What AMD's compiler makes of the kernels, on Mesa's null device: it needs no GPU and runs nothing.
 
+#[allow(dead_code)]
+#[path = "common/skip.rs"]
+mod skip;
+
 use std::path::Path;
 
 use assert_cmd::Command;
+use skip::{Lack, skip};
 
 /// Mesa whose figures the snapshots are.
 const DRIVER: &str = "radv Mesa 22.3.6";
@@ -18,7 +23,7 @@ fn on_null_device(family: &str, arguments: &[&str]) -> Command {
 fn installed() -> bool {
     let there = Path::new(ICD).is_file();
     if !there {
-        println!("skipped: no {ICD} (Debian: mesa-vulkan-drivers)");
+        skip(Lack::Radv, &format!("no {ICD} (Debian: mesa-vulkan-drivers)"));
     }
     there
 }
@@ -59,7 +64,7 @@ fn registers_and_spills_are_those_of_the_table() {
         assert!(kernels.iter().all(|k| k["registers"].as_u64().is_some_and(|n| n > 0)), "{family}");
         let driver = found["driver"].as_str().expect("a driver");
         if driver != DRIVER {
-            println!("skipped: the table is of {DRIVER}, and here is {driver}");
+            skip(Lack::RadvTable, &format!("the table for {family} is of {DRIVER}, and here is {driver}"));
             continue;
         }
         assert_room(family, subgroup, kernels);

@@ -8,17 +8,18 @@ use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpStream;
 use std::os::unix::process::ExitStatusExt as _;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Command, Output};
 use std::sync::LazyLock;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use assert_cmd::cargo::cargo_bin;
+use common::place::{Files, Place, assert_same, failed, fails, output, send, succeeds, text, wait_until};
+use common::skip::{Lack, skip};
 use gscream_vk::config::Settings;
 use gscream_vk::train::checkpoint;
 use gscream_vk::train::config::ViewOrder;
 use rand::{RngExt, SeedableRng};
-use tempfile::TempDir;
 
 /// Growth, pruning, statistics and attention in the first steps; a checkpoint every third.
 fn settings() -> Settings {
@@ -27,147 +28,6 @@ fn settings() -> Settings {
     train.view_order = ViewOrder::Shuffled;
     (train.log_interval, train.eval_interval, train.save_interval, train.checkpoint_interval) = (5, 12, 9, 3);
     settings
-}
-
-/// Files' contents by their path within a run folder, sorted.
-type Files = Vec<(String, Vec<u8>)>;
-
-/// A folder with a scene and the settings of its runs.
-struct Place {
-    folder: TempDir,
-}
-
-impl Place {
-    fn new(settings: &Settings) -> Self {
-        let folder = common::folder();
-        fs::write(folder.path().join("settings.toml"), settings.to_toml()).expect("a writable folder");
-        Self { folder }
-    }
-
-    fn path(&self) -> &Path {
-        self.folder.path()
-    }
-
-    /// The program within the folder. Pipelines are compiled once for all tests.
-    fn program(&self, arguments: &[&str]) -> Command {
-        let mut command = Command::new(cargo_bin!("gscream-vk"));
-        command.args(arguments).current_dir(self.path()).env("XDG_CACHE_HOME", env!("CARGO_TARGET_TMPDIR"));
-        command.env_remove("RUST_LOG").stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
-        command
-    }
-
-    fn train(&self, out: &str, more: &[&str]) -> Command {
-        self.program(&[&["train", "scene", "--config", "settings.toml", "--out", out], more].concat())
-    }
-
-    fn resume(&self, run: &str) -> Command {
-        self.program(&["train", "--resume", run])
-    }
-
-    fn checkpoints(&self, run: &str) -> Vec<u32> {
-        checkpoint::list(&self.path().join(run)).into_iter().map(|(step, _)| step).collect()
-    }
-
-    /// What a finished run has left: every file's bytes by its path; times, memory of the process and the command line
-    /// left out.
-    fn result(&self, run: &str) -> Files {
-        let run = self.path().join(run);
-        let mut files = vec![];
-        let mut folders = vec![run.clone()];
-        while let Some(next) = folders.pop() {
-            for entry in fs::read_dir(next).expect("a folder") {
-                let path = entry.expect("readable").path();
-                if path.is_dir() {
-                    folders.push(path);
-                    continue;
-                }
-                let mut bytes = fs::read(&path).expect("readable");
-                let name = path.strip_prefix(&run).expect("below it").to_string_lossy().into_owned();
-                if name == "run.json" || name == "index.html" {
-                    continue;
-                }
-                if name == "log.jsonl" {
-                    let text = String::from_utf8(bytes).expect("text");
-                    bytes = text.lines().map(without_times).collect::<String>().into_bytes();
-                }
-                files.push((name, bytes));
-            }
-        }
-        files.sort();
-        files
-    }
-}
-
-/// A line of the log but for seconds, speed and the process's own memory.
-fn without_times(line: &str) -> String {
-    let serde_json::Value::Object(mut fields) = serde_json::from_str(line).expect("a line of JSON") else {
-        panic!("{line} is no object")
-    };
-    for time in ["seconds", "steps_per_second", "host_bytes"] {
-        assert!(fields.remove(time).is_some(), "{line} has no {time}");
-    }
-    // Numbers as they were written.
-    let mut text = line.to_owned();
-    for time in ["seconds", "steps_per_second", "host_bytes"] {
-        let start = text.find(&format!("\"{time}\":")).expect("it was there");
-        let end = text[start..].find([',', '}']).expect("an object ends") + start;
-        text.replace_range(start..end, "");
-    }
-    text + "\n"
-}
-
-fn text(bytes: &[u8]) -> String {
-    String::from_utf8_lossy(bytes).into_owned()
-}
-
-fn output(mut command: Command) -> Output {
-    command.output().expect("the program starts")
-}
-
-fn succeeds(command: Command) -> Output {
-    let output = output(command);
-    assert!(output.status.success(), "{}", text(&output.stderr));
-    output
-}
-
-/// Fails with this code and exactly one error, which it returns.
-fn fails(command: Command, code: i32) -> String {
-    failed(output(command), code)
-}
-
-fn failed(output: Output, code: i32) -> String {
-    let stderr = text(&output.stderr);
-    assert_eq!(output.status.code(), Some(code), "{stderr}");
-    assert_eq!(stderr.matches("error:").count(), 1, "{stderr}");
-    assert!(!stderr.contains("panicked"), "{stderr}");
-    stderr
-}
-
-fn assert_same(got: &[(String, Vec<u8>)], want: &[(String, Vec<u8>)], what: &str) {
-    let names = |files: &[(String, Vec<u8>)]| files.iter().map(|(name, _)| name.clone()).collect::<Vec<_>>();
-    assert_eq!(names(got), names(want), "{what}");
-    for ((name, got), (_, want)) in got.iter().zip(want) {
-        let lines = || {
-            let (got, want) = (text(got), text(want));
-            let differ = got.lines().zip(want.lines()).find(|(a, b)| a != b);
-            differ.map_or_else(String::new, |(a, b)| format!(":\n{a}\n{b}"))
-        };
-        let detail = if name.ends_with("jsonl") { lines() } else { String::new() };
-        assert!(got == want, "{what}: {name} differs ({} and {} bytes){detail}", got.len(), want.len());
-    }
-}
-
-/// Waits until the condition holds or the program has ended; false in the second case.
-fn wait_until(child: &mut Child, mut holds: impl FnMut() -> bool) -> bool {
-    loop {
-        if holds() {
-            return true;
-        }
-        if child.try_wait().expect("a child").is_some() {
-            return holds();
-        }
-        std::thread::sleep(Duration::from_millis(1));
-    }
 }
 
 /// What every run comes to: one that nothing happened to, and how long it took with all pipelines compiled.
@@ -196,11 +56,6 @@ fn stopped(place: &Place, run: &str, step: u32, signal: &str) -> Output {
     assert!(there, "{}", text(&child.wait_with_output().expect("a child").stderr));
     send(&child, signal);
     child.wait_with_output().expect("a child")
-}
-
-fn send(child: &Child, signal: &str) {
-    let status = Command::new("kill").args(["-s", signal, &child.id().to_string()]).status();
-    assert!(status.expect("kill starts").success());
 }
 
 /// A run that was stopped with two checkpoints.
@@ -302,6 +157,48 @@ fn resume_or_start_does_what_is_missing() {
     assert_eq!(text(&output.stdout), "run: the run is complete (36 steps): nothing to do\n");
     assert_whole(&place, "run", "left alone");
     fails(again(&["--overwrite"]), 2);
+}
+
+/// Two programs that write into one run folder would mix their settings and models.
+#[test]
+fn of_two_programs_in_a_run_folder_the_second_says_so() {
+    let place = Place::new(&settings());
+    let mut child = place.train("run", &[]).spawn().expect("the program starts");
+    let model = place.path().join("run/model/weights.safetensors");
+    assert!(wait_until(&mut child, || model.is_file() && !place.checkpoints("run").is_empty()));
+    let says = "run: another gscream-vk is at work in this folder: wait until it has ended, or name another folder";
+    for second in [
+        place.train("run", &["--seed", "7"]),
+        place.train("run", &["--overwrite"]),
+        place.train("run", &["--resume-or-start"]),
+        place.resume("run"),
+        place.program(&["export", "run"]),
+    ] {
+        let stderr = fails(second, 1);
+        assert!(stderr.ends_with(&format!("error: {says}\n")), "{stderr}");
+    }
+    assert!(child.try_wait().expect("a child").is_none(), "it was there all the time");
+    let output = child.wait_with_output().expect("a child");
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    assert_whole(&place, "run", "others tried");
+}
+
+/// `--overwrite` that ends while it takes the old run away leaves no run that says complete without its model.
+#[test]
+fn a_run_half_taken_away_is_not_complete() {
+    let place = Place::new(&settings());
+    succeeds(place.train("run", &[]));
+    // What cannot be removed ends it where a kill would.
+    let log = place.path().join("run/log.jsonl");
+    fs::remove_file(&log).expect("a log");
+    fs::create_dir_all(log.join("mine")).expect("writable");
+    let stderr = fails(place.train("run", &["--overwrite"]), 1);
+    assert!(stderr.contains("error: run/log.jsonl: cannot be removed"), "{stderr}");
+    assert!(!place.path().join("run/model/point_cloud.ply").exists(), "the model went before");
+    fs::remove_dir_all(&log).expect("writable");
+    let output = succeeds(place.train("run", &["--resume-or-start"]));
+    assert!(text(&output.stderr).contains("no checkpoint yet, the run starts again"), "{}", text(&output.stderr));
+    assert_whole(&place, "run", "half taken away");
 }
 
 /// GETs a path, or sends whatever bytes; what came back.
@@ -565,7 +462,7 @@ fn without_room_for_a_checkpoint_the_last_one_stays() {
     let output = output(limited);
     // Mesa's newer software drivers keep device memory in files without a name: what lies beyond the limit is not there.
     if output.status.signal() == Some(signal_hook::consts::SIGBUS) {
-        println!("skipped: to this driver a limit of files is one of device memory, and ends the program");
+        skip(Lack::MemoryWithoutFiles, "to this driver a limit of files is one of device memory, and ends the program");
         return;
     }
     let stderr = failed(output, 1);

@@ -6,6 +6,7 @@
 #[allow(dead_code)]
 mod common;
 
+use common::skip::{Lack, skip};
 use gscream_vk::gpu::{Command, Entry, Form, Gpu, testing};
 use gscream_vk::render::bin::Tiling;
 use gscream_vk::scene::Scene;
@@ -28,9 +29,9 @@ fn passes_and_barriers_of_a_step() {
             Form::Cpu if Tiling::of(&gpu) == Tiling::Narrow => "subgroups_of_8",
             Form::Cpu => {
                 let size = gpu.info().subgroup_size;
-                println!(
-                    "skipped: the CPU's schedules kept here are those of subgroups of 8, and this device has {size}"
-                );
+                let why =
+                    format!("the CPU's schedules kept here are those of subgroups of 8, and this device has {size}");
+                skip(Lack::SubgroupsOf8, &why);
                 continue;
             }
         };

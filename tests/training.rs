@@ -6,6 +6,7 @@ mod common;
 use std::path::PathBuf;
 
 use common::Watch;
+use common::skip::{Lack, skip};
 use gscream_vk::config::Settings;
 use gscream_vk::gpu::form::without_form;
 use gscream_vk::gpu::{Descriptors, Form, Gpu, Options, testing};
@@ -93,7 +94,7 @@ fn the_same_seed_gives_the_same_bytes_in_one_form(gpu: &Gpu) {
 #[test]
 fn pushed_or_as_sets_the_buffers_are_the_same() {
     if !testing::gpu().info().push_descriptors {
-        println!("skipped: this device has sets alone");
+        skip(Lack::PushDescriptors, "this device has sets alone");
         return;
     }
     let (scene, settings) = (scene_without_tests(), common::settings(13));
@@ -446,7 +447,7 @@ fn capture(name: &str, config: &scene::Config) -> Option<Scene> {
         .map_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
     let folder = data.join(name);
     if !folder.is_dir() {
-        println!("skipped: no {} (GSCREAM_DATA names the folder of the captures)", folder.display());
+        skip(Lack::Captures, &format!("no {} (GSCREAM_DATA names the folder of the captures)", folder.display()));
         return None;
     }
     Some(scene::load(&folder, config).expect("a readable capture"))

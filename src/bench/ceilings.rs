@@ -283,6 +283,7 @@ impl<'g> Prober<'g> {
 mod tests {
     use super::*;
     use crate::gpu::{Options, testing};
+    use crate::skip::{Lack, skip};
 
     fn ramp(n: usize) -> Vec<f32> {
         (0..n).map(|i| 0.1 + 0.8 * i as f32 / n.max(1) as f32).collect()
@@ -318,7 +319,7 @@ mod tests {
     fn ceilings_are_numbers() {
         let gpu = testing::fresh_gpu(Options { timestamps: true, ..Options::default() });
         if gpu.info().timestamp_period <= 0.0 {
-            println!("skipped: {} has no timestamps", gpu.info().name);
+            skip(Lack::Timestamps, &format!("{} has no timestamps", gpu.info().name));
             return;
         }
         let mut prober = Prober::new(&gpu).expect("the device has room");

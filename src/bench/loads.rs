@@ -520,6 +520,7 @@ mod tests {
     use super::*;
     use crate::gpu::{Options, testing};
     use crate::report::statistics::Spread;
+    use crate::skip::{Lack, skip};
 
     #[test]
     fn exponents_of_known_data() {
@@ -568,7 +569,7 @@ mod tests {
     fn loads_are_what_they_say() {
         let gpu = testing::fresh_gpu(Options { timestamps: true, ..Options::default() });
         if gpu.info().timestamp_period <= 0.0 {
-            println!("skipped: {} has no timestamps", gpu.info().name);
+            skip(Lack::Timestamps, &format!("{} has no timestamps", gpu.info().name));
             return;
         }
         let mut settings = Settings::default();

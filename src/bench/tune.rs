@@ -214,6 +214,7 @@ pub(crate) fn measure(
 mod tests {
     use super::*;
     use crate::gpu::{Options, testing};
+    use crate::skip::{Lack, skip};
 
     #[test]
     fn the_shipped_option_stays_unless_most_rounds_agree() {
@@ -246,7 +247,7 @@ mod tests {
     fn the_choices_run() {
         let gpu = testing::fresh_gpu(Options { timestamps: true, ..Options::default() });
         if gpu.info().timestamp_period <= 0.0 {
-            println!("skipped: {} has no timestamps", gpu.info().name);
+            skip(Lack::Timestamps, &format!("{} has no timestamps", gpu.info().name));
             return;
         }
         let sorted = sorting(&gpu, 3000, 14, 1).expect("the device has room");

@@ -6,6 +6,9 @@ use gscream_vk::train::config::ViewOrder;
 use gscream_vk::train::run::{Observer, Progress};
 use tempfile::TempDir;
 
+pub mod place;
+pub mod skip;
+
 /// The scene's folder: six train views of 48 x 36, the fourth the reference view, two test views.
 pub fn folder() -> TempDir {
     let folder = tempfile::tempdir().expect("a temporary folder");

@@ -5,6 +5,7 @@ use crate::gpu::testing::{self, UNWRITTEN};
 use crate::math::camera::factors;
 use crate::math::tiles::Support;
 use crate::render::bin::Tiling;
+use crate::skip::{Lack, skip};
 use rand::{RngExt, SeedableRng};
 
 /// Random Gaussians in screen space, binned on the host.
@@ -183,7 +184,7 @@ fn backward_matches_its_twin() {
 fn lists_hold_what_is_blended() {
     let gpu = testing::gpu();
     if !gpu.runs_lanes() {
-        println!("skipped: narrow tiles need subgroups of 8 threads");
+        skip(Lack::SubgroupsOf8, "narrow tiles need subgroups of 8 threads");
         return;
     }
     let size = [129, 97];
