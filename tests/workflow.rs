@@ -1,5 +1,5 @@
 //! The Snakemake workflow under configs/workflow: three scenes, one training killed on the way, rerun to the same bytes.
-//! Ignored: it takes minutes and needs `snakemake` on the PATH.
+//! They need `snakemake` on the PATH; the first is ignored, as it takes minutes.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -11,6 +11,7 @@ use std::process::{Command, Output, Stdio};
 mod common;
 
 use assert_cmd::cargo::cargo_bin;
+use common::skip::{Lack, skip};
 use gscream_vk::scene::synthetic;
 
 const SCENES: [&str; 3] = ["one", "two", "three"];
@@ -51,6 +52,69 @@ fn snakemake(folder: &Path) -> Output {
         .expect("snakemake starts")
 }
 
+fn installed() -> bool {
+    let there = Command::new("snakemake").arg("--version").output().is_ok();
+    if !there {
+        skip(Lack::Snakemake, "snakemake is not installed: pip install snakemake");
+    }
+    there
+}
+
+/// Names are folders, and what is written in a list of scenes is no command of the shell.
+#[test]
+fn names_and_folders_are_words_of_the_shell() {
+    if !installed() {
+        return;
+    }
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = folder.path();
+    // In place of the program: it keeps its arguments, and makes what the next step reads.
+    let program = folder.join("my program");
+    let script = "#!/bin/bash\nprintf '<%s>' \"$@\" >>said; echo >>said\n\
+         if [ \"$1\" = eval ]; then echo '{\"mean\": {}}' >\"$4\"; fi\n\
+         if [ \"$1\" = export ]; then for f in ply spz glb; do touch \"$4/scene.$f\"; done; \
+         echo '{\"files\": []}' >\"$4/export.json\"; fi\n";
+    fs::write(&program, script).expect("writable");
+    fs::set_permissions(&program, fs::Permissions::from_mode(0o755)).expect("a file of ours");
+    let out = "my results; touch pwned $(touch pwned)";
+    let list = serde_json::json!({
+        "program": program, "out": out, "train": "--set 'a b=1'",
+        "scenes": { "it's a `touch pwned`": { "photographs": "photos $(touch pwned)", "mask": "a=b c.png" } },
+    });
+    // JSON is YAML.
+    fs::write(folder.join("scenes.yaml"), list.to_string()).expect("writable");
+    let output = snakemake(folder);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(!folder.join("pwned").exists() && !folder.join("my").exists(), "nothing was a command");
+    let name = "it's a `touch pwned`";
+    let said = fs::read_to_string(folder.join("said")).expect("what was asked for");
+    assert_eq!(
+        said,
+        format!(
+            "<prepare><photos $(touch pwned)><--out><{out}/scenes/{name}><--mask><a=b c.png>\n\
+             <train><{out}/scenes/{name}><--out><{out}/runs/{name}><--resume-or-start><--set><a b=1>\n"
+        ) + &if said.find("<eval>") < said.find("<export>") {
+            format!(
+                "<eval><{out}/runs/{name}><--json><{out}/eval/{name}.json>\n\
+                 <export><{out}/runs/{name}><--out><{out}/export/{name}>\n"
+            )
+        } else {
+            format!(
+                "<export><{out}/runs/{name}><--out><{out}/export/{name}>\n\
+                 <eval><{out}/runs/{name}><--json><{out}/eval/{name}.json>\n"
+            )
+        }
+    );
+
+    for name in ["..", ".", "", "a/b", "a\\b", "a\nb"] {
+        let list = serde_json::json!({ "program": program, "scenes": { name: { "scene": "a" } } });
+        fs::write(folder.join("scenes.yaml"), list.to_string()).expect("writable");
+        let output = snakemake(folder);
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert!(!output.status.success() && stderr.contains("a name is that of a folder"), "{name:?}: {stderr}");
+    }
+}
+
 /// The bytes of all that was made but records of commands and times.
 fn made(folder: &Path) -> BTreeMap<String, Vec<u8>> {
     let mut files = BTreeMap::new();
@@ -75,12 +139,11 @@ fn made(folder: &Path) -> BTreeMap<String, Vec<u8>> {
 }
 
 #[test]
-#[ignore = "takes minutes and needs snakemake"]
+#[ignore = "long; .ci/run has it"]
 fn three_scenes_one_killed_and_run_again() {
-    assert!(
-        Command::new("snakemake").arg("--version").output().is_ok(),
-        "snakemake is not installed: pip install snakemake, or leave this test out with --skip three_scenes"
-    );
+    if !installed() {
+        return;
+    }
     let program = cargo_bin!("gscream-vk");
     let folder = tempfile::tempdir().expect("a temporary folder");
     let (whole, killed) = (folder.path().join("whole"), folder.path().join("killed"));
