@@ -34,6 +34,7 @@ pub mod cost;
 pub mod densify;
 pub mod evaluate;
 pub mod export;
+pub mod folder;
 pub mod gpu;
 pub mod losses;
 pub mod math;

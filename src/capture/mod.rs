@@ -52,6 +52,9 @@ pub enum Error {
     /// What was asked for cannot be.
     #[error("{0}")]
     Request(String),
+    /// The scene's folder.
+    #[error(transparent)]
+    Folder(#[from] crate::folder::Error),
     /// Photographs, model, masks.
     #[error(transparent)]
     Scene(#[from] scene::Error),
@@ -220,7 +223,9 @@ pub fn prepare(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<()
     // Mistakes in what the user named are found before anything is written.
     let networks = Networks::open(request)?;
     let mut object = given(&capture, request)?;
+    let _lock = crate::folder::Lock::take(&request.out)?;
     let mut folder = Folder::open(&request.out)?;
+    folder.sweep();
     object.extend(corrected(&folder, &capture, &object)?);
     if object.is_empty() && request.wants(Step::Masks) && request.only.is_empty() {
         return Err(Error::Request(

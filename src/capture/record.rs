@@ -6,7 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{self, Cursor, Write as _};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use atomic_write_file::AtomicWriteFile;
 use image::{GrayImage, ImageFormat, RgbImage};
@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize};
 use tempfile::TempDir;
 
 use super::Error;
+use crate::folder;
 
 /// The record's file within a prepared scene.
 pub const RECORD: &str = "prepare.json";
@@ -182,6 +183,22 @@ impl Folder {
         Ok(Self { root: root.to_owned(), record })
     }
 
+    /// Removes what a killed `prepare` left of files that it was writing. The caller holds the folder's lock.
+    pub fn sweep(&self) {
+        let recorded = self.record.steps.values().flat_map(|step| step.files.keys()).chain(self.record.pending.keys());
+        // A record may be somebody else's: nothing outside the scene is looked at.
+        let normal = |path: &&Path| path.components().all(|part| matches!(part, Component::Normal(_)));
+        let mut own: BTreeMap<PathBuf, BTreeSet<&str>> = BTreeMap::new();
+        for path in recorded.map(Path::new).filter(normal).chain([Path::new(RECORD)]) {
+            if let (Some(folder), Some(name)) = (path.parent(), path.file_name().and_then(|name| name.to_str())) {
+                own.entry(self.root.join(folder)).or_default().insert(name);
+            }
+        }
+        for (folder, names) in own {
+            folder::sweep(&folder, |name| names.contains(name));
+        }
+    }
+
     /// The folder.
     pub fn root(&self) -> &Path {
         &self.root
@@ -338,6 +355,26 @@ mod tests {
         let mut folder = Folder::open(dir.path()).unwrap();
         assert!(folder.write("fit", "1".into(), batch(&[("a", "whole")])).unwrap().is_empty());
         assert_eq!(std::fs::read(dir.path().join("a")).unwrap(), b"whole");
+    }
+
+    #[test]
+    fn what_a_killed_step_was_writing_is_swept() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut folder = Folder::open(&dir.path().join("scene")).unwrap();
+        folder.write("masks", "1".into(), batch(&[("masks/a.png", "one")])).unwrap();
+        folder.record.pending.insert("depth/b.npy".into(), String::new());
+        folder.record.pending.insert("../c".into(), String::new());
+        folder.save().unwrap();
+        let left = ["scene/masks/.a.png.a1B2c3", "scene/depth/.b.npy.ABCDEF", "scene/.prepare.json.123456"];
+        let others = ["scene/masks/.z.png.a1B2c3", "scene/masks/.a.png.swp", ".c.a1B2c3"];
+        std::fs::create_dir(dir.path().join("scene/depth")).unwrap();
+        for path in left.iter().chain(&others) {
+            std::fs::write(dir.path().join(path), "").unwrap();
+        }
+        Folder::open(&dir.path().join("scene")).unwrap().sweep();
+        assert!(left.iter().all(|path| !dir.path().join(path).exists()), "left by a killed step");
+        assert!(others.iter().all(|path| dir.path().join(path).exists()), "nobody's, or outside the scene");
+        assert!(dir.path().join("scene/masks/a.png").exists());
     }
 
     #[test]

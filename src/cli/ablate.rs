@@ -10,12 +10,14 @@ use atomic_write_file::AtomicWriteFile;
 use serde::{Deserialize, Serialize};
 
 use super::eval::JudgeArgs;
+use super::folders::{RECORD, Record};
 use super::report::last_part;
 use super::shared::{DeviceArgs, SYNTHETIC, SceneArgs, load_scene, with_gpu};
 use super::train::{Manner, Trained, default_folder, is_begun, train};
 use super::{index, next};
 use crate::config::{Settings, SettingsArgs};
-use crate::evaluate::{Judge, Mean, Metrics, PUBLISHED_ROWS, Published, Region};
+use crate::evaluate::{Judge, Mean, Metrics, PUBLISHED_ROWS, Published, Region, decibel};
+use crate::folder::{self, Lock};
 use crate::gpu::Gpu;
 use crate::report::pace::Pace;
 use crate::report::statistics::{Moments, Paired};
@@ -28,7 +30,7 @@ use crate::scene::Scene;
 /// one `priors-NAME` for every other folder of depth priors and one `reference-NAME` for every other inpainted picture.
 ///
 /// A variant has its parts whatever the preset or the settings say of them. One run after the other, each in a folder of
-/// its own; `--resume` goes on with an ablation that was stopped. With several seeds, figures are means and standard deviations
+/// its own; `--resume` goes on with an ablation that was stopped, and no run is replaced without `--overwrite`. With several seeds, figures are means and standard deviations
 /// over the seeds, and every two variants are compared over the same seeds by a paired t-test. With several scenes, a
 /// seed's figure is its mean over the scenes, as the paper's tables have it. Prints tables, and writes ablation.json (every
 /// run) and comparison.json (means, differences, and the published figures).
@@ -70,6 +72,9 @@ pub(super) struct Args {
     /// there were several.
     #[arg(long)]
     resume: bool,
+    /// Replace the runs of these variants, scenes and seeds that the folder holds already
+    #[arg(long, conflicts_with = "resume")]
+    overwrite: bool,
     #[command(flatten)]
     judge: JudgeArgs,
     #[command(flatten)]
@@ -164,10 +169,15 @@ struct Row {
     #[serde(skip_serializing_if = "Option::is_none", default)]
     residue: Option<f64>,
     /// Every figure by its name.
-    figures: BTreeMap<String, f64>,
+    figures: BTreeMap<String, Figure>,
     /// What the figures follow.
     protocol: String,
 }
+
+/// A number, of which PSNR may be infinite.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(transparent)]
+struct Figure(#[serde(with = "decibel")] f64);
 
 /// A column: the figure's name in JSON, its title, digits.
 type Column = (&'static str, &'static str, usize);
@@ -220,7 +230,7 @@ impl Row {
             anchors: summary.anchors,
             metrics: mean.metrics,
             residue: mean.residue,
-            figures: figures.into_iter().map(|(name, value)| (name.to_owned(), value)).collect(),
+            figures: figures.into_iter().map(|(name, value)| (name.to_owned(), Figure(value))).collect(),
             protocol: judge.protocol.describe().to_owned(),
         })
     }
@@ -296,8 +306,23 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         folder.push("-ablation");
         folder.into()
     });
-    let seeds: Vec<u64> = (base.train.seed..).take(args.seeds as usize).collect();
-    let mut known = Known::new(&out.join(RUNS), args.resume, scenes.len() * seeds.len() * variants.len())?;
+    let seeds = seeds(base.train.seed, args.seeds)?;
+    let _lock = Lock::take(&out)?;
+    folder::sweep(&out, |name| [RUNS, COMPARISON].contains(&name));
+    let mut known = Known::new(&out.join(RUNS), scenes.len() * seeds.len() * variants.len())?;
+    if !args.resume && !args.overwrite {
+        for (label, seed) in labels.iter().flat_map(|label| seeds.iter().map(move |seed| (label, *seed))) {
+            for variant in &variants {
+                let folder = folder(args, &out, label, &variant.name, seed);
+                ensure!(
+                    !folder.join(RECORD).exists() && !known.has(&variant.name, label, seed),
+                    "{}: holds a run already: choose another --out, go on with the ablation by --resume, or replace its \
+                     runs by --overwrite",
+                    folder.display()
+                );
+            }
+        }
+    }
     let rows = with_gpu(&args.device.options(), |gpu| {
         let mut rows = vec![];
         for ((scene, name), label) in scenes.iter().zip(&names).zip(&labels) {
@@ -310,13 +335,13 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     })?;
     let last = rows.last().map(|row| folder(args, &out, &row.scene, &row.variant, row.seed));
     let comparison = compare(&variants, &rows, labels, seeds, &judge);
-    write(&out.join("comparison.json"), &comparison)?;
+    write(&out.join(COMPARISON), &comparison)?;
     print!("{}", table(&comparison.variants));
     print!("{}", differences(&comparison.differences));
     if args.scenes.iter().any(|scene| scene != Path::new(SYNTHETIC)) {
         print!("{}", published());
     }
-    println!("wrote {} runs, {RUNS} and comparison.json in {}", rows.len(), out.display());
+    println!("wrote {} runs, {RUNS} and {COMPARISON} in {}", rows.len(), out.display());
     if let Some(last) = last {
         next::say(&[
             (next::typed(&last.join(index::INDEX).to_string_lossy()), "is one run as a page; every run has its own"),
@@ -349,8 +374,23 @@ fn folder(args: &Args, out: &Path, label: &str, variant: &str, seed: u64) -> Pat
     folder
 }
 
+/// So many seeds from the first on.
+fn seeds(first: u64, count: u32) -> anyhow::Result<Vec<u64>> {
+    // Settings are written as TOML, whose numbers have a sign.
+    let last = first.checked_add(u64::from(count) - 1).filter(|last| i64::try_from(*last).is_ok());
+    let last = last.with_context(|| {
+        format!(
+            "--seeds {count}: the last seed after train.seed = {first} would be above {}: choose a smaller one",
+            i64::MAX
+        )
+    })?;
+    Ok((first..=last).collect())
+}
+
 /// Every run's figures.
 const RUNS: &str = "ablation.json";
+/// Means and differences over them.
+const COMPARISON: &str = "comparison.json";
 
 /// The runs that are complete, kept in a file as they come.
 struct Known {
@@ -362,16 +402,30 @@ struct Known {
 }
 
 impl Known {
-    /// Those of an ablation that was stopped with `resume`, or none.
-    fn new(path: &Path, resume: bool, all: usize) -> anyhow::Result<Self> {
-        let rows = if resume && path.exists() {
+    /// Those of ablations in this folder before.
+    fn new(path: &Path, all: usize) -> anyhow::Result<Self> {
+        let rows = if path.exists() {
             let text = std::fs::read_to_string(path).with_context(|| format!("{}: cannot be read", path.display()))?;
-            serde_json::from_str(&text)
-                .with_context(|| format!("{}: holds no runs of an ablation: leave --resume out", path.display()))?
+            serde_json::from_str(&text).with_context(|| {
+                format!("{}: holds no runs of an ablation: move it away, or choose another --out", path.display())
+            })?
         } else {
             vec![]
         };
         Ok(Self { path: path.to_owned(), rows, pace: Pace::new(all), done: 0 })
+    }
+
+    fn has(&self, variant: &str, scene: &str, seed: u64) -> bool {
+        self.rows.iter().any(|row| (&*row.variant, &*row.scene, row.seed) == (variant, scene, seed))
+    }
+
+    /// A run is about to be replaced.
+    fn forget(&mut self, variant: &str, scene: &str, seed: u64) -> anyhow::Result<()> {
+        if self.has(variant, scene, seed) {
+            self.rows.retain(|row| (&*row.variant, &*row.scene, row.seed) != (variant, scene, seed));
+            write(&self.path, &self.rows)?;
+        }
+        Ok(())
     }
 
     fn find(&self, variant: &str, scene: &str, seed: u64, protocol: &str) -> Option<&Row> {
@@ -405,7 +459,8 @@ fn of_scene(
         let settings = variant.settings(base, path, seed);
         let folder = folder(args, out, label, &variant.name, seed);
         let begun = args.resume && is_begun(&folder, name, &settings)?;
-        if let Some(row) = known.find(&variant.name, label, seed, judge.protocol.describe()).filter(|_| begun) {
+        let complete = begun && Record::read(&folder)?.complete.is_some();
+        if let Some(row) = known.find(&variant.name, label, seed, judge.protocol.describe()).filter(|_| complete) {
             rows.push(row.clone());
             known.done += 1;
             known.pace.skip();
@@ -431,6 +486,14 @@ fn of_scene(
             which = format!("{which}, seed {seed}");
         }
         eprintln!("{}", format!("== {which} {}", known.pace.next(known.done)).trim_end());
+        if complete && known.has(&variant.name, label, seed) {
+            bail!(
+                "{}: its figures follow another protocol than this one: choose another --out, or train again by --overwrite",
+                folder.display()
+            );
+        }
+        let _lock = Lock::take(&folder)?;
+        known.forget(&variant.name, label, seed)?;
         let manner = Manner { go_on: begun, ..Manner::default() };
         let trained = train(gpu, scene, &settings, name, &folder, &manner, judge)?;
         let row = Row::new(variant, label, seed, &trained, judge)?;
@@ -444,7 +507,7 @@ fn of_scene(
 fn by_seed(rows: &[Row], variant: &str, figure: &str, seeds: &[u64]) -> Option<Vec<f64>> {
     let mean = |seed: &u64| {
         let runs = rows.iter().filter(|row| row.variant == variant && row.seed == *seed);
-        let values: Vec<f64> = runs.map(|row| row.figures.get(figure).copied()).collect::<Option<_>>()?;
+        let values: Vec<f64> = runs.map(|row| Some(row.figures.get(figure)?.0)).collect::<Option<_>>()?;
         (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
     };
     seeds.iter().map(mean).collect()
@@ -608,6 +671,46 @@ mod tests {
         assert_eq!(labels(&names), ["1-1", "1-2", "2"]);
     }
 
+    /// A picture that is the photograph to the bit has an infinite PSNR, which JSON's numbers are not.
+    #[test]
+    fn an_infinite_figure_is_known_again() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let path = folder.path().join(RUNS);
+        let mut known = Known::new(&path, 1).expect("no file is no run");
+        let row = Row {
+            variant: "depth".into(),
+            scene: "a".into(),
+            seed: 3,
+            seconds: 1.0,
+            steps_per_second: 1.0,
+            anchors: 1,
+            metrics: Metrics::new(Figures { psnr: f64::INFINITY, ssim: 1.0, flip: 0.0 }),
+            residue: None,
+            figures: [("psnr".to_owned(), Figure(f64::INFINITY)), ("ssim".to_owned(), Figure(1.0))].into(),
+            protocol: "p".into(),
+        };
+        known.add(&row).expect("writable");
+        let read = Known::new(&path, 1).expect("its own file");
+        let found = read.find("depth", "a", 3, "p").expect("the run");
+        assert_eq!((found.figures["psnr"], found.figures["ssim"]), (Figure(f64::INFINITY), Figure(1.0)));
+        let variants = [Variant::new("depth", true, false, false)];
+        let compared = compare(&variants, &read.rows, vec!["a".into()], vec![3], &Judge::default());
+        let json = serde_json::to_value(&compared).expect("JSON");
+        assert_eq!(json["variants"][0]["figures"]["psnr"]["mean"], "inf");
+        assert!(Paired::of(&[1.0, f64::INFINITY], &[f64::INFINITY; 2]).is_none(), "no difference of infinities");
+    }
+
+    #[test]
+    fn seeds_beyond_what_settings_hold_are_refused() {
+        let most = i64::MAX as u64;
+        assert_eq!(seeds(most - 1, 2).expect("the last two"), [most - 1, most]);
+        assert_eq!(seeds(7, 1).expect("one"), [7]);
+        for (first, count) in [(most, 2), (u64::MAX, 2)] {
+            let error = seeds(first, count).expect_err("too large").to_string();
+            assert!(error.contains("would be above 9223372036854775807"), "{error}");
+        }
+    }
+
     /// Two variants, two scenes, three seeds: figures are means over scenes by seed.
     #[test]
     fn figures_are_means_over_scenes_and_then_over_seeds() {
@@ -620,7 +723,7 @@ mod tests {
             anchors: 1,
             metrics: Metrics::new(Figures { psnr, ssim: 0.5, flip: 0.5 }),
             residue: None,
-            figures: [("psnr".to_owned(), psnr)].into(),
+            figures: [("psnr".to_owned(), Figure(psnr))].into(),
             protocol: String::new(),
         };
         let mut rows = vec![];

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context as _, bail};
+use clap::ValueEnum as _;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::{Deserialize, Serialize};
 
@@ -12,6 +13,7 @@ use super::next;
 use super::shared::{self, DeviceArgs};
 use crate::config::{Settings, Source};
 use crate::export::{self, Cloud, Export, Observer, Options, gltf, low_pass, measure, ply, spz, up};
+use crate::folder::{self, Lock};
 use crate::model;
 use crate::render::widen;
 use crate::scene::{Camera, Scene, path};
@@ -94,6 +96,10 @@ impl Format {
             Self::Spz => "spz",
             Self::Glb => "glb",
         }
+    }
+
+    fn file(self) -> String {
+        format!("{STEM}.{}", self.extension())
     }
 
     fn encode(self, cloud: &Cloud) -> Result<Vec<u8>, export::Error> {
@@ -245,6 +251,14 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     if args.formats.is_empty() {
         bail!("--formats: names no format");
     }
+    // The files go into the run's own folder, or into one that is theirs.
+    let _lock = match &origin {
+        Origin::Run { folder, .. } if args.out.is_none() => Lock::take(folder)?,
+        _ => Lock::take(&folder)?,
+    };
+    let all = Format::value_variants().iter().map(|format| format.file()).chain([FIGURES.to_owned()]);
+    let all: Vec<String> = all.collect();
+    folder::sweep(&folder, |name| all.iter().any(|own| own == name));
     args.device.with_gpu(|gpu| {
         let began = Instant::now();
         let options = Options {
@@ -267,7 +281,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             let read_back = format.decode(&bytes)?;
             let times = low_pass::measured(made.larger);
             let loss = made.yardstick.of_cloud(gpu, &read_back, times, &settings.render, background)?;
-            let name = format!("{STEM}.{}", format.extension());
+            let name = format.file();
             made.losses.push((format!("{name}, {}", size(bytes.len())), loss));
             written.push((File { name, bytes: bytes.len(), loss }, bytes));
         }

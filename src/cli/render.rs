@@ -7,6 +7,7 @@ use super::folders::Origin;
 use super::shared::{self, DeviceArgs};
 use super::{next, pictures};
 use crate::config::Source;
+use crate::folder::{self, Lock};
 use crate::model;
 use crate::render::view::Renderer;
 use crate::scene::{Camera, Scene, View, path};
@@ -52,6 +53,10 @@ pub(super) struct Args {
     #[command(flatten)]
     device: DeviceArgs,
 }
+
+/// Endings of a view's files: colour; depth and transmittance.
+const PICTURE: &str = "png";
+const MAPS: &str = "exr";
 
 #[derive(Debug, Clone, Copy, clap::ValueEnum)]
 enum Views {
@@ -113,6 +118,14 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     }
     let out = args.out.clone().unwrap_or_else(|| args.model.join("renders").join(args.views.name()));
     let background = settings.train.background.map(|channel| channel as f32);
+    let _lock = Lock::take(&out)?;
+    for (name, _) in &cameras {
+        for path in [PICTURE, MAPS].map(|extension| pictures::path(&out, name, extension)) {
+            if let (Some(folder), Some(own)) = (path.parent(), path.file_name()) {
+                folder::sweep(folder, |name| own == name);
+            }
+        }
+    }
     args.device.with_gpu(|gpu| {
         let mut renderer = Renderer::new(gpu, &anchors, &weights, &settings.render, background)?.larger(larger);
         let style = ProgressStyle::with_template("{wide_bar} {pos}/{len} views, {eta} left")?;
@@ -120,8 +133,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         for (name, camera) in &cameras {
             let mut view = renderer.render(camera)?;
             view.depth.iter_mut().for_each(|z| *z = (f64::from(*z) * loaded.unit) as f32);
-            pictures::write_png(&pictures::path(&out, name, "png"), view.size, &view.rgb)?;
-            pictures::write_exr(&pictures::path(&out, name, "exr"), view.size, &view.depth, &view.transmittance)?;
+            pictures::write_png(&pictures::path(&out, name, PICTURE), view.size, &view.rgb)?;
+            pictures::write_exr(&pictures::path(&out, name, MAPS), view.size, &view.depth, &view.transmittance)?;
             bar.inc(1);
         }
         bar.finish_and_clear();

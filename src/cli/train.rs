@@ -16,6 +16,7 @@ use super::{index, instruments, minutes, next, pictures, preset};
 use crate::capture::doctor::{self, Severity};
 use crate::config::{Settings, SettingsArgs, Source};
 use crate::evaluate::{Judge, Report};
+use crate::folder::{self, Lock};
 use crate::gpu::{self, Gpu, Options, Timing};
 use crate::model::files::{POINT_CLOUD, WEIGHTS};
 use crate::render::view::Rendered;
@@ -125,24 +126,30 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let began = Instant::now();
     let given = |scene: &PathBuf| SceneArgs { scene: scene.clone(), settings: args.settings.clone() };
     let given = args.scene.as_ref().map(given);
-    let (scene, settings, name, folder, begun) = if let Some(folder) = &args.resume {
-        let record = Record::read(folder)
-            .with_context(|| format!("{}: holds no run to go on with: start one with --out", folder.display()))?;
-        if is_complete(folder, &record)? {
+    let (scene, settings, name, folder, begun, _lock) = if let Some(folder) = &args.resume {
+        let read = || {
+            Record::read(folder)
+                .with_context(|| format!("{}: holds no run to go on with: start one with --out", folder.display()))
+        };
+        read()?;
+        let lock = held(folder, true)?;
+        let record = read()?;
+        if is_complete(folder, &record, lock.is_some())? {
             return Ok(());
         }
         let settings = Settings::resolve(&[Source::File(folder.join(SETTINGS))])?;
         let path = args.scene.clone().unwrap_or_else(|| PathBuf::from(&record.scene));
         let name = given.map_or(record.scene, |given| given.name());
-        (load_scene(&path, &settings)?, settings, name, folder.clone(), true)
+        (load_scene(&path, &settings)?, settings, name, folder.clone(), true, lock)
     } else {
         let given = given.expect("clap asks for a scene where there is nothing to resume");
-        let (scene, settings) = preset::load(&given, &args.device)?;
         let name = given.name();
         let folder = args.out.clone().unwrap_or_else(|| default_folder(&name));
+        let lock = held(&folder, args.resume_or_start)?;
+        let (scene, settings) = preset::load(&given, &args.device)?;
         let begun = args.resume_or_start && is_begun(&folder, &name, &settings)?;
         if begun {
-            if is_complete(&folder, &Record::read(&folder)?)? {
+            if is_complete(&folder, &Record::read(&folder)?, lock.is_some())? {
                 return Ok(());
             }
         } else if folder.join(RECORD).exists() && !args.overwrite {
@@ -151,7 +158,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
                 folder.display()
             );
         }
-        (scene, settings, name, folder, begun)
+        (scene, settings, name, folder, begun, lock)
     };
     let looked = doctor::look(&scene);
     eprintln!("doctor: {}", looked.verdict());
@@ -192,12 +199,23 @@ fn warn(looked: &doctor::Report) {
     }
 }
 
+/// Takes the lock of a run folder. `None` where it cannot be had and nothing is to be done: complete runs are left alone, and
+/// the folder holds one.
+fn held(folder: &Path, leave_complete: bool) -> Result<Option<Lock>, folder::Error> {
+    match Lock::take(folder) {
+        Err(_) if leave_complete && Record::read(folder).is_ok_and(|record| record.complete.is_some()) => Ok(None),
+        taken => taken.map(Some),
+    }
+}
+
 /// Whether the run is complete, which is then said.
-fn is_complete(folder: &Path, record: &Record) -> anyhow::Result<bool> {
+fn is_complete(folder: &Path, record: &Record, locked: bool) -> anyhow::Result<bool> {
     let Some(steps) = record.complete else { return Ok(false) };
     // It may have been killed after it was complete and before its last lines.
-    sweep(folder);
-    checkpoint::clear(folder)?;
+    if locked {
+        sweep(folder);
+        checkpoint::clear(folder)?;
+    }
     println!("{}: the run is complete ({steps} steps): nothing to do", folder.display());
     Ok(true)
 }
@@ -251,7 +269,7 @@ pub(super) struct Trained {
     pub written: Vec<&'static str>,
 }
 
-/// Trains into `folder`, in place of any run that is there unless it is gone on with, and evaluates, with a progress bar on
+/// Trains into `folder`, of which the caller holds the lock, in place of any run that is there unless it is gone on with, and evaluates, with a progress bar on
 /// stderr.
 pub(super) fn train(
     gpu: &Gpu,
@@ -265,7 +283,6 @@ pub(super) fn train(
     if manner.go_on && Record::read(folder)?.complete.is_none() {
         return resume(gpu, scene, settings, name, folder, manner, judge);
     }
-    std::fs::create_dir_all(folder).with_context(|| format!("{}: cannot be made", folder.display()))?;
     let run = start(gpu, scene, settings)?;
     clear(folder)?;
     let path = folder.join(SETTINGS);
@@ -387,8 +404,12 @@ fn judged(
     Ok(trained)
 }
 
-/// Removes what an earlier run left in the folder, the record last: until then the folder holds a run.
+/// Removes what an earlier run left in the folder. The run is no longer complete before the first file goes, and until its
+/// record goes it can be gone on with, from the start, under its own settings.
 fn clear(folder: &Path) -> anyhow::Result<()> {
+    if let Ok(record @ Record { complete: Some(_), .. }) = Record::read(folder) {
+        Record { complete: None, ..record }.write(folder)?;
+    }
     sweep(folder);
     checkpoint::clear(folder)?;
     if !folder.join(RECORD).exists() {
@@ -405,7 +426,7 @@ fn clear(folder: &Path) -> anyhow::Result<()> {
     }
     let model = folder.join(MODEL);
     let files = [model.join(POINT_CLOUD), model.join(WEIGHTS)];
-    let of_run = [LOG, METRICS, TRACE, index::INDEX, SETTINGS, RECORD];
+    let of_run = [LOG, METRICS, TRACE, index::INDEX, RECORD, SETTINGS];
     for path in files.into_iter().chain(of_run.map(|name| folder.join(name))) {
         gone(path.clone(), std::fs::remove_file(&path))?;
     }
@@ -414,14 +435,14 @@ fn clear(folder: &Path) -> anyhow::Result<()> {
 
 /// Removes what a killed run had not written to the end.
 fn sweep(folder: &Path) {
-    checkpoint::sweep(folder, |name| [LOG, METRICS, index::INDEX, SETTINGS, RECORD].contains(&name));
-    checkpoint::sweep(&folder.join(checkpoint::FOLDER), |name| name.starts_with("step-"));
-    checkpoint::sweep(&folder.join(MODEL), |name| [POINT_CLOUD, WEIGHTS].contains(&name));
-    checkpoint::sweep(&folder.join(TEST), |name| name.ends_with(".png"));
-    checkpoint::sweep(&folder.join(SEEN), |name| name.ends_with(".png"));
-    for pictures in index::FOLDERS {
-        checkpoint::sweep(&folder.join(index::PICTURES).join(pictures), |name| name.ends_with(".jpg"));
+    folder::sweep(folder, |name| [LOG, METRICS, index::INDEX, SETTINGS, RECORD].contains(&name));
+    folder::sweep(&folder.join(checkpoint::FOLDER), |name| name.starts_with("step-"));
+    folder::sweep(&folder.join(MODEL), |name| [POINT_CLOUD, WEIGHTS].contains(&name));
+    // Names of views may have folders in them.
+    for pictures in [TEST, SEEN] {
+        folder::sweep_below(&folder.join(pictures), &|name| name.ends_with(".png"));
     }
+    folder::sweep_below(&folder.join(index::PICTURES), &|name| name.ends_with(".jpg"));
 }
 
 /// Writes a file that appears complete or not at all.

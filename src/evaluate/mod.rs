@@ -368,7 +368,7 @@ pub fn psnr(mean_squared_error: f64) -> f64 {
 }
 
 /// A number of decibels; infinity, which JSON cannot hold, is the string "inf".
-mod decibel {
+pub(crate) mod decibel {
     use serde::{Deserialize, Deserializer, Serializer, de::Error};
 
     #[derive(Deserialize)]

@@ -47,7 +47,8 @@ impl Spread {
 /// Mean of a figure over seeds, and how far the seeds lie apart.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Moments {
-    /// Arithmetic mean.
+    /// Arithmetic mean. JSON has the string `"inf"` for an infinite PSNR.
+    #[serde(with = "crate::evaluate::decibel")]
     pub mean: f64,
     /// Standard deviation of a single seed (n - 1 in the denominator); absent for one.
     #[serde(skip_serializing_if = "Option::is_none", default)]
@@ -87,14 +88,15 @@ pub struct Paired {
 }
 
 impl Paired {
-    /// Of `b - a`, seed by seed; `None` with fewer than two seeds.
+    /// Of `b - a`, seed by seed; `None` with fewer than two seeds, or where a figure is infinite: there is no difference.
     ///
     /// # Panics
     /// Unless both have equally many.
     pub fn of(a: &[f64], b: &[f64]) -> Option<Self> {
         assert_eq!(a.len(), b.len(), "the same seeds");
         let differences: Vec<f64> = a.iter().zip(b).map(|(a, b)| b - a).collect();
-        let Moments { mean, deviation, seeds } = Moments::of(&differences)?;
+        let Moments { mean, deviation, seeds } =
+            Moments::of(&differences).filter(|moments| moments.mean.is_finite())?;
         let standard_error = deviation? / (seeds as f64).sqrt();
         // Seeds that all differ alike: certainly different, or the same.
         let p = match (standard_error > 0.0, mean == 0.0) {

@@ -27,6 +27,7 @@ use super::run::Progress;
 use super::step::Step;
 use crate::config::{Settings, without_removed};
 use crate::densify::Statistics;
+use crate::folder;
 use crate::gpu::{self, Buffer, Gpu};
 use crate::losses::Term;
 use crate::math::attention::WEIGHTS as ATTENTION;
@@ -654,19 +655,8 @@ pub fn clear(run: &Path) -> Result<(), WriteError> {
     for (_, path) in list(run) {
         std::fs::remove_file(&path).map_err(|source| WriteError { path: path.clone(), source })?;
     }
-    sweep(&run.join(FOLDER), |name| name.starts_with("step-"));
+    folder::sweep(&run.join(FOLDER), |name| name.starts_with("step-"));
     // Fails where somebody else's files are: they stay.
     let _ = std::fs::remove_dir(run.join(FOLDER));
     Ok(())
-}
-
-/// Removes what a killed writer left of files whose names `owned` knows: `.NAME.` and six letters, never renamed to `NAME`.
-pub fn sweep(folder: &Path, owned: impl Fn(&str) -> bool) {
-    for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
-        let name = entry.file_name();
-        let stem = name.to_str().and_then(|name| name.strip_prefix('.')?.rsplit_once('.'));
-        if stem.is_some_and(|(stem, suffix)| suffix.len() == 6 && owned(stem)) {
-            let _ = std::fs::remove_file(entry.path());
-        }
-    }
 }
