@@ -645,18 +645,24 @@ fn a_run_with_the_truth_as_reference_is_judged_and_judged_again() {
     fs::create_dir(folder.join("millimetres")).expect("writable");
     let path = folder.join("scene/test_depth/test_001.npy");
     let depth: ndarray::Array2<f32> = ndarray_npy::read_npy(path).expect("a depth map");
-    fs::create_dir(folder.join("metres")).expect("writable");
-    ndarray_npy::write_npy(folder.join("metres/test_001.npy"), &depth).expect("writable");
-    ndarray_npy::write_npy(folder.join("millimetres/test_001.npy"), &(depth * 1000.0)).expect("writable");
-    let [metres, millimetres] = ["metres", "millimetres"].map(|unit| {
+    ndarray_npy::write_npy(folder.join("millimetres/test_001.npy"), &(&depth * 1000.0)).expect("writable");
+    let figures = |unit: &str| {
         succeeds(folder, &format!("eval run --depth-truth {unit} --json {unit}.json"));
-        read(&format!("{unit}.json"))["mean"]["geometry"].clone()
-    });
+        read(&format!("{unit}.json"))
+    };
+    let millimetres = figures("millimetres");
+    // The same truth in the scene's unit as the maps outside the masks say it is.
+    let factor = millimetres["depth_factor"].as_f64().expect("another unit");
+    assert!((0.2e-3..5e-3).contains(&factor), "{factor} scene units in a millimetre");
+    fs::create_dir(folder.join("units")).expect("writable");
+    ndarray_npy::write_npy(folder.join("units/test_001.npy"), &(depth * (1000.0 * factor) as f32)).expect("writable");
+    let units = figures("units");
+    assert!(units["depth_factor"].is_null(), "{units:#}");
     for figure in ["relative_error", "completeness"] {
-        let value = |geometry: &serde_json::Value| geometry[figure].as_f64().expect("a figure");
-        // Both are float32 depths times a factor: a few roundings of 6e-8 each, of which shares may flip with a pixel.
-        let (metres, millimetres) = (value(&metres), value(&millimetres));
-        assert!((metres - millimetres).abs() <= 1e-3 * metres.abs(), "{figure}: {metres} m, {millimetres} mm");
+        let value = |report: &serde_json::Value| report["mean"]["geometry"][figure].as_f64().expect("a figure");
+        // Float32 depths times a factor: roundings of 6e-8 each.
+        let (units, millimetres) = (value(&units), value(&millimetres));
+        assert!((units - millimetres).abs() <= 1e-5 * units.abs(), "{figure}: {units}, of millimetres {millimetres}");
     }
 
     for (code, arguments, part) in [
