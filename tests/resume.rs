@@ -166,6 +166,8 @@ fn of_two_programs_in_a_run_folder_the_second_says_so() {
     let mut child = place.train("run", &[]).spawn().expect("the program starts");
     let model = place.path().join("run/model/weights.safetensors");
     assert!(wait_until(&mut child, || model.is_file() && !place.checkpoints("run").is_empty()));
+    // It stands still meanwhile, and is there.
+    send(&child, "STOP");
     let says = "run: another gscream-vk is at work in this folder: wait until it has ended, or name another folder";
     for second in [
         place.train("run", &["--seed", "7"]),
@@ -177,7 +179,7 @@ fn of_two_programs_in_a_run_folder_the_second_says_so() {
         let stderr = fails(second, 1);
         assert!(stderr.ends_with(&format!("error: {says}\n")), "{stderr}");
     }
-    assert!(child.try_wait().expect("a child").is_none(), "it was there all the time");
+    send(&child, "CONT");
     let output = child.wait_with_output().expect("a child");
     assert!(output.status.success(), "{}", text(&output.stderr));
     assert_whole(&place, "run", "others tried");
