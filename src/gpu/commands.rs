@@ -115,12 +115,14 @@ impl Commands<'_> {
             Work::Dispatch(dispatch) => self.dispatch(dispatch),
             Work::Fill { to, at, bytes, word } => {
                 self.noted.push(Command::Fill);
-                // SAFETY: a live buffer with transfer usage, the range within it.
+                // SAFETY: a live buffer, made with transfer usage as all are; the range was asserted to lie within it when the pass
+                // was recorded, and is of whole words.
                 unsafe { device.cmd_fill_buffer(self.raw, *to, *at, *bytes, *word) };
             }
             Work::Copy { from, to, region } => {
                 self.noted.push(Command::Copy);
-                // SAFETY: live buffers with transfer usage, regions within both.
+                // SAFETY: live buffers, made with transfer usage as all are; the region was asserted to lie within both when the
+                // pass was recorded.
                 unsafe { device.cmd_copy_buffer(self.raw, *from, *to, &[*region]) };
             }
         }
@@ -130,7 +132,9 @@ impl Commands<'_> {
         let Dispatch { pipeline, bindings, slots, set, push, workgroups } = dispatch;
         let (device, commands, layout) = (&self.inner.device, self.raw, pipeline.layout);
         self.noted.push(Command::Dispatch);
-        // SAFETY: live handles; the layout comes from the kernel's own reflection.
+        // SAFETY: a command buffer in recording and live handles: the pipeline and what it binds are kept until the submission is
+        // over. Bindings and push constants are those of the kernel's own reflection. Kernels keep their bounds by the counts
+        // that they are given, which saturate: robust access is not asked for.
         unsafe {
             let point = vk::PipelineBindPoint::COMPUTE;
             device.cmd_bind_pipeline(commands, point, pipeline.raw());
