@@ -30,6 +30,10 @@ pub enum Lack {
     MemoryWithoutFiles,
     /// Snakemake.
     Snakemake,
+    /// A golden case, where `GSCREAM_GOLDEN` names a folder of some kinds.
+    GoldenCase,
+    /// What a process's memory is, from the system.
+    ProcessMemory,
     /// `rustc`, which the tests of a failing disk compile a library with.
     Compiler,
 }
@@ -50,6 +54,8 @@ impl Lack {
             Self::Timestamps => "timestamps",
             Self::MemoryWithoutFiles => "memory-without-files",
             Self::Snakemake => "snakemake",
+            Self::GoldenCase => "golden-case",
+            Self::ProcessMemory => "process-memory",
             Self::Compiler => "compiler",
         }
     }

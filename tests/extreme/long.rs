@@ -8,6 +8,7 @@ use gscream_vk::model::files;
 use gscream_vk::scene::{self, Scene, synthetic};
 use gscream_vk::train::run::{Observer, Progress, Run};
 
+use super::common::skip::{Lack, skip};
 use super::{Case, common};
 
 const STEPS: u32 = 20_000;
@@ -145,7 +146,7 @@ fn alone() {
     assert!(device.len() == last.len() && device.iter().all(|&b| b == device[0]), "device bytes {device:?}");
     let host = bytes("host_bytes");
     if host.is_empty() {
-        println!("skipped: this system does not tell a process's memory");
+        skip(Lack::ProcessMemory, "this system does not tell a process's memory");
     } else if let (Some(first), Some(most)) = (host.first(), host.iter().copied().reduce(f64::max)) {
         println!("resident memory {first} to {most} bytes");
         assert!(most < 1.03 * first, "resident memory went from {first} to {most}");

@@ -4,6 +4,7 @@ use gscream_vk::gpu::{Check, Difference, Gpu, testing};
 use gscream_vk::math::attention::{self, FEATURE, HEADS, INNER, SIDES, TENSORS, WEIGHTS, dot, head, linear};
 use gscream_vk::model::attention::{Attention, Pair};
 
+use super::skip::{Lack, skip};
 use super::support::{Case, cases};
 
 /// How far float32 may be, for logits of up to `logit`. With u = 2^-24, the unit roundoff:
@@ -133,7 +134,7 @@ fn attention_of_very_large_logits() {
 
 fn very_large_logits_in_one_form(gpu: &Gpu) {
     let Some(case) = cases("attention").into_iter().find(|case| case.name == "attention") else {
-        println!("skipped: no case of this name");
+        skip(Lack::GoldenCase, "the folder of GSCREAM_GOLDEN has no case `attention`");
         return;
     };
     for gain in [1.0, 5.0, 20.0] {

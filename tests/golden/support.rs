@@ -6,6 +6,8 @@ use std::path::PathBuf;
 use gscream_vk::gpu::{Check, Difference};
 use safetensors::{Dtype, SafeTensors};
 
+use super::skip::{Lack, skip};
+
 /// One golden file.
 pub struct Case {
     /// The file's stem.
@@ -37,7 +39,7 @@ pub fn cases(kind: &str) -> Vec<Case> {
     if found.is_empty() {
         // Another folder may hold some kinds only; our own holds all.
         assert!(std::env::var_os("GSCREAM_GOLDEN").is_some(), "{}: no {kind} case here", folder.display());
-        println!("skipped: no {kind} case in {}", folder.display());
+        skip(Lack::GoldenCase, &format!("no {kind} case in {}", folder.display()));
     }
     found
 }
