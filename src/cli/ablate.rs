@@ -29,11 +29,11 @@ use crate::scene::Scene;
 /// attention, which changes the features in place, beside the paper's, through which gradients flow; and with both parts
 /// one `priors-NAME` for every other folder of depth priors and one `reference-NAME` for every other inpainted picture.
 ///
-/// A variant has its parts whatever the preset or the settings say of them. One run after the other, each in a folder of
-/// its own; `--resume` goes on with an ablation that was stopped, and no run is replaced without `--overwrite`. With several seeds, figures are means and standard deviations
-/// over the seeds, and every two variants are compared over the same seeds by a paired t-test. With several scenes, a
-/// seed's figure is its mean over the scenes, as the paper's tables have it. Prints tables, and writes ablation.json (every
-/// run) and comparison.json (means, differences, and the published figures).
+/// A variant has its parts whatever the preset or the settings say of them. One run after the other, each in a folder of its
+/// own; `--resume` goes on with an ablation that was stopped, and no run is replaced without `--overwrite`. With several
+/// seeds, figures are means and standard deviations over the seeds, and every two variants are compared over the same seeds
+/// by a paired t-test. With several scenes, a seed's figure is its mean over the scenes, as the paper's tables have it.
+/// Prints tables, and writes ablation.json (every run) and comparison.json (means, differences, and the published figures).
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   gscream-vk ablate synthetic --preset demo --seeds 3
@@ -46,7 +46,7 @@ pub(super) struct Args {
     #[command(flatten)]
     settings: SettingsArgs,
     /// Runs per variant and scene, with seeds train.seed, train.seed + 1, ...
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     seeds: u32,
     /// Also train with the depth priors of this folder; may be given many times
     ///

@@ -269,8 +269,8 @@ pub(super) struct Trained {
     pub written: Vec<&'static str>,
 }
 
-/// Trains into `folder`, of which the caller holds the lock, in place of any run that is there unless it is gone on with, and evaluates, with a progress bar on
-/// stderr.
+/// Trains into `folder`, of which the caller holds the lock, in place of any run that is there unless it is gone on with,
+/// and evaluates, with a progress bar on stderr.
 pub(super) fn train(
     gpu: &Gpu,
     scene: &Scene,
