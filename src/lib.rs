@@ -26,6 +26,7 @@
 //! | guessed | a place that no photograph shows |
 //! | unit | the length that counts as one in the settings, in lengths of the capture's files |
 
+pub mod atomic;
 pub mod bench;
 pub mod capture;
 pub mod cli;

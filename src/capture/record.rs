@@ -8,7 +8,7 @@ use std::fs::File;
 use std::io::{self, Cursor, Write as _};
 use std::path::{Component, Path, PathBuf};
 
-use atomic_write_file::AtomicWriteFile;
+use crate::atomic::AtomicWriteFile;
 use image::{GrayImage, ImageFormat, RgbImage};
 use serde::{Deserialize, Serialize};
 use tempfile::TempDir;
@@ -82,6 +82,27 @@ pub fn hash(path: &Path) -> Result<String, Error> {
     let mut hasher = blake3::Hasher::new();
     io::copy(&mut File::open(path).map_err(failed)?, &mut hasher).map_err(failed)?;
     Ok(hasher.finalize().to_hex().to_string())
+}
+
+/// A path below a scene as records have it: its components with `/` between them on every platform. Nothing for a path
+/// that leads elsewhere, with `..`, a root or a drive in it.
+pub fn key(path: &Path) -> Option<String> {
+    joined(path.components())
+}
+
+/// Whether a path as text leads below the folder that it is joined to.
+fn is_below(path: &str) -> bool {
+    key(Path::new(path)).is_some()
+}
+
+/// See [`key`].
+fn joined<'a>(components: impl Iterator<Item = Component<'a>>) -> Option<String> {
+    let normal = |component| match component {
+        Component::Normal(name) => Some(name.to_string_lossy()),
+        Component::Prefix(_) | Component::RootDir | Component::CurDir | Component::ParentDir => None,
+    };
+    let names: Vec<_> = components.map(normal).collect::<Option<_>>()?;
+    (!names.is_empty()).then(|| names.join("/"))
 }
 
 /// What a step writes, all of it at once.
@@ -172,7 +193,7 @@ impl Folder {
     pub fn open(root: &Path) -> Result<Self, Error> {
         std::fs::create_dir_all(root).map_err(|source| Error::Io { path: root.to_owned(), source })?;
         let path = root.join(RECORD);
-        let record = match std::fs::read(&path) {
+        let record: Record = match std::fs::read(&path) {
             Ok(text) => serde_json::from_slice(&text).map_err(|error| {
                 let what = format!("not a record of prepare ({error}); move it away to start again");
                 Error::File { path: path.clone(), what }
@@ -180,6 +201,13 @@ impl Folder {
             Err(error) if error.kind() == io::ErrorKind::NotFound => Record::default(),
             Err(source) => return Err(Error::Io { path, source }),
         };
+        // A record may come with a scene from anywhere, and files that it names are removed.
+        let mut named = record.steps.values().flat_map(|step| step.files.keys()).chain(record.pending.keys());
+        if let Some(outside) = named.find(|file| !is_below(file)) {
+            let what =
+                format!("it names {outside:?}, which is no path below the scene; move this file away to start again");
+            return Err(Error::File { path, what });
+        }
         Ok(Self { root: root.to_owned(), record })
     }
 
@@ -223,6 +251,13 @@ impl Folder {
         Ok(!recorded.chain(self.record.pending.get(path)).any(|hash| *hash == found))
     }
 
+    /// Whether a file is there and lies in the scene's folder itself, not behind a link that leads out of it.
+    fn holds(&self, file: &Path) -> bool {
+        let folder = file.parent().and_then(|folder| folder.canonicalize().ok());
+        let root = self.root.canonicalize();
+        file.exists() && folder.is_some_and(|folder| root.is_ok_and(|root| folder.starts_with(root)))
+    }
+
     /// Whether a step has nothing to do: its inputs are those of last time and its files are there.
     pub fn is_fresh(&self, step: &str, inputs: &str) -> bool {
         self.record.steps.get(step).is_some_and(|record| {
@@ -234,9 +269,15 @@ impl Folder {
     /// user's stays as it is. Returns the paths that were kept for that reason.
     ///
     /// # Errors
-    /// A file that cannot be read or written; the files written before stay, and are written over the next time.
+    /// A path that does not lead below the scene, before anything is written; a file that cannot be read or written: the
+    /// files written before stay, and are written over the next time.
     pub fn write(&mut self, step: &str, inputs: String, batch: Batch) -> Result<Vec<String>, Error> {
         let Batch { files, notes, figures, aside: _aside } = batch;
+        if let Some(outside) = files.keys().find(|path| !is_below(path)) {
+            let what =
+                format!("the step {step} would write {outside:?}, which is no path below the scene; rename its source");
+            return Err(Error::File { path: self.root.clone(), what });
+        }
         let mut kept = vec![];
         let mut new = StepRecord { inputs, files: BTreeMap::new(), notes, figures };
         let mut todo = vec![];
@@ -273,8 +314,8 @@ impl Folder {
         let old: BTreeSet<String> =
             self.record.steps.get(step).map(|old| old.files.keys().cloned().collect()).unwrap_or_default();
         for path in old.into_iter().filter(|path| !new.files.contains_key(path)) {
-            if self.root.join(&path).exists() && !self.is_users(&path)? {
-                let file = self.root.join(&path);
+            let file = self.root.join(&path);
+            if self.holds(&file) && !self.is_users(&path)? {
                 std::fs::remove_file(&file).map_err(|source| Error::Io { path: file.clone(), source })?;
                 // A folder that is empty now says nothing any more; one that is not stays.
                 if let Some(folder) = file.parent().filter(|folder| *folder != self.root) {
@@ -342,6 +383,69 @@ mod tests {
         folder.write("masks", "3".into(), batch(&[("masks/d", "four")])).unwrap();
         std::fs::remove_file(dir.path().join("masks/d")).unwrap();
         assert!(!folder.is_fresh("masks", "3"));
+    }
+
+    /// A record keeps `/` between folders where the platform has something else.
+    #[test]
+    fn keys_are_the_same_on_every_platform() {
+        let normal = |name: &'static str| Component::Normal(name.as_ref());
+        assert_eq!(joined([normal("masks"), normal("a.png")].into_iter()).as_deref(), Some("masks/a.png"));
+        assert_eq!(key(&["masks", "b", "a.png"].iter().collect::<PathBuf>()).as_deref(), Some("masks/b/a.png"));
+        for elsewhere in [Component::ParentDir, Component::RootDir] {
+            assert_eq!(joined([normal("masks"), elsewhere, normal("a.png")].into_iter()), None);
+        }
+        assert_eq!(key(Path::new("")), None);
+    }
+
+    /// A scene that somebody gives away names files elsewhere in its record, with their hashes: they stay.
+    #[test]
+    fn a_foreign_record_removes_nothing_elsewhere() {
+        let dir = tempfile::tempdir().unwrap();
+        let (scene, precious) = (dir.path().join("scene"), dir.path().join("precious"));
+        std::fs::create_dir(&scene).unwrap();
+        std::fs::write(&precious, "photographs").unwrap();
+        let hash = blake3::hash(b"photographs").to_hex().to_string();
+        for (path, pending) in [("../precious", false), (precious.to_str().unwrap(), false), ("a/../../b", true)] {
+            let mut record = Record::default();
+            if pending {
+                record.pending.insert(path.into(), hash.clone());
+            } else {
+                let file = FileRecord { hash: hash.clone(), from: "a test".into() };
+                record.steps.entry("masks".into()).or_default().files.insert(path.into(), file);
+            }
+            std::fs::write(scene.join(RECORD), serde_json::to_string(&record).unwrap()).unwrap();
+            let refusal = Folder::open(&scene).and_then(|mut folder| folder.write("masks", "1".into(), batch(&[])));
+            let error = refusal.expect_err("a path elsewhere").to_string();
+            assert!(error.contains("which is no path below the scene"), "{error}");
+            assert!(precious.exists());
+        }
+    }
+
+    /// A link to a folder elsewhere in such a scene does not help either.
+    #[cfg(unix)]
+    #[test]
+    fn nothing_is_removed_behind_a_link() {
+        let dir = tempfile::tempdir().unwrap();
+        let (scene, home) = (dir.path().join("scene"), dir.path().join("home"));
+        std::fs::create_dir_all(&home).unwrap();
+        let mut folder = Folder::open(&scene).unwrap();
+        folder.write("masks", "1".into(), batch(&[("masks/a", "one"), ("kept/a", "one")])).unwrap();
+        std::fs::write(home.join("a"), "one").unwrap();
+        std::fs::remove_dir_all(scene.join("masks")).unwrap();
+        std::os::unix::fs::symlink(&home, scene.join("masks")).unwrap();
+        folder.write("masks", "2".into(), batch(&[])).unwrap();
+        assert!(home.join("a").exists() && !scene.join("kept").exists());
+    }
+
+    #[test]
+    fn what_would_be_written_elsewhere_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut folder = Folder::open(&dir.path().join("scene")).unwrap();
+        for path in ["../a", "/a", "images/../../a", "."] {
+            let error = folder.write("poses", "1".into(), batch(&[("images/b", "x"), (path, "y")])).unwrap_err();
+            assert!(error.to_string().contains("no path below the scene"), "{error}");
+        }
+        assert!(!dir.path().join("a").exists() && !dir.path().join("scene/images").exists());
     }
 
     /// A run that was killed between its files and its record leaves files of its own, not the user's.

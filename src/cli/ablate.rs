@@ -6,7 +6,7 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail, ensure};
-use atomic_write_file::AtomicWriteFile;
+use crate::atomic::AtomicWriteFile;
 use serde::{Deserialize, Serialize};
 
 use super::eval::JudgeArgs;

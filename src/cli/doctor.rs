@@ -1,8 +1,8 @@
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
+use crate::atomic::AtomicWriteFile;
 use anyhow::{Context as _, bail};
-use atomic_write_file::AtomicWriteFile;
 
 use super::{next, pictures};
 use crate::capture::doctor::{self, Report, Severity};
@@ -45,7 +45,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     }
     if let (Some(folder), Some(scene)) = (&args.sheet, &scene) {
         // A picture that is not there, or not readable, leaves its cell out.
-        let provenance = image::open(args.scene.join(PROVENANCE)).ok().map(image::DynamicImage::into_rgb8);
+        let provenance = crate::scene::decode(&args.scene.join(PROVENANCE)).ok().map(image::DynamicImage::into_rgb8);
         let sheet = sheet::draw(scene, provenance.as_ref());
         let rgb: Vec<[f32; 3]> = sheet.picture.pixels().map(|p| p.0.map(|v| f32::from(v) / 255.0)).collect();
         pictures::write_png(&folder.join(sheet::PICTURE), [sheet.picture.width(), sheet.picture.height()], &rgb)?;

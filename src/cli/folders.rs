@@ -15,8 +15,8 @@
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
+use crate::atomic::AtomicWriteFile;
 use anyhow::{Context as _, bail};
-use atomic_write_file::AtomicWriteFile;
 use serde::{Deserialize, Serialize};
 
 use crate::config::{Error as SettingsError, Settings, Source};

@@ -6,8 +6,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
+use crate::atomic::AtomicWriteFile;
 use anyhow::{Context as _, bail, ensure};
-use atomic_write_file::AtomicWriteFile;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::folders::{MODEL, RECORD, Record, SEEN, SETTINGS, TEST};

@@ -15,7 +15,7 @@ pub mod up;
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
-use atomic_write_file::AtomicWriteFile;
+use crate::atomic::AtomicWriteFile;
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::config::Settings;

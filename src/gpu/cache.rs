@@ -32,7 +32,7 @@ pub(super) fn write(path: &Path, data: &[u8]) -> std::io::Result<()> {
     if let Some(folder) = path.parent() {
         std::fs::create_dir_all(folder)?;
     }
-    let mut file = atomic_write_file::AtomicWriteFile::open(path)?;
+    let mut file = crate::atomic::AtomicWriteFile::open(path)?;
     file.write_all(MAGIC)?;
     file.write_all(blake3::hash(data).as_bytes())?;
     file.write_all(data)?;

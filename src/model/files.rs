@@ -18,7 +18,7 @@ use std::fs::File;
 use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
-use atomic_write_file::AtomicWriteFile;
+use crate::atomic::AtomicWriteFile;
 use ply_rs_bw::parser::{Parser, Reader};
 use ply_rs_bw::ply::{
     ElementDef, Encoding, Header, Property, PropertyAccess, PropertyAccessResult, PropertyDef, PropertyType, ScalarType,
@@ -396,6 +396,10 @@ pub fn load_anchors(path: &Path) -> Result<Anchors, Error> {
         } else if let Some(columns) = columns {
             // Elements after the vertices are of no use.
             return Ok(columns.anchors());
+        }
+        if element.count > 0 && element.properties.is_empty() {
+            let (count, name) = (element.count, &element.name);
+            return Err(broken(format!("its header declares {count} {name} without a property; save the model again")));
         }
         for index in 0..element.count {
             let row = read_row(&parser, &mut reader, header.encoding, element).map_err(|error| {

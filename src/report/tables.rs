@@ -3,7 +3,7 @@
 use std::io::Write as _;
 use std::path::Path;
 
-use atomic_write_file::AtomicWriteFile;
+use crate::atomic::AtomicWriteFile;
 
 use super::kernels::Kernels;
 use super::training::Training;

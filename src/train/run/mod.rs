@@ -3,6 +3,7 @@
 mod error;
 mod observer;
 
+use crate::atomic::AtomicWriteFile;
 use crate::config::Settings;
 use crate::evaluate::{self, Report, ViewMetrics};
 use crate::gpu::{self, Buffer, Gpu, NotFinite, Submission, Timing, Timings};
@@ -17,7 +18,6 @@ use crate::train::order::Order;
 use crate::train::photographs::{self, Photograph};
 use crate::train::plan::Plan;
 use crate::train::step::{Rates, Step};
-use atomic_write_file::AtomicWriteFile;
 pub use error::{Error, Signal};
 use observer::StepsLeft;
 pub use observer::{Observer, Progress, Silent, Summary};
