@@ -688,7 +688,7 @@ fn bad_priors_are_refused() {
     depth/a.npy: the prior is 64x40 but its picture is 64x36; their proportions must agree within 1 %
     depth/a.npy: the array's type must be float32, float64, uint8 or uint16; save it with `.astype('float32')`
     depth/a.npy: the array's shape is [2304], it must be rows x columns
-    depth/a.npy: not a readable NumPy array: reached EOF before reading all data
+    depth/a.npy: not a readable NumPy array: its header says 36 x 64 values of 4 bytes, 9216 bytes together, and 4872 follow; copy or save it again
     depth/a.png: a prior is one grey channel, this is a colour picture; save the values, not a colour map
     depth/a.exr: depth/a.npy has the same name; keep one
     depth/a.exr: not a readable OpenEXR picture: invalid: file identifier missing

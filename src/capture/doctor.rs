@@ -153,7 +153,9 @@ pub fn look(scene: &Scene) -> Report {
 
 /// Whether a note of the loader says that it left something out.
 fn lost(note: &str) -> bool {
-    ["belong to no picture", "are not in the model", "is not read"].iter().any(|part| note.contains(part))
+    ["belong to no picture", "are not in the model", "is not read", "is not looked into"]
+        .iter()
+        .any(|part| note.contains(part))
 }
 
 fn examine_scene(scene: &Scene, report: &mut Report) {

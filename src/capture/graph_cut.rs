@@ -411,12 +411,12 @@ impl Strokes {
     /// # Errors
     /// An unreadable file, one of other proportions than the photograph, one without a stroke on the object.
     pub fn read(path: &Path, size: [u32; 2]) -> Result<Self, Error> {
-        let picture = scene::decode(path)?.into_rgba8();
-        let found = [picture.width(), picture.height()];
+        let found = scene::dimensions(path)?;
         let ratio = |s: [u32; 2]| f64::from(s[0]) / f64::from(s[1]);
         if (ratio(found) / ratio(size) - 1.0).abs() > 0.02 {
             return Err(scene::Error::MaskSize { path: path.to_owned(), size: found, picture: size }.into());
         }
+        let picture = scene::decode(path)?.into_rgba8();
         let known = picture.pixels().map(|p| {
             let [r, g, b, a] = p.0.map(i32::from);
             if a < 128 {

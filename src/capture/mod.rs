@@ -201,12 +201,7 @@ impl Watch for Silent {}
 
 /// Width and height of a picture file.
 pub(crate) fn picture_size(path: &Path) -> Result<[u32; 2], Error> {
-    let failed = |source| Error::Io { path: path.to_owned(), source };
-    let reader = image::ImageReader::open(path).map_err(failed)?.with_guessed_format().map_err(failed)?;
-    let (w, h) = reader
-        .into_dimensions()
-        .map_err(|source| Error::Scene(scene::Error::Picture { path: path.to_owned(), source }))?;
-    Ok([w, h])
+    Ok(scene::dimensions(path)?)
 }
 
 /// Makes a scene of photographs.
@@ -215,6 +210,7 @@ pub(crate) fn picture_size(path: &Path) -> Result<[u32; 2], Error> {
 /// See [`Error`]. What steps before have written stays.
 pub fn prepare(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<(), Error> {
     let mut capture = poses::find(&request.photographs)?;
+    capture.photographs.iter().try_for_each(|(name, path)| has_room(name, path))?;
     // In a scene that is made in its own capture's folder the masks may be the program's; `corrected` tells them apart.
     let own = request.out.join("masks").canonicalize();
     capture.masks.retain(|_, (path, _)| {
@@ -272,6 +268,19 @@ pub fn prepare(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<()
     Ok(())
 }
 
+/// Refuses a photograph whose name leaves no room for that of its files, of which its prior as the reference has the longest.
+fn has_room(name: &str, path: &Path) -> Result<(), Error> {
+    let most = crate::atomic::LONGEST_NAME - "_disparity.npy".len();
+    let own = name.rsplit('/').next().unwrap_or(name).len();
+    if own <= most {
+        return Ok(());
+    }
+    let what = format!(
+        "its name has {own} bytes without extension, and what is named after it leaves room for at most {most}; rename it"
+    );
+    Err(Error::File { path: path.to_owned(), what })
+}
+
 /// A mask that was given or derived from a box, as large as the photograph, and what it was made from.
 struct Given {
     mask: GrayImage,
@@ -297,7 +306,7 @@ fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>
         // Masks of no photograph are not this scene's.
         let Some(photograph) = capture.photographs.get(name) else { continue };
         let size = picture_size(photograph)?;
-        let mut mask = scene::mask(path, 1)?;
+        let mut mask = read_mask(path, size)?;
         if *inverted {
             mask.iter_mut().for_each(|v| *v = 255 - *v);
         }
@@ -325,7 +334,7 @@ fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>
         let size = picture_size(photograph)?;
         let given = match evidence {
             Evidence::Mask(path) => {
-                let mask = checked(path, scene::mask(path, 1)?, size, false)?;
+                let mask = checked(path, read_mask(path, size)?, size, false)?;
                 Given { mask, from: format!("--mask {}", path.display()) }
             }
             Evidence::Box(bounds) => {
@@ -394,26 +403,32 @@ fn corrected(
         return Ok(all);
     }
     for (name, path) in scene::pictures(&masks)? {
-        let relative = path.strip_prefix(folder.root()).unwrap_or(&path).to_string_lossy().into_owned();
         let Some(photograph) = capture.photographs.get(&name) else { continue };
+        let below = path.strip_prefix(folder.root()).ok().and_then(record::key);
+        let relative = below.expect("the files of masks/ lie below the scene");
         if !given.contains_key(&name) && folder.is_users(&relative)? {
-            let mask = checked(&path, scene::mask(&path, 1)?, picture_size(photograph)?, true)?;
+            let size = picture_size(photograph)?;
+            let mask = checked(&path, read_mask(&path, size)?, size, true)?;
             all.insert(name, Given { mask, from: USERS.into() });
         }
     }
     Ok(all)
 }
 
+/// A mask of a photograph of this size, as large as its file has it: its proportions are looked at before it is decoded.
+fn read_mask(path: &Path, size: [u32; 2]) -> Result<GrayImage, Error> {
+    let found = picture_size(path)?;
+    let ratio = |s: [u32; 2]| f64::from(s[0]) / f64::from(s[1]);
+    if found != size && (ratio(found) / ratio(size) - 1.0).abs() > 0.01 {
+        return Err(scene::Error::MaskSize { path: path.to_owned(), size: found, picture: size }.into());
+    }
+    Ok(scene::mask(path, 1)?)
+}
+
 /// A mask as large as its photograph that is neither full nor, unless that is allowed, empty.
 fn checked(path: &Path, mask: GrayImage, size: [u32; 2], may_be_empty: bool) -> Result<GrayImage, Error> {
     let found = [mask.width(), mask.height()];
     let refuse = |what: String| Err(Error::File { path: path.to_owned(), what });
-    if found != size {
-        let ratio = |s: [u32; 2]| f64::from(s[0]) / f64::from(s[1]);
-        if (ratio(found) / ratio(size) - 1.0).abs() > 0.01 {
-            return Err(scene::Error::MaskSize { path: path.to_owned(), size: found, picture: size }.into());
-        }
-    }
     let mask = if found == size { mask } else { resample::nearest(&mask, size) };
     let object = mask.as_raw().iter().filter(|v| **v != 0).count();
     if object == mask.as_raw().len() {
@@ -657,17 +672,13 @@ impl Preparation<'_> {
         let root = self.folder.root();
         let ours = self.folder.record().steps.get(Step::Depth.name()).map(|step| &step.files);
         for name in PRIORS {
-            let path = root.join(name);
-            let entries = match std::fs::read_dir(&path) {
-                Ok(entries) => entries,
-                Err(error) if error.kind() == std::io::ErrorKind::NotFound => continue,
-                Err(source) => return Err(Error::Io { path, source }),
-            };
-            for entry in entries {
-                let entry = entry.map_err(|source| Error::Io { path: path.clone(), source })?;
-                let file = entry.file_name().to_string_lossy().into_owned();
-                // Names that begin with a dot are of files that were not written to the end.
-                if !file.starts_with('.') && !ours.is_some_and(|ours| ours.contains_key(&format!("{name}/{file}"))) {
+            let folder = root.join(name);
+            if !folder.is_dir() {
+                continue;
+            }
+            for path in scene::depth_maps(&folder)?.values() {
+                let below = path.strip_prefix(root).ok().and_then(record::key);
+                if !ours.zip(below).is_some_and(|(ours, below)| ours.contains_key(&below)) {
                     return Ok(true);
                 }
             }

@@ -1,10 +1,12 @@
 //! Photographs and their cameras: an existing COLMAP model (whose fisheyes [`super::lens`] resamples), nerfstudio's `transforms.json`, or photographs alone through
 //! the `colmap` program.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsString;
 use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
+use std::fs::File;
+use std::io::Read as _;
+use std::path::{Component, Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use glam::{DMat3, DQuat, DVec3, dvec3};
@@ -21,6 +23,9 @@ use crate::scene::{self, colmap, undistort};
 /// Where a scene keeps its photographs and its model.
 pub const IMAGES: &str = "images";
 const MODEL: &str = "sparse/0";
+/// COLMAP's numbers of its camera models.
+const PINHOLE: u32 = 1;
+const OPENCV: u32 = 4;
 /// Kept as they are where a capture has them.
 const TEST: [&str; 2] = ["test_images", "test_masks"];
 
@@ -36,7 +41,12 @@ pub struct Capture {
     depths: BTreeMap<String, PathBuf>,
     /// What brings photographs of other lenses into a pinhole's picture of the same size.
     pinholes: BTreeMap<String, Pinhole>,
+    /// Photographs whose path can be no name in a scene, and the names that they get.
+    renamed: Vec<Renamed>,
 }
+
+/// A photograph and the name that it gets.
+type Renamed = (PathBuf, String);
 
 #[derive(Debug)]
 enum Source {
@@ -125,7 +135,15 @@ pub fn find(folder: &Path) -> Result<Capture, Error> {
     let masks = masks.into_iter().map(|(name, path)| (name, (path, false))).collect();
     let pinholes = if model.is_some() { pinholes(folder, &photographs)? } else { BTreeMap::new() };
     let source = model.map_or(Source::Photographs(images), Source::Colmap);
-    Ok(Capture { folder: folder.to_owned(), source, photographs, masks, depths: BTreeMap::new(), pinholes })
+    Ok(Capture {
+        folder: folder.to_owned(),
+        source,
+        photographs,
+        masks,
+        depths: BTreeMap::new(),
+        pinholes,
+        renamed: vec![],
+    })
 }
 
 /// The pinholes of the photographs whose lenses training does not project with.
@@ -239,8 +257,7 @@ impl Capture {
                     batch.rgb_aside(format!("{IMAGES}/{name}.png"), &picture, from)?;
                     continue;
                 }
-                let extension = path.extension().map_or_else(|| "png".into(), |e| e.to_string_lossy().to_lowercase());
-                let target = format!("{IMAGES}/{name}.{extension}");
+                let target = format!("{IMAGES}/{name}.{}", picture_extension(path));
                 if out.join(&target).canonicalize().ok() != path.canonicalize().ok() || !out.join(&target).exists() {
                     batch.copy(target, path, "the photographs");
                 }
@@ -254,8 +271,8 @@ impl Capture {
         if !in_place {
             for folder in TEST {
                 for path in existing(&self.folder.join(folder))?.values() {
-                    let relative = path.strip_prefix(&self.folder).unwrap_or(path);
-                    batch.copy(relative.to_string_lossy(), path, "the photographs");
+                    let below = path.strip_prefix(&self.folder).ok().and_then(record::key);
+                    batch.copy(below.expect("the files of a folder lie below it"), path, "the photographs");
                 }
             }
         }
@@ -268,6 +285,14 @@ impl Capture {
             }
             Source::Transforms { file, transforms, names } => {
                 self.collect_transforms(file, transforms, names, &mut batch)?;
+                if let Some((path, name)) = self.renamed.first() {
+                    let count = self.renamed.len();
+                    batch.notes.push(format!(
+                        "{count} photographs lie elsewhere or have a name that a scene cannot list, and are copied under \
+                         another (first: {} as {name})",
+                        path.display()
+                    ));
+                }
                 let lost = self.depths.keys().filter(|name| self.pinholes.contains_key(*name)).count();
                 if let Some(pinhole) = self.pinholes.values().next() {
                     let (count, model) = (self.pinholes.len(), pinhole.lens.model);
@@ -312,8 +337,7 @@ impl Capture {
                     pinhole.focal
                 }
                 None => {
-                    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-                    batch.copy(format!("{folder}/{name}.{extension}"), path, "the photographs");
+                    batch.copy(format!("{folder}/{name}.{}", picture_extension(path)), path, "the photographs");
                     shot.parameters[4..].copy_from_slice(&lens.coefficients[..4]);
                     lens.focal
                 }
@@ -322,10 +346,10 @@ impl Capture {
             shot.parameters[2..4].copy_from_slice(&lens.principal);
             shots.push(shot);
         }
-        let (cameras, images) = model_text(&shots);
         let origin = format!("{}, its lenses resampled", self.origin());
-        batch.bytes(format!("{MODEL}/cameras.txt"), cameras.into_bytes(), origin.clone());
-        batch.bytes(format!("{MODEL}/images.txt"), images.into_bytes(), origin);
+        for (name, bytes) in model_files_of(&shots) {
+            batch.bytes(format!("{MODEL}/{name}"), bytes, origin.clone());
+        }
         if let Source::Colmap(files) = &self.source {
             for path in files.iter().filter(|path| path.file_stem().is_some_and(|stem| stem == "points3D")) {
                 let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -360,9 +384,9 @@ impl Capture {
             let lens = taken_with(frame.lens, transforms.lens, fisheye, size).map_err(refuse)?;
             shots.push(shot(frame, name, &lens, self.pinholes.get(name)).map_err(refuse)?);
         }
-        let (cameras, images) = model_text(&shots);
-        batch.bytes(format!("{MODEL}/cameras.txt"), cameras.into_bytes(), self.origin());
-        batch.bytes(format!("{MODEL}/images.txt"), images.into_bytes(), self.origin());
+        for (name, bytes) in model_files_of(&shots) {
+            batch.bytes(format!("{MODEL}/{name}"), bytes, self.origin());
+        }
         match &transforms.ply_file_path {
             Some(points) => {
                 batch.copy(format!("{MODEL}/points3D.ply"), &self.folder.join(points), "transforms.json: ply_file_path")
@@ -452,6 +476,17 @@ impl Capture {
     }
 }
 
+/// The extension under which a scene lists a photograph: its own in lower case, or that of its contents.
+fn picture_extension(path: &Path) -> String {
+    let own = path.extension().map_or_else(String::new, |e| e.to_string_lossy().to_lowercase());
+    if scene::PICTURES.contains(&own.as_str()) {
+        return own;
+    }
+    let guessed = image::ImageReader::open(path).and_then(image::ImageReader::with_guessed_format);
+    let jpeg = guessed.is_ok_and(|reader| reader.format() == Some(image::ImageFormat::Jpeg));
+    if jpeg { "jpg".into() } else { "png".into() }
+}
+
 fn run_colmap(command: &str, arguments: &[OsString]) -> Result<(), Error> {
     let output = Command::new("colmap")
         .arg(command)
@@ -492,22 +527,25 @@ fn from_transforms(folder: &Path, file: &Path) -> Result<Capture, Error> {
         masks: BTreeMap::new(),
         depths: BTreeMap::new(),
         pinholes: BTreeMap::new(),
+        renamed: vec![],
     };
-    let mut names = vec![];
     let below = |path: &str| {
         let plain = path.trim_start_matches("./");
         let given = folder.join(plain);
         // Some writers leave the extension out.
-        let candidates =
-            ["png", "jpg", "jpeg", "PNG", "JPG"].map(|e| PathBuf::from(format!("{}.{e}", given.display())));
+        let candidates = ["png", "jpg", "jpeg", "PNG", "JPG"].map(|e| {
+            let mut name = given.clone().into_os_string();
+            name.push(format!(".{e}"));
+            PathBuf::from(name)
+        });
         std::iter::once(given.clone()).chain(candidates).find(|path| path.is_file()).ok_or_else(|| {
             refuse(format!("{} is not there; paths are read below {}", given.display(), folder.display()))
         })
     };
-    for (i, frame) in transforms.frames.iter().enumerate() {
-        let picture = below(&frame.file_path)?;
-        let relative = picture.strip_prefix(folder).unwrap_or(&picture).to_string_lossy().into_owned();
-        let name = scene::stem(relative.strip_prefix("images/").unwrap_or(&relative)).to_owned();
+    let pictures: Vec<PathBuf> =
+        transforms.frames.iter().map(|frame| below(&frame.file_path)).collect::<Result<_, _>>()?;
+    let (names, renamed) = names_of(folder, &pictures).map_err(refuse)?;
+    for (i, ((frame, name), picture)) in transforms.frames.iter().zip(&names).zip(pictures).enumerate() {
         if let Some(path) = &frame.mask_path {
             // nerfstudio trains on what is not black: black is what is to be left out.
             capture.masks.insert(name.clone(), (below(path)?, true));
@@ -523,13 +561,72 @@ fn from_transforms(folder: &Path, file: &Path) -> Result<Capture, Error> {
                 Pinhole::of(lens).ok_or_else(|| wrong("its lens folds over: no pinhole shows a part of it alone"))?;
             capture.pinholes.insert(name.clone(), pinhole);
         }
-        if capture.photographs.insert(name.clone(), picture).is_some() {
-            return Err(refuse(format!("two frames show {name}")));
-        }
-        names.push(name);
+        capture.photographs.insert(name.clone(), picture);
     }
+    if let Some(points) = &transforms.ply_file_path {
+        let path = folder.join(points);
+        let mut first = [0; 4];
+        let is_ply = path.is_file() && File::open(&path).and_then(|mut file| file.read_exact(&mut first)).is_ok();
+        if !is_ply || &first[..3] != b"ply" {
+            return Err(refuse(format!(
+                "ply_file_path is {points:?}, which is no PLY file; leave it out or correct it"
+            )));
+        }
+    }
+    capture.renamed = renamed;
     capture.source = Source::Transforms { file: file.to_owned(), transforms: Box::new(transforms), names };
     Ok(capture)
+}
+
+/// The name of each picture in the scene, one for each, and which of them have another than their path below the folder,
+/// with what they are called there.
+///
+/// A picture that lies elsewhere, or whose path a scene does not list, is called by the parts of its path that can be
+/// names; what is called so already gets a number behind it.
+fn names_of(folder: &Path, pictures: &[PathBuf]) -> Result<(Vec<String>, Vec<Renamed>), String> {
+    let own = |picture: &PathBuf| -> Option<String> {
+        let relative = record::key(picture.strip_prefix(folder).ok()?)?;
+        let name = scene::stem(relative.strip_prefix("images/").unwrap_or(&relative));
+        name.split('/').all(|part| safe_part(part) == part).then(|| name.to_owned())
+    };
+    let mut names: Vec<Option<String>> = pictures.iter().map(own).collect();
+    let mut taken = BTreeSet::new();
+    if let Some(twice) = names.iter().flatten().find(|name| !taken.insert(String::from(*name))) {
+        return Err(format!("two frames show {twice}"));
+    }
+    let mut renamed = vec![];
+    let mut shown = BTreeSet::new();
+    if let Some(twice) = pictures.iter().find(|picture| !shown.insert(*picture)) {
+        return Err(format!("two frames show {}", twice.display()));
+    }
+    for (name, picture) in names.iter_mut().zip(pictures).filter(|(name, _)| name.is_none()) {
+        let path = picture.strip_prefix(folder).unwrap_or(picture);
+        let parts = path.components().filter_map(|part| match part {
+            Component::Normal(part) => Some(safe_part(&part.to_string_lossy())),
+            _ => None,
+        });
+        let parts: Vec<String> = parts.filter(|part| !part.is_empty()).collect();
+        let joined = parts.join("/");
+        let wanted = Some(scene::stem(&joined)).filter(|stem| !stem.is_empty()).unwrap_or("frame").to_owned();
+        let mut safe = wanted.clone();
+        for number in 2.. {
+            if !taken.contains(&safe) {
+                break;
+            }
+            safe = format!("{wanted}_{number}");
+        }
+        taken.insert(safe.clone());
+        renamed.push((picture.clone(), safe.clone()));
+        *name = Some(safe);
+    }
+    Ok((names.into_iter().map(|name| name.expect("every picture has got a name")).collect(), renamed))
+}
+
+/// A folder's or file's name as a scene lists it and as a line of the model can hold it: neither hidden, nor with control
+/// characters or blanks at its ends.
+fn safe_part(part: &str) -> String {
+    let plain: String = part.chars().map(|c| if c.is_control() { '_' } else { c }).collect();
+    plain.trim().trim_start_matches('.').trim_start().to_owned()
 }
 
 /// The lens of a frame's photograph of this size: OPENCV's, its fisheye's, or with a third radial term FULL_OPENCV's.
@@ -586,20 +683,25 @@ fn shot(frame: &Frame, name: &str, lens: &colmap::Lens, pinhole: Option<&Pinhole
     Ok(Shot { name: name.to_owned(), size: lens.size, parameters, rotation, translation: -(rotation * column(3)) })
 }
 
-/// `cameras.txt` and `images.txt`, a camera for each photograph.
-fn model_text(shots: &[Shot]) -> (String, String) {
-    let (mut cameras, mut images) = (String::new(), String::new());
-    for (i, shot) in shots.iter().enumerate() {
-        let Shot { name, size: [w, h], parameters, rotation: q, translation: t } = shot;
+/// `cameras.bin` and `images.bin`, a camera for each photograph: unlike lines of text they hold any name.
+fn model_files_of(shots: &[Shot]) -> [(&'static str, Vec<u8>); 2] {
+    let count = (shots.len() as u64).to_le_bytes().to_vec();
+    let (mut cameras, mut images) = (count.clone(), count);
+    for (id, shot) in (1u32..).zip(shots) {
+        let Shot { name, size, parameters, rotation: q, translation: t } = shot;
         let straight = parameters[4..].iter().all(|v| *v == 0.0);
-        let (model, used) = if straight { ("PINHOLE", 4) } else { ("OPENCV", 8) };
-        let parameters: Vec<String> = parameters[..used].iter().map(f64::to_string).collect();
-        let id = i + 1;
-        writeln!(cameras, "{id} {model} {w} {h} {}", parameters.join(" ")).expect("a string takes everything");
-        let pose = format!("{} {} {} {} {} {} {}", q.w, q.x, q.y, q.z, t.x, t.y, t.z);
-        writeln!(images, "{id} {pose} {id} {name}\n").expect("a string takes everything");
+        let (model, used) = if straight { (PINHOLE, 4) } else { (OPENCV, 8) };
+        [id, model].iter().for_each(|v| cameras.extend(v.to_le_bytes()));
+        size.iter().for_each(|v| cameras.extend(u64::from(*v).to_le_bytes()));
+        parameters[..used].iter().for_each(|v| cameras.extend(v.to_le_bytes()));
+        images.extend(id.to_le_bytes());
+        [q.w, q.x, q.y, q.z, t.x, t.y, t.z].iter().for_each(|v| images.extend(v.to_le_bytes()));
+        images.extend(id.to_le_bytes());
+        images.extend(name.bytes());
+        // The end of the name, and no observations.
+        images.extend([0; 9]);
     }
-    (cameras, images)
+    [("cameras.bin", cameras), ("images.bin", images)]
 }
 
 /// How many points are drawn where a capture has none.

@@ -147,7 +147,7 @@ pub fn decode(bytes: &[u8]) -> Result<Cloud, Error> {
         let view =
             &document["bufferViews"][document["accessors"][at]["bufferView"].as_u64().ok_or_else(missing)? as usize];
         let [first, length] = ["byteOffset", "byteLength"].map(|key| view[key].as_u64().unwrap_or(0) as usize);
-        let part = bin.get(first..first + length).ok_or_else(missing)?;
+        let part = bin.get(first..).and_then(|rest| rest.get(..length)).ok_or_else(missing)?;
         Ok(part.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect())
     };
     let of = |name: &str| floats(&format!("{EXTENSION}:{name}"));
@@ -170,12 +170,16 @@ pub fn decode(bytes: &[u8]) -> Result<Cloud, Error> {
         let [a, b, c, d] = *q;
         [a, -d, c, -b]
     };
-    Ok(Cloud {
+    let cloud = Cloud {
         position: position.as_chunks().0.iter().map(|[x, y, z]| [*x, -y, -z]).collect(),
         log_scale: of("SCALE")?.as_chunks().0.iter().map(|s: &[f32; 3]| s.map(|v| f64::from(v).ln() as f32)).collect(),
         rotation: of("ROTATION")?.as_chunks().0.iter().map(turned).collect(),
         logit: of("OPACITY")?.iter().map(|o| logit(f64::from(*o))).collect(),
         degree,
         harmonics,
-    })
+    };
+    if [cloud.log_scale.len(), cloud.rotation.len(), cloud.logit.len()] != [n; 3] {
+        return Err(broken("its attributes are not of the same number of Gaussians"));
+    }
+    Ok(cloud)
 }

@@ -68,7 +68,7 @@ pub fn decode(bytes: &[u8]) -> Result<Cloud, Error> {
     if head != header(count) {
         return Err(broken("its header is another"));
     }
-    if body.len() != count * FLOATS * 4 {
+    if count.checked_mul(FLOATS * 4) != Some(body.len()) {
         return Err(broken("it is cut off"));
     }
     let (words, _) = body.as_chunks::<4>();

@@ -28,6 +28,8 @@ const HEADER: usize = 16;
 const COLOR: f64 = 0.15;
 /// Largest magnitude of a rotation's component in the file.
 const COMPONENT: u32 = (1 << 9) - 1;
+/// Gaussians at most, 9 GB of them.
+const MOST_GAUSSIANS: usize = 1 << 27;
 /// Fractional bits at most: JavaScript readers shift a 32-bit 1 by them.
 const MOST_BITS: u32 = 24;
 
@@ -120,23 +122,29 @@ pub fn beyond_range(cloud: &Cloud) -> usize {
 /// Any other file, or one that is cut off.
 pub fn decode(bytes: &[u8]) -> Result<Cloud, Error> {
     let broken = |what: String| Error::Format(format!("not an SPZ file of version {VERSION}: {what}"));
-    let mut raw = vec![];
-    GzDecoder::new(bytes).read_to_end(&mut raw).map_err(|e| broken(e.to_string()))?;
     let cut = || broken("it is cut off".to_owned());
-    let word = |at: usize| {
-        let word = raw.get(at..at + 4).and_then(|w| <[u8; 4]>::try_from(w).ok());
-        word.map(u32::from_le_bytes).ok_or_else(cut)
-    };
-    if [word(0)?, word(4)?] != [MAGIC, VERSION] {
+    let mut unpacked = GzDecoder::new(bytes);
+    let mut header = [0; HEADER];
+    unpacked.read_exact(&mut header).map_err(|e| broken(e.to_string()))?;
+    let (words, _) = header.as_chunks::<4>();
+    let [magic, version, count, last] = std::array::from_fn(|i| u32::from_le_bytes(words[i]));
+    if [magic, version] != [MAGIC, VERSION] {
         return Err(broken("its first words are others".to_owned()));
     }
-    let n = word(8)? as usize;
-    let [degree, bits, ..] = word(12)?.to_le_bytes().map(u32::from);
+    let n = count as usize;
+    let [degree, bits, ..] = last.to_le_bytes().map(u32::from);
     if degree > 3 || bits > MOST_BITS {
         return Err(broken(format!("degree {degree} with {bits} fractional bits")));
     }
     let rest = coefficients(degree) - 1;
-    let mut at = HEADER;
+    if n > MOST_GAUSSIANS {
+        return Err(broken(format!("{n} Gaussians")));
+    }
+    // No more than it says: a small stream may go on for gigabytes.
+    let mut raw = vec![];
+    let wanted = (n * (20 + 3 * rest)) as u64;
+    unpacked.take(wanted).read_to_end(&mut raw).map_err(|e| broken(e.to_string()))?;
+    let mut at = 0;
     let mut take = |each: usize| {
         let part = raw.get(at..at + n * each).ok_or_else(cut);
         at += n * each;

@@ -7,6 +7,8 @@ use std::fs::File;
 use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
 
+use ply_rs_bw::ply::{PropertyType, ScalarType};
+
 use super::{Error, Point};
 
 /// A camera of the model, as written: the size is that of the photographs COLMAP saw.
@@ -549,6 +551,12 @@ fn ply_points(path: &Path) -> Result<Vec<Point>, Error> {
     };
     if first != "vertex" {
         return Err(invalid(format!("the PLY file begins with '{first}', it must begin with its vertices")));
+    }
+    let numbers = [ScalarType::Float, ScalarType::Double].map(PropertyType::Scalar);
+    let is_number = |name| element.properties.get(name).is_some_and(|p| numbers.contains(&p.data_type));
+    // Before anything is read: a row that is shorter than a point would let a small file become a large cloud.
+    if !["x", "y", "z"].into_iter().all(is_number) {
+        return Err(invalid("the vertices lack x, y or z as float or double".into()));
     }
     let vertices = parser.read_payload_for_element(&mut reader, element, &header).map_err(unreadable)?;
     vertices

@@ -10,7 +10,8 @@ pub struct Config {
     pub downscale: u32,
     /// Masks are 0 on the object instead of off it.
     pub invert_masks: bool,
-    /// Enlarge the train masks by a disc of this radius, in pixels at the training size. Test masks stay as they are.
+    /// Enlarge the train masks by a disc of this radius, in pixels at the training size, at most 1,024. Test masks stay as
+    /// they are.
     pub dilate_masks: u32,
     /// Where the layout has no test views, hold out the first of every `test_every` views; 0 holds out none. Held-out
     /// views show the object, so they judge the scene around it.
@@ -70,6 +71,8 @@ impl Config {
     /// Refuses values that no scene could be read with.
     pub fn validate(&self) -> Result<(), Invalid> {
         ensure(self.downscale > 0, "downscale", self.downscale, "must be at least 1")?;
+        let most = MOST_DILATION;
+        ensure(self.dilate_masks <= most, "dilate_masks", self.dilate_masks, format!("must be at most {most} pixels"))?;
         let unit = self.unit;
         ensure(
             unit == 0.0 || (1e-30..=1e30).contains(&unit),
@@ -87,6 +90,9 @@ impl Config {
         ensure(self.rim <= 64, "rim", self.rim, "must be at most 64 pixels")
     }
 }
+
+/// Largest [`Config::dilate_masks`]: a mask that needs more is none of the object.
+const MOST_DILATION: u32 = 1024;
 
 /// What [`Config::truth_prior`] says for no prior.
 pub(super) const NO_PRIOR: &str = "none";

@@ -1,12 +1,12 @@
 //! Which file is what: the folder layouts found in circulation, told apart by the folders they have.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use super::{Error, PriorKind, priors};
 
 /// Extensions of pictures and masks, lower case.
-pub(super) const PICTURES: [&str; 3] = ["png", "jpg", "jpeg"];
+pub(crate) const PICTURES: [&str; 3] = ["png", "jpg", "jpeg"];
 
 /// SPIn-NeRF's split of its 100 sorted pictures: the first 40 are test views, and the reference is number 29 of the rest.
 const SPIN_PICTURES: usize = 100;
@@ -94,11 +94,13 @@ fn image_folder<'a>(scene: &Path, names: &[&'a str]) -> Result<&'a str, Error> {
 
 fn plain(scene: &Path) -> Result<Layout, Error> {
     let folder = image_folder(scene, &["images", "images_2", "images_4", "images_8"])?;
-    let (images, test_images) = (index(&scene.join(folder), &PICTURES)?, index(&scene.join("test_images"), &PICTURES)?);
+    let mut passed_over = vec![];
+    let mut index = |folder: &str, extensions: &[&str]| index(&scene.join(folder), extensions, &mut passed_over);
+    let (images, test_images) = (index(folder, &PICTURES)?, index("test_images", &PICTURES)?);
     if images.is_empty() {
         return Err(Error::NoImages { scene: scene.to_path_buf() });
     }
-    let (masks, test_masks) = (index(&scene.join("masks"), &PICTURES)?, index(&scene.join("test_masks"), &PICTURES)?);
+    let (masks, test_masks) = (index("masks", &PICTURES)?, index("test_masks", &PICTURES)?);
     let kind = match (scene.join("depth").is_dir(), scene.join("disparity").is_dir()) {
         (true, true) => {
             let what = "depth/ and disparity/ are both there; keep the one to train with".into();
@@ -109,15 +111,16 @@ fn plain(scene: &Path) -> Result<Layout, Error> {
         (false, false) => None,
     };
     let priors = match kind {
-        Some(kind) => index(&scene.join(kind.folder()), &priors::EXTENSIONS)?,
+        Some(kind) => index(kind.folder(), &priors::EXTENSIONS)?,
         None => Index::new(),
     };
     let train = entries(&images, |name| masks.get(name).cloned(), |name| Some((priors.get(name)?.clone(), kind?)));
     let prior = |name: &String| Some((priors.get(name)?.clone(), kind?));
     let mut test = entries(&test_images, |name| test_masks.get(name).cloned(), prior);
-    let depths = index(&scene.join("test_depth"), &priors::EXTENSIONS)?;
+    let depths = index("test_depth", &priors::EXTENSIONS)?;
     test.iter_mut().for_each(|entry| entry.depth = depths.get(&entry.name).cloned());
     let mut notes = misspelt(scene)?;
+    notes.append(&mut passed_over);
     let of_test =
         [("masks", &masks, &images), ("test_masks", &test_masks, &test_images), ("test_depth", &depths, &test_images)];
     for (what, files, pictures) in of_test {
@@ -138,7 +141,7 @@ const FOLDERS: [&str; 9] =
 
 /// Notes on folders that are called nearly like one that is not there.
 fn misspelt(scene: &Path) -> Result<Vec<String>, Error> {
-    let folders = list(scene)?.into_iter().filter(|(path, _)| path.is_dir()).map(|(_, name)| name);
+    let folders = list(scene, &mut vec![])?.into_iter().filter(|(path, _)| path.is_dir()).map(|(_, name)| name);
     let near = |name: &str| {
         let missing = FOLDERS.into_iter().filter(|known| !scene.join(known).is_dir());
         missing.map(|known| (strsim::damerau_levenshtein(name, known), known)).filter(|(d, _)| *d <= 2).min()
@@ -162,8 +165,9 @@ fn strays(what: &str, files: &Index, pictures: &Index) -> Option<String> {
 
 fn spin_nerf(scene: &Path, folder: &str) -> Result<Layout, Error> {
     let images = scene.join(folder);
-    let masks = index(&images.join("label"), &PICTURES)?;
-    let test_masks = index(&images.join("test_label"), &PICTURES)?;
+    let mut passed_over = vec![];
+    let masks = index(&images.join("label"), &PICTURES, &mut passed_over)?;
+    let test_masks = index(&images.join("test_label"), &PICTURES, &mut passed_over)?;
     let split = spin_split(scene, &images, |name| masks.contains_key(name))?;
     let train = entries(&split.train, |name| masks.get(name).cloned(), |_| None);
     // Test masks are numbered in the order of the sorted pictures.
@@ -178,7 +182,7 @@ fn spin_nerf(scene: &Path, folder: &str) -> Result<Layout, Error> {
         test,
         references,
         kind: None,
-        notes: split.notes.into_iter().chain(note).collect(),
+        notes: split.notes.into_iter().chain(note).chain(passed_over).collect(),
         tall_test_mask: Some(SPIN_TALL_MASK),
     })
 }
@@ -187,18 +191,20 @@ fn gscream_copy(scene: &Path, by: &str) -> Result<Layout, Error> {
     let folder = image_folder(scene, &["images_4", "images", "images_2", "images_8"])?;
     let images = scene.join(folder);
     let mut masks = Index::new();
+    let mut passed_over = vec![];
+    let mut index = |folder: PathBuf, extensions: &[&str]| index(&folder, extensions, &mut passed_over);
     for at in [scene.join("lama_input"), images.join("lama_input")] {
-        let files = index(&at, &PICTURES)?;
+        let files = index(at, &PICTURES)?;
         masks
             .extend(files.into_iter().filter_map(|(name, path)| Some((name.strip_suffix("_mask")?.to_string(), path))));
     }
     // Copies that kept SPIn-NeRF's own masks.
-    for (name, path) in index(&images.join("label"), &PICTURES)? {
+    for (name, path) in index(images.join("label"), &PICTURES)? {
         masks.entry(name).or_insert(path);
     }
-    let test_masks = index(&images.join("mask_test"), &PICTURES)?;
-    let numbered = index(&images.join("test_label"), &PICTURES)?;
-    let depth = index(&scene.join("marigold_output/depth_npy"), &["npy"])?;
+    let test_masks = index(images.join("mask_test"), &PICTURES)?;
+    let numbered = index(images.join("test_label"), &PICTURES)?;
+    let depth = index(scene.join("marigold_output/depth_npy"), &["npy"])?;
     let depth: Index =
         depth.into_iter().map(|(name, path)| (name.strip_suffix("_pred").unwrap_or(&name).to_string(), path)).collect();
     let split = spin_split(scene, &images, |name| masks.contains_key(name) && !test_masks.contains_key(name))?;
@@ -209,7 +215,7 @@ fn gscream_copy(scene: &Path, by: &str) -> Result<Layout, Error> {
         |name: &String| test_masks.get(name).or_else(|| numbered.get(&format!("out_{:05}", position[name]))).cloned();
     let test = entries(&split.test, test_mask, prior);
     let (mut references, note) = spin_reference(scene, &images, &train, split.reference.as_deref())?;
-    let mut notes: Vec<String> = split.notes.into_iter().chain(note).collect();
+    let mut notes: Vec<String> = split.notes.into_iter().chain(note).chain(passed_over).collect();
     for files in &mut references {
         let Some((path, kind)) = prior(&files.name).filter(|_| files.prior.is_none()) else { continue };
         notes.push(format!(
@@ -240,7 +246,8 @@ struct Split {
 
 /// The benchmark's split by position where all 100 pictures are there, else by which pictures have a train mask.
 fn spin_split(scene: &Path, images: &Path, has_train_mask: impl Fn(&str) -> bool) -> Result<Split, Error> {
-    let mut all = index_flat(images, &PICTURES)?;
+    let mut notes = vec![];
+    let mut all = index_flat(images, &PICTURES, &mut notes)?;
     // A single inpainted picture beside the photographs is not one of them.
     all.remove("reference");
     if all.is_empty() {
@@ -250,15 +257,15 @@ fn spin_split(scene: &Path, images: &Path, has_train_mask: impl Fn(&str) -> bool
         let reference = all.keys().nth(SPIN_REFERENCE).cloned();
         let first_train = all.keys().nth(SPIN_TEST).cloned().expect("there are 100 names");
         let train = all.split_off(&first_train);
-        let notes = vec![format!("the first {SPIN_TEST} of {SPIN_PICTURES} sorted names are test views")];
+        notes.push(format!("the first {SPIN_TEST} of {SPIN_PICTURES} sorted names are test views"));
         return Ok(Split { train, test: all, reference, notes });
     }
     let count = all.len();
     let (train, test): (Index, Index) = all.into_iter().partition(|(name, _)| has_train_mask(name));
-    let notes = vec![format!(
+    notes.push(format!(
         "{count} pictures instead of {SPIN_PICTURES}: the {} with a train mask are train views, the others test views",
         train.len()
-    )];
+    ));
     Ok(Split { train, test, reference: None, notes })
 }
 
@@ -314,7 +321,7 @@ fn references(folder: &Path, train: &[Entry]) -> Result<Vec<ReferenceFiles>, Err
     let kinds = [PriorKind::Depth, PriorKind::Disparity];
     let suffixed = |name: &str| kinds.into_iter().any(|k| name.ends_with(k.suffix()));
     let known = |name: &str| train.iter().any(|e| e.name == name);
-    let mut pictures = index(folder, &PICTURES)?;
+    let mut pictures = index(folder, &PICTURES, &mut vec![])?;
     pictures.retain(|name, _| known(name) || !suffixed(name));
     let all = pictures.into_iter().map(|(name, image)| {
         if !known(&name) {
@@ -389,26 +396,70 @@ pub(crate) fn stem(name: &str) -> &str {
     stem
 }
 
+/// Folders within one another that are looked into. Real ones end long before; it is a chain of links that may not.
+const DEEPEST: usize = 32;
+
 /// The files of `folder` and of the folders below it that have one of `extensions`. A missing folder is an empty one.
-pub(super) fn index(folder: &Path, extensions: &[&str]) -> Result<Index, Error> {
+///
+/// Links to folders are followed, but no folder is looked into twice, nor one that `folder` lies in: its files would be
+/// there several times, under names to which nothing else belongs. `passed_over` gets a sentence on each such link and on
+/// names that are no text.
+pub(super) fn index(folder: &Path, extensions: &[&str], passed_over: &mut Vec<String>) -> Result<Index, Error> {
     let mut out = Index::new();
-    let mut pending = vec![(folder.to_path_buf(), String::new())];
-    while let Some((at, prefix)) = pending.pop() {
-        for (path, name) in list(&at)? {
-            if path.is_dir() {
-                pending.push((path, format!("{prefix}{name}/")));
+    let canonical = |path: &Path| path.canonicalize().map_err(|source| Error::Io { path: path.to_path_buf(), source });
+    if !folder.is_dir() {
+        return Ok(out);
+    }
+    let mut seen: BTreeSet<PathBuf> = canonical(folder)?.ancestors().map(Path::to_path_buf).collect();
+    // Real folders before links, and links by name, so that it is never a real folder of `folder` that counts as the second.
+    let mut folders = vec![(folder.to_path_buf(), String::new())];
+    let mut links: BTreeSet<(PathBuf, String)> = BTreeSet::new();
+    loop {
+        let Some((at, prefix)) = folders.pop() else {
+            let Some((path, prefix)) = links.pop_first() else { return Ok(out) };
+            let target = canonical(&path)?;
+            if prefix.matches('/').count() <= DEEPEST && seen.insert(target.clone()) {
+                folders.push((path, prefix));
             } else {
-                insert(&mut out, path, format!("{prefix}{name}"), extensions)?;
+                passed_over.push(looked_into_already(&path, &target));
+            }
+            continue;
+        };
+        for (path, name) in list(&at, passed_over)? {
+            match std::fs::metadata(&path) {
+                Ok(what) if what.is_dir() && path.is_symlink() => {
+                    links.insert((path, format!("{prefix}{name}/")));
+                }
+                Ok(what) if what.is_dir() => {
+                    let target = canonical(&path)?;
+                    if seen.insert(target.clone()) {
+                        folders.push((path, format!("{prefix}{name}/")));
+                    } else {
+                        // It lies behind a link.
+                        passed_over.push(looked_into_already(&path, &target));
+                    }
+                }
+                // Neither a pipe nor a device is a picture, and reading one may never end.
+                Ok(what) if !what.is_file() => {}
+                // A link to nothing is refused where it is read.
+                _ => insert(&mut out, path, format!("{prefix}{name}"), extensions)?,
             }
         }
     }
-    Ok(out)
+}
+
+fn looked_into_already(path: &Path, target: &Path) -> String {
+    format!(
+        "{} is not looked into: it leads to {}, which is read under another name or holds this folder; remove the link",
+        path.display(),
+        target.display()
+    )
 }
 
 /// Like [`index`], without the folders below.
-fn index_flat(folder: &Path, extensions: &[&str]) -> Result<Index, Error> {
+fn index_flat(folder: &Path, extensions: &[&str], passed_over: &mut Vec<String>) -> Result<Index, Error> {
     let mut out = Index::new();
-    for (path, name) in list(folder)? {
+    for (path, name) in list(folder, passed_over)? {
         if path.is_file() {
             insert(&mut out, path, name, extensions)?;
         }
@@ -416,8 +467,8 @@ fn index_flat(folder: &Path, extensions: &[&str]) -> Result<Index, Error> {
     Ok(out)
 }
 
-/// Visible entries of a folder; none if there is no such folder.
-fn list(folder: &Path) -> Result<Vec<(PathBuf, String)>, Error> {
+/// Visible entries of a folder; none if there is no such folder. `passed_over` gets a sentence on names that are no text.
+fn list(folder: &Path, passed_over: &mut Vec<String>) -> Result<Vec<(PathBuf, String)>, Error> {
     let failed = |source| Error::Io { path: folder.to_path_buf(), source };
     if !folder.is_dir() {
         return Ok(Vec::new());
@@ -425,9 +476,10 @@ fn list(folder: &Path) -> Result<Vec<(PathBuf, String)>, Error> {
     let mut out = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(failed)? {
         let path = entry.map_err(failed)?.path();
-        if let Some(name) = path.file_name().and_then(|n| n.to_str()).filter(|n| !n.starts_with('.')) {
-            let name = name.to_string();
-            out.push((path, name));
+        match path.file_name().and_then(|n| n.to_str()).map(str::to_owned) {
+            Some(name) if name.starts_with('.') => {}
+            Some(name) => out.push((path, name)),
+            None => passed_over.push(format!("{} is not read: its name is not UTF-8; rename it", path.display())),
         }
     }
     Ok(out)

@@ -24,7 +24,9 @@ mod condition;
 mod config;
 mod error;
 mod layout;
+mod npy;
 pub mod path;
+mod picture;
 mod priors;
 pub(crate) mod resample;
 pub mod synthetic;
@@ -32,7 +34,7 @@ pub mod synthetic;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use image::{DynamicImage, GrayImage, RgbImage};
+use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 
 pub use camera::{Camera, distort, undistort};
@@ -40,8 +42,10 @@ pub use condition::{condition, footprint};
 pub use config::Config;
 use config::{NO_PRIOR, STEREO_PRIOR};
 pub use error::Error;
-pub(crate) use layout::stem;
+pub(crate) use layout::{PICTURES, stem};
+pub use picture::{decode, dimensions, object_mask};
 pub(crate) use priors::rank_correlation;
+pub use priors::read as read_prior;
 pub use priors::{Prior, PriorKind, in_own_range, own_range};
 
 /// A photograph at the training resolution and what is known about it.
@@ -568,23 +572,23 @@ struct Reader<'a> {
 impl Reader<'_> {
     fn view(&self, entry: &layout::Entry, poses: &Poses) -> Result<Loaded, Error> {
         let (pose, intrinsics) = poses.find(&entry.name).expect("views without a pose were left out");
-        let image = decode(&entry.image)?.into_rgb8();
-        let picture = [image.width(), image.height()];
+        let picture = dimensions(&entry.image)?;
         if !same_proportions(picture, intrinsics.size) {
             return Err(Error::ImageSize { path: entry.image.clone(), size: picture, camera: intrinsics.size });
         }
+        let image = decode(&entry.image)?.into_rgb8();
         let size = picture.map(|n| reduced(n, self.config.downscale));
         let image = if size == picture { image } else { resample::photograph(&image, size) };
         let mut stretched_mask = false;
         let mask = match &entry.mask {
             None => None,
             Some(path) => {
+                let found = dimensions(path)?;
+                if found != picture && (self.tall_mask)(entry) != Some((found, picture)) {
+                    return Err(Error::MaskSize { path: path.clone(), size: found, picture });
+                }
                 let mut mask = object_mask(path, self.config.invert_masks)?;
-                let found = [mask.width(), mask.height()];
                 if found != picture {
-                    if (self.tall_mask)(entry) != Some((found, picture)) {
-                        return Err(Error::MaskSize { path: path.clone(), size: found, picture });
-                    }
                     mask = resample::nearest(&mask, picture);
                     stretched_mask = true;
                 }
@@ -629,35 +633,15 @@ fn same_proportions(picture: [u32; 2], calibrated: [u32; 2]) -> bool {
     x.0.max(y.0) <= x.1.min(y.1)
 }
 
-/// Decodes a picture by its content, whatever its extension says.
-pub(crate) fn decode(path: &Path) -> Result<DynamicImage, Error> {
-    let io = |source| Error::Io { path: path.to_path_buf(), source };
-    let reader = image::ImageReader::open(path).map_err(io)?.with_guessed_format().map_err(io)?;
-    reader.decode().map_err(|source| Error::Picture { path: path.to_path_buf(), source })
-}
-
-/// A mask as 0 and 255. Object is whatever is not 0 in some colour channel; JPEG, which does not keep zeros, from 128 on.
-fn object_mask(path: &Path, invert: bool) -> Result<GrayImage, Error> {
-    let image = decode(path)?;
-    let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default();
-    let lossy = extension.eq_ignore_ascii_case("jpg") || extension.eq_ignore_ascii_case("jpeg");
-    let (w, h) = (image.width(), image.height());
-    // 16 bits, so that no small value is rounded to 0.
-    let threshold = if lossy { 128 * 257 } else { 1 };
-    let raw = image
-        .into_rgb16()
-        .pixels()
-        .map(|p| if p.0.iter().any(|v| *v >= threshold) != invert { 255 } else { 0 })
-        .collect();
-    Ok(GrayImage::from_raw(w, h, raw).expect("one value per pixel"))
-}
-
 /// The pictures in a folder and in the folders below it, by their path below `folder` without extension.
 pub(crate) fn pictures(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Error> {
     if !folder.is_dir() {
         return Err(Error::File { path: folder.to_path_buf(), what: "there is no such folder".into() });
     }
-    layout::index(folder, &layout::PICTURES)
+    let mut passed_over = vec![];
+    let found = layout::index(folder, &PICTURES, &mut passed_over)?;
+    passed_over.iter().for_each(|line| log::warn!("{line}"));
+    Ok(found)
 }
 
 /// Longer side of the first picture of a scene, pixels; `None` where there is none that can be read.
@@ -672,7 +656,7 @@ pub(crate) fn depth_maps(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Err
     if !folder.is_dir() {
         return Err(Error::File { path: folder.to_path_buf(), what: "there is no such folder".into() });
     }
-    layout::index(folder, &priors::EXTENSIONS)
+    layout::index(folder, &priors::EXTENSIONS, &mut vec![])
 }
 
 /// A picture at 1 / `downscale` of its size, reduced as [`load`] reduces photographs.
@@ -718,11 +702,11 @@ fn read_reference(
     picture: [u32; 2],
     kind: Option<PriorKind>,
 ) -> Result<(Reference, Option<String>), Error> {
-    let image = decode(&files.image)?.into_rgb8();
-    let found = [image.width(), image.height()];
+    let found = dimensions(&files.image)?;
     if found != picture {
         return Err(Error::ReferenceSize { path: files.image.clone(), size: found, picture });
     }
+    let image = decode(&files.image)?.into_rgb8();
     let mask = view.mask.as_ref().expect("a reference view without a mask was refused");
     if mask.as_raw().iter().all(|v| *v == 0) {
         let path = entry.mask.clone().unwrap_or_else(|| files.image.clone());

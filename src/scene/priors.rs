@@ -2,10 +2,10 @@
 
 use std::path::Path;
 
-use image::DynamicImage;
-use ndarray::ArrayD;
-use ndarray_npy::{ReadNpyError, ReadableElement, read_npy};
+use exr::meta::MetaData;
 
+use super::npy::{self, Map};
+use super::picture::{self, MAX_PIXELS, MOST_GROWTH};
 use super::{Error, resample};
 
 /// What the values of a prior mean, up to an unknown positive scale and a shift.
@@ -87,11 +87,8 @@ impl Prior {
 /// File extensions read here, lower case.
 pub(super) const EXTENSIONS: [&str; 3] = ["npy", "exr", "png"];
 
-/// A prior as stored: row-major values and (width, height).
-struct Map {
-    values: Vec<f32>,
-    size: [u32; 2],
-}
+/// Bytes of the largest OpenEXR picture that is read, over all its channels.
+const MAX_EXR_BYTES: u64 = 8 * MAX_PIXELS;
 
 /// Reads a prior and brings it to `size`, for a picture whose own size is `picture`.
 ///
@@ -101,7 +98,7 @@ struct Map {
 ///
 /// # Errors
 /// Unreadable files, infinite values, other proportions than the picture's.
-pub(super) fn read(path: &Path, kind: PriorKind, picture: [u32; 2], size: [u32; 2]) -> Result<Prior, Error> {
+pub fn read(path: &Path, kind: PriorKind, picture: [u32; 2], size: [u32; 2]) -> Result<Prior, Error> {
     let map = stored(path, picture)?;
     if let Some(at) = map.values.iter().position(|v| v.is_infinite()) {
         let (row, column) = (at / map.size[0] as usize, at % map.size[0] as usize);
@@ -130,51 +127,61 @@ pub(super) fn nearest(path: &Path, picture: [u32; 2], size: [u32; 2]) -> Result<
 /// A file's values, whose proportions are those of `picture` within 1 %.
 fn stored(path: &Path, picture: [u32; 2]) -> Result<Map, Error> {
     let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
-    let map = match extension.as_str() {
-        "npy" => npy(path),
-        "exr" => exr(path),
-        _ => png(path),
-    }?;
-    let [w, h] = map.size.map(f64::from);
-    let proportion = (w / h) / (f64::from(picture[0]) / f64::from(picture[1]));
-    if (proportion - 1.0).abs() > 0.01 {
-        return Err(Error::PriorSize { path: path.to_path_buf(), size: map.size, picture });
+    let fits = |size: [u32; 2]| {
+        let [w, h] = size.map(f64::from);
+        let proportion = (w / h) / (f64::from(picture[0]) / f64::from(picture[1]));
+        let off = (proportion - 1.0).abs() > 0.01;
+        if off { Err(Error::PriorSize { path: path.to_path_buf(), size, picture }) } else { Ok(()) }
+    };
+    match extension.as_str() {
+        "npy" => {
+            let map = npy::read(path)?;
+            fits(map.size)?;
+            Ok(map)
+        }
+        "exr" => {
+            fits(exr_size(path)?)?;
+            exr(path)
+        }
+        _ => {
+            fits(picture::dimensions(path)?)?;
+            png(path)
+        }
     }
-    Ok(map)
 }
 
 fn invalid(path: &Path, what: impl std::fmt::Display) -> Error {
     Error::File { path: path.to_path_buf(), what: what.to_string() }
 }
 
-fn npy(path: &Path) -> Result<Map, Error> {
-    /// `None` if the file holds another element type.
-    fn typed<T: ReadableElement + Copy>(path: &Path, value: impl Fn(T) -> f32) -> Result<Option<Map>, Error> {
-        let array: ArrayD<T> = match read_npy(path) {
-            Ok(array) => array,
-            Err(ReadNpyError::WrongDescriptor(_)) => return Ok(None),
-            Err(ReadNpyError::Io(source)) => return Err(Error::Io { path: path.to_path_buf(), source }),
-            Err(e) => return Err(invalid(path, format!("not a readable NumPy array: {e}"))),
-        };
-        // Networks leave batch and channel axes of length 1 around the map.
-        let sides: Vec<usize> = array.shape().iter().copied().filter(|n| *n != 1).collect();
-        let &[h, w] = sides.as_slice() else {
-            return Err(invalid(path, format!("the array's shape is {:?}, it must be rows x columns", array.shape())));
-        };
-        let size = [w, h].map(|n| u32::try_from(n).unwrap_or(0));
-        if size.contains(&0) {
-            return Err(invalid(path, format!("the array's shape is {:?}", array.shape())));
+/// Width and height of an OpenEXR picture's first layer, whose headers are held against the file's length.
+fn exr_size(path: &Path) -> Result<[u32; 2], Error> {
+    let unreadable = |e: exr::error::Error| invalid(path, format!("not a readable OpenEXR picture: {e}"));
+    let length = std::fs::metadata(path).map_err(|source| Error::Io { path: path.to_path_buf(), source })?.len();
+    let meta = MetaData::read_from_file(path, false).map_err(unreadable)?;
+    for header in &meta.headers {
+        let [w, h] = [header.layer_size.0, header.layer_size.1].map(|n| n as u64);
+        let pixels = w.saturating_mul(h);
+        if !(1..=MAX_PIXELS).contains(&pixels) {
+            return Err(invalid(path, format!("the OpenEXR picture is {w}x{h}; a map has 1 to {MAX_PIXELS} values")));
         }
-        // `iter` walks in logical (row-major) order whatever the order in memory.
-        Ok(Some(Map { values: array.iter().map(|v| value(*v)).collect(), size }))
+        let bytes = pixels.saturating_mul(header.channels.bytes_per_pixel as u64);
+        if bytes > MAX_EXR_BYTES {
+            let count = header.channels.list.len();
+            return Err(invalid(
+                path,
+                format!("the OpenEXR picture is {w}x{h} with {count} channels; keep the one that is depth"),
+            ));
+        }
+        if bytes > length.saturating_mul(MOST_GROWTH) {
+            let what =
+                format!("the OpenEXR picture is said to be {w}x{h}, which {length} bytes cannot hold; copy it again");
+            return Err(invalid(path, what));
+        }
     }
-    let read = typed::<f32>(path, |v| v)?
-        .map_or_else(|| typed::<f64>(path, |v| v as f32), |m| Ok(Some(m)))?
-        .map_or_else(|| typed::<u8>(path, f32::from), |m| Ok(Some(m)))?
-        .map_or_else(|| typed::<u16>(path, f32::from), |m| Ok(Some(m)))?;
-    read.ok_or_else(|| {
-        invalid(path, "the array's type must be float32, float64, uint8 or uint16; save it with `.astype('float32')`")
-    })
+    let first = meta.headers.first().ok_or_else(|| invalid(path, "the OpenEXR picture is empty"))?;
+    // At most 2^28 pixels, so that each side fits.
+    Ok([first.layer_size.0 as u32, first.layer_size.1 as u32])
 }
 
 fn exr(path: &Path) -> Result<Map, Error> {
@@ -189,32 +196,28 @@ fn exr(path: &Path) -> Result<Map, Error> {
         .or_else(|| channels.first())
         .ok_or_else(|| invalid(path, "the OpenEXR picture has no channels"))?;
     let size = [layer.size.0, layer.size.1].map(|n| u32::try_from(n).unwrap_or(0));
-    if size.contains(&0) {
-        return Err(invalid(path, "the OpenEXR picture is empty"));
+    let values: Vec<f32> = channel.sample_data.values_as_f32().collect();
+    if values.is_empty() || values.len() as u64 != u64::from(size[0]) * u64::from(size[1]) {
+        return Err(invalid(path, "the OpenEXR picture has a channel of another size than its own; save one channel"));
     }
-    Ok(Map { values: channel.sample_data.values_as_f32().collect(), size })
+    Ok(Map { values, size })
 }
 
 fn png(path: &Path) -> Result<Map, Error> {
-    let image = super::decode(path)?;
+    let image = picture::decode(path)?;
     let size = [image.width(), image.height()];
-    let grey = |channels: &[f32]| channels[0] == channels[1] && channels[1] == channels[2];
-    let values = match image {
-        DynamicImage::ImageLuma8(i) => i.as_raw().iter().map(|v| f32::from(*v) / 255.0).collect(),
-        DynamicImage::ImageLumaA8(i) => i.pixels().map(|p| f32::from(p.0[0]) / 255.0).collect(),
-        DynamicImage::ImageLuma16(i) => i.as_raw().iter().map(|v| f32::from(*v) / 65535.0).collect(),
-        DynamicImage::ImageLumaA16(i) => i.pixels().map(|p| f32::from(p.0[0]) / 65535.0).collect(),
-        other => {
-            let rgb = other.into_rgb32f();
-            if !rgb.pixels().all(|p| grey(&p.0)) {
-                return Err(invalid(
-                    path,
-                    "a prior is one grey channel, this is a colour picture; save the values, not a colour map",
-                ));
-            }
-            rgb.pixels().map(|p| p.0[0]).collect()
-        }
-    };
+    fn grey<T: Copy + PartialEq>(colors: &[T]) -> Option<T> {
+        colors.iter().all(|v| *v == colors[0]).then_some(colors[0])
+    }
+    let values = picture::by_pixel(
+        &image,
+        |colors| grey(colors).map(|v| f32::from(v) / 255.0),
+        |colors| grey(colors).map(|v| f32::from(v) / 65535.0),
+    );
+    let values: Option<Vec<f32>> = values.into_iter().collect();
+    let values = values.ok_or_else(|| {
+        invalid(path, "a prior is one grey channel, this is a colour picture; save the values, not a colour map")
+    })?;
     Ok(Map { values, size })
 }
 
