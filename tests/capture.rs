@@ -4,9 +4,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use assert_cmd::cargo::cargo_bin_cmd;
+use gscream_vk::capture::doctor::{self, Severity};
 use gscream_vk::capture::{self, Evidence, Request, Step, Watch};
 use gscream_vk::gpu::testing;
-use gscream_vk::scene::{self, Camera, synthetic};
+use gscream_vk::scene::{self, Camera, Scene, synthetic};
 use image::{GrayImage, Luma, Rgb, RgbImage};
 use tempfile::TempDir;
 
@@ -553,7 +554,7 @@ fn the_doctor_tells_right_from_wrong() {
     RgbImage::from_fn(112, 84, |x, y| image::Rgb(bright.get_pixel(x, y).0.map(|v| (f64::from(v) * 0.7) as u8)))
         .save(&dark)
         .expect("a writable folder");
-    problems(&["1 of 10 photographs differ in brightness", "most: train_003"]);
+    problems(&["1 of 10 photographs show the same points brighter or darker", "most: train_003"]);
     bright.save(&dark).expect("a writable folder");
     // A reference that was moved, and one that still shows the object.
     let reference = at.join("full/reference/train_005.png");
@@ -571,4 +572,142 @@ fn the_doctor_tells_right_from_wrong() {
         mask.save(&path).expect("a writable folder");
     }
     problems(&["they seem to be 0 on the object"]);
+}
+
+/// Scenes whose cameras, points and photographs have nothing to do with each other: RELIABILITY's dozen.
+#[test]
+fn the_doctor_finds_senseless_scenes() {
+    let folder = capture();
+    let whole = scene::load(&folder.path().join("full"), &scene::Config::default()).expect("a scene");
+    let problems = |scene: &Scene| {
+        let report = doctor::look(scene);
+        let found = report.findings.into_iter().filter(|f| f.severity == Severity::Problem);
+        found.map(|f| f.message).collect::<Vec<String>>()
+    };
+    assert_eq!(problems(&whole), Vec::<String>::new());
+    let shares = |scene: &Scene| {
+        let of =
+            |view: &doctor::ViewFigures| [view.points_in_front, view.points_in_picture].map(|s| s.expect("a share"));
+        doctor::look(scene).views.iter().map(of).collect::<Vec<[f64; 2]>>()
+    };
+    assert!(shares(&whole).iter().all(|[front, inside]| *front == 1.0 && *inside > 0.3), "{:?}", shares(&whole));
+
+    type Change = fn(&mut Scene);
+    fn cameras(scene: &mut Scene, change: impl Fn(usize, &mut Camera)) {
+        scene.train.iter_mut().enumerate().for_each(|(i, view)| change(i, &mut view.camera));
+    }
+    fn points(scene: &mut Scene, change: impl Fn(usize, [f32; 3]) -> [f32; 3]) {
+        scene.points.iter_mut().enumerate().for_each(|(i, point)| point.position = change(i, point.position));
+    }
+    /// The camera at another place, looking as it did.
+    fn moved(camera: &mut Camera, center: [f64; 3]) {
+        camera.translation = Camera::translation_to(&camera.rotation, center);
+    }
+    let apart = "do not belong together";
+    let cases: [(&str, Change, &str); 13] = [
+        (
+            "points behind all cameras",
+            |s| {
+                let mean: [f64; 3] = std::array::from_fn(|i| {
+                    s.train.iter().map(|v| v.camera.center()[i]).sum::<f64>() / s.train.len() as f64
+                });
+                points(s, |_, p| std::array::from_fn(|i| (2.0 * mean[i] - f64::from(p[i])) as f32));
+            },
+            apart,
+        ),
+        ("points in one place", |s| points(s, |_, _| [0.1, 0.2, 0.3]), "all points stand at one place"),
+        ("points far beside the cameras", |s| points(s, |_, p| [p[0] + 1e4, p[1], p[2]]), apart),
+        ("points in another unit", |s| points(s, |_, p| p.map(|x| 1e5 * x)), ""),
+        ("focal length 1e38", |s| cameras(s, |_, c| c.focal = [1e38; 2]), "its focal length is"),
+        ("focal length 1e-38", |s| cameras(s, |_, c| c.focal = [1e-38; 2]), "its focal length is"),
+        ("principal point 1e38", |s| cameras(s, |_, c| c.principal = [1e38; 2]), "its principal point lies"),
+        (
+            "distortion 1e38",
+            |s| cameras(s, |_, c| c.distortion = [1e38, 0.0, 0.0, 0.0]),
+            "a coefficient of its lens is",
+        ),
+        ("folded distortion", |s| cameras(s, |_, c| c.distortion = [0.0, 0.0, 900.0, 900.0]), apart),
+        (
+            "cameras 1e6 apart",
+            |s| {
+                cameras(s, |i, c| moved(c, [1e6 * i as f64, 1e6 * (i * i % 7) as f64, -1e6 * (i % 3) as f64]));
+            },
+            "",
+        ),
+        (
+            "cameras in one place",
+            |s| {
+                let place = s.train[0].camera.center();
+                cameras(s, |_, c| moved(c, place));
+            },
+            "all cameras stand at one place",
+        ),
+        (
+            "cameras looking away",
+            |s| {
+                cameras(s, |_, c| {
+                    let center = c.center();
+                    for row in [0, 2] {
+                        c.rotation[row] = c.rotation[row].map(|v| -v);
+                    }
+                    moved(c, center);
+                })
+            },
+            apart,
+        ),
+        (
+            "one camera looking away",
+            |s| {
+                let c = &mut s.train[2].camera;
+                let center = c.center();
+                for row in [0, 2] {
+                    c.rotation[row] = c.rotation[row].map(|v| -v);
+                }
+                moved(c, center);
+            },
+            "1 of 10 photographs have no point in the picture (first: train_002)",
+        ),
+    ];
+    for (what, change, says) in cases {
+        let mut scene = whole.clone();
+        change(&mut scene);
+        let found = problems(&scene);
+        assert!(!found.is_empty() && found.iter().any(|line| line.contains(says)), "{what}: {found:?}");
+    }
+}
+
+/// Focal lengths that are none in float32 are refused on reading.
+#[test]
+fn a_focal_length_that_vanishes_is_refused() {
+    let folder = capture();
+    let cameras = folder.path().join("full/sparse/0/cameras.bin");
+    let whole = fs::read(&cameras).expect("a model");
+    // The first parameter follows 8 bytes of count, 4 of id, 4 of model and 16 of size.
+    for focal in [1e-44, 1e-200, 1e39, -5.0, f64::NAN] {
+        let mut bytes = whole.clone();
+        bytes[32..40].copy_from_slice(&f64::to_le_bytes(focal));
+        fs::write(&cameras, bytes).expect("a writable folder");
+        let outcome = run(folder.path(), "doctor full");
+        assert_eq!(outcome.code, 1, "{focal}: {}{}", outcome.stdout, outcome.stderr);
+        assert!(outcome.stdout.contains("cameras.bin: camera 1: "), "{focal}: {}", outcome.stdout);
+    }
+}
+
+/// Real captures, where they are at hand: nothing is wrong but what is.
+#[test]
+fn the_doctor_passes_clean_captures() {
+    for (name, problem) in [("spin-1", None), ("fern", None), ("bonsai", Some("DSCF5698"))] {
+        let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
+        let dir = std::env::var_os("GSCREAM_DATA").map_or(data, PathBuf::from).join(name);
+        if !dir.is_dir() {
+            continue;
+        }
+        let (report, _) = doctor::examine(&dir, None).expect("it can be read");
+        let problems = report.findings.iter().filter(|f| f.severity == Severity::Problem);
+        let problems: Vec<&str> = problems.map(|f| f.message.as_str()).collect();
+        match problem {
+            None => assert_eq!(problems, Vec::<&str>::new(), "{name}"),
+            Some(says) => assert!(problems.len() == 1 && problems[0].starts_with(says), "{name}: {problems:?}"),
+        }
+    }
 }

@@ -7,7 +7,7 @@ mod skip;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use gscream_vk::scene::{self, Camera, Config, Error, PriorKind, Scene, synthetic};
+use gscream_vk::scene::{self, Camera, Config, Error, Note, PriorKind, Scene, synthetic};
 use image::{GrayImage, Luma, Rgb, RgbImage};
 use ndarray::Array2;
 use skip::{Lack, skip};
@@ -648,7 +648,7 @@ fn contradictions_are_refused() {
     SCENE: no pictures in images/; put the photographs (.jpg or .png) there, or make a scene of them: gscream-vk prepare SCENE --out SCENE
     SCENE: no COLMAP model; sparse/0/ (or sparse/) must hold cameras and images, both .bin or both .txt; gscream-vk prepare images --out SCENE makes one, where colmap is installed
     SCENE: none of the 4 pictures is in the model (pictures like a, model images like p.jpg); the names must agree up to the extension
-    reference/b.png: the model has no pose for the view of this inpainted picture
+    reference/b.png: the model has no pose for the view of this inpainted picture, or none that is near the others'
     sparse/0: the model has no points, and the Gaussians are built around them; export points3D.bin, .txt or .ply
     ");
     let gone = scene::load(Path::new("no/such/scene"), &Config::default()).expect_err("there is none").to_string();
@@ -1111,6 +1111,80 @@ fn gscreams_copy_is_found() {
     assert_note!(scene, "the reference's depth is marigold_output/depth_npy/2022_138_pred.npy");
 }
 
+// ---------------------------------------------------------------- strays
+
+/// Adds a record to a file of the model that begins with their number.
+fn add_record(path: &Path, record: &[u8]) {
+    let mut bytes = fs::read(path).unwrap();
+    let count = u64::from_le_bytes(bytes[..8].try_into().unwrap()) + 1;
+    bytes[..8].copy_from_slice(&count.to_le_bytes());
+    bytes.extend(record);
+    fs::write(path, bytes).unwrap();
+}
+
+/// Registers a photograph `name` whose camera has this translation, and adds points at these places.
+fn add_strays(scene: &Path, name: &str, translation: [f64; 3], points: &[[f64; 3]]) {
+    let pose = [1.0, 0.0, 0.0, 0.0].into_iter().chain(translation).flat_map(f64::to_le_bytes);
+    let record: Vec<u8> = 1000u32
+        .to_le_bytes()
+        .into_iter()
+        .chain(pose)
+        .chain(1u32.to_le_bytes())
+        .chain(name.bytes())
+        .chain([0; 9])
+        .collect();
+    add_record(&scene.join("sparse/0/images.bin"), &record);
+    for (i, position) in points.iter().enumerate() {
+        let position = position.iter().flat_map(|x| x.to_le_bytes());
+        let id = (10_000 + i as u64).to_le_bytes();
+        let record: Vec<u8> = id.into_iter().chain(position).chain([9; 3]).chain([0; 16]).collect();
+        add_record(&scene.join("sparse/0/points3D.bin"), &record);
+    }
+}
+
+/// One camera 9e9 away and points as far, as COLMAP leaves them in one capture of two: the scene is what it is without.
+#[test]
+fn strays_change_nothing_but_a_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let options = synthetic::Options { seed: 3, width: 48, height: 36, train_views: 8, test_views: 2, points: 200 };
+    let dir = folder.path().join("scene");
+    synthetic::write(&dir, &options).unwrap();
+    let read = |config: &Config| {
+        let mut scene = scene::load(&dir, config).unwrap();
+        scene::condition(&mut scene, config);
+        scene
+    };
+    let holding = Config { test_every: 3, ..Config::default() };
+    let (plain, plain_held) = (read(&Config::default()), read(&holding));
+    assert_eq!(plain.notes.iter().filter(|n| matches!(n, Note::Lost(_) | Note::Stray(_))).count(), 0);
+    let far = [[1.5e11, -3e10, 2e9], [-2e10, 1e9, 4e11], [0.0, 0.0, -7e8]];
+    add_strays(&dir, "stray.png", [9e9, 1e9, -3e9], &far);
+    save(dir.join("images/stray.png"), &picture([48, 36]));
+    save(dir.join("masks/stray.png"), &mask([48, 36], 255));
+    for (with, without) in [(read(&Config::default()), plain), (read(&holding), plain_held)] {
+        assert_eq!((with.radius, with.unit, &with.points), (without.radius, without.unit, &without.points));
+        assert_eq!(scene::footprint(&with), scene::footprint(&without));
+        for (a, b) in [(&with.train, &without.train), (&with.test, &without.test)] {
+            let of = |views: &[scene::View]| views.iter().map(|v| (v.name.clone(), v.camera)).collect::<Vec<_>>();
+            assert_eq!(of(a), of(b));
+        }
+        assert_note!(with, "stray of 11 views: the model has the camera where no capture has any");
+        assert_note!(with, "3 of 203 points lie far beyond what the cameras can measure");
+        assert_eq!(with.notes.iter().filter(|n| matches!(n, Note::Stray(_))).count(), 1);
+    }
+    // As a test view it judges nothing.
+    fs::rename(dir.join("images/stray.png"), dir.join("test_images/stray.png")).unwrap();
+    fs::rename(dir.join("masks/stray.png"), dir.join("test_masks/stray.png")).unwrap();
+    assert_eq!(scene::load(&dir, &Config::default()).unwrap().test.len(), 2);
+    // The inpainted picture of a stray has no place.
+    fs::rename(dir.join("test_images/stray.png"), dir.join("images/stray.png")).unwrap();
+    fs::rename(dir.join("test_masks/stray.png"), dir.join("masks/stray.png")).unwrap();
+    fs::remove_dir_all(dir.join("reference")).unwrap();
+    save(dir.join("reference/stray.png"), &picture([48, 36]));
+    let refused = scene::load(&dir, &Config::default()).expect_err("a reference nowhere").to_string();
+    assert!(refused.contains("has no pose for the view of this inpainted picture, or none that is near"), "{refused}");
+}
+
 // ---------------------------------------------------------------- synthetic
 
 #[test]
@@ -1260,4 +1334,16 @@ fn fern_is_read() {
         "no depth priors: the depth losses are off",
     ]
     "#);
+}
+
+/// A capture as COLMAP leaves it, where it is at hand.
+#[test]
+fn the_bonsai_loads_as_it_comes() {
+    let Some(dir) = capture("bonsai") else { return };
+    let scene = scene::load(&dir, &Config { downscale: 16, ..Config::default() }).unwrap();
+    assert_eq!((scene.train.len(), scene.points.len()), (82, 9_929));
+    assert_note!(scene, "DSCF5698 of 83 views");
+    assert_note!(scene, "62 of 9991 points");
+    // The farthest camera stands at 4 times the median distance.
+    assert!((5.0..15.0).contains(&scene.radius), "{}", scene.radius);
 }

@@ -26,7 +26,7 @@ use crate::render::view::Capacity;
 use crate::report::Error;
 use crate::report::kernels::{Bench, Warm};
 use crate::report::variants::Variant;
-use crate::scene::{Camera, Prior, PriorKind, Reference, Scene, View};
+use crate::scene::{Camera, Notes, Prior, PriorKind, Reference, Scene, View};
 use crate::train::photographs;
 use crate::train::plan::Plan;
 use crate::train::step::Step;
@@ -169,7 +169,7 @@ impl Load {
             points: vec![crate::scene::Point { position: [0.0, 0.0, 3.0], color: [0; 3] }],
             radius: 1.0,
             unit: 1.0,
-            notes: vec![],
+            notes: Notes::default(),
         }
     }
 

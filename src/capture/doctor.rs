@@ -1,5 +1,8 @@
 //! Is a scene right? Checks that cost seconds and find what costs days.
 
+mod exposure;
+mod geometry;
+
 use std::path::Path;
 
 use image::{GrayImage, RgbImage};
@@ -9,7 +12,7 @@ use serde::Serialize;
 use super::masks;
 use super::record::{Folder, RECORD};
 use super::{Error, Step};
-use crate::scene::{self, Camera, Prior, PriorKind, Reference, Scene, View, rank_correlation, resample};
+use crate::scene::{self, Camera, Note, Prior, PriorKind, Reference, Scene, View, rank_correlation, resample};
 
 /// How bad a finding is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -26,7 +29,7 @@ pub enum Severity {
 pub struct Finding {
     /// How bad it is.
     pub severity: Severity,
-    /// What was looked at: "masks", "names", "depth", "reference", "exposure", "scene".
+    /// What was looked at: "masks", "names", "poses", "depth", "reference", "exposure", "scene".
     pub check: &'static str,
     /// The view, where it is about one.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -49,7 +52,13 @@ pub struct ViewFigures {
     /// Median residual of the prior, fitted to the points by scale and shift, as a part of the median depth (or disparity).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub depth_residual: Option<f64>,
-    /// Brightness of the photograph over that of the sparse points, median; 1 is the mean of all views.
+    /// Share of the sparse points that lie before the camera, 0 to 1.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub points_in_front: Option<f64>,
+    /// Share of the sparse points that fall into the picture, 0 to 1.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub points_in_picture: Option<f64>,
+    /// Brightness of the photograph over that of most, by what the photographs around it show of the same points.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub exposure: Option<f64>,
     /// Intersection over union of its mask with the one it was compared with.
@@ -127,9 +136,8 @@ pub fn examine(folder: &Path, truth: Option<&Path>) -> Result<(Report, Option<Sc
         }
     };
     for note in &scene.notes {
-        let lost = lost(note);
-        let kind = if lost { Severity::Problem } else { Severity::Note };
-        report.add(kind, if lost { "names" } else { "scene" }, None, note.clone());
+        let (severity, check) = weigh(note);
+        report.add(severity, check, None, &**note);
     }
     examine_scene(&scene, &mut report);
     provenance(folder, &mut report);
@@ -143,23 +151,32 @@ pub fn examine(folder: &Path, truth: Option<&Path>) -> Result<(Report, Option<Sc
 /// The checks that need no more than a scene that was loaded: for the lines that training prints.
 pub fn look(scene: &Scene) -> Report {
     let mut report = Report::default();
-    for note in scene.notes.iter().filter(|note| lost(note)) {
-        report.add(Severity::Problem, "names", None, note.clone());
+    for note in &scene.notes {
+        let (severity, check) = weigh(note);
+        if severity == Severity::Problem {
+            report.add(severity, check, None, &**note);
+        }
     }
     examine_scene(scene, &mut report);
     report.sort();
     report
 }
 
-/// Whether a note of the loader says that it left something out.
-fn lost(note: &str) -> bool {
-    ["belong to no picture", "are not in the model", "is not read", "is not looked into"]
-        .iter()
-        .any(|part| note.contains(part))
+/// How bad it is what the loader says, and what it is about: a photograph or a file that is not used is a problem.
+fn weigh(note: &Note) -> (Severity, &'static str) {
+    match note {
+        Note::Lost(_) => (Severity::Problem, "names"),
+        Note::Stray(_) => (Severity::Problem, "poses"),
+        Note::Plain(_) => (Severity::Note, "scene"),
+    }
 }
 
 fn examine_scene(scene: &Scene, report: &mut Report) {
     report.views = scene.train.par_iter().map(|view| figures(scene, view)).collect();
+    geometry::look(scene, report);
+    for (figures, exposure) in report.views.iter_mut().zip(exposure::exposures(scene)) {
+        figures.exposure = exposure;
+    }
     mask_findings(scene, report);
     depth_findings(scene, report);
     exposure_findings(report);
@@ -175,7 +192,6 @@ fn examine_scene(scene: &Scene, report: &mut Report) {
 struct Seen {
     pixel: usize,
     depth: f64,
-    color: [u8; 3],
 }
 
 /// The points that fall into a view, the nearest of those that share a cell of 4 x 4 pixels: what stands behind is not
@@ -194,7 +210,7 @@ fn seen(scene: &Scene, camera: &Camera) -> Vec<Seen> {
         let cell = &mut nearest[(y / 4.0) as usize * cells[0] + (x / 4.0) as usize];
         if cell.as_ref().is_none_or(|other| depth < other.depth) {
             let pixel = y as usize * w as usize + x as usize;
-            *cell = Some(Seen { pixel, depth, color: point.color });
+            *cell = Some(Seen { pixel, depth });
         }
     }
     nearest.into_iter().flatten().collect()
@@ -221,14 +237,7 @@ fn figures(scene: &Scene, view: &View) -> ViewFigures {
     if let Some(prior) = &view.prior {
         (depth_correlation, depth_residual) = against_points(prior, &points);
     }
-    let raw = view.image.as_raw();
-    let mut ratios: Vec<f64> = points
-        .iter()
-        .filter(|p| (20.0..235.0).contains(&luminance(p.color)))
-        .map(|p| luminance([raw[3 * p.pixel], raw[3 * p.pixel + 1], raw[3 * p.pixel + 2]]) / luminance(p.color))
-        .collect();
-    let exposure = if ratios.len() >= 50 { median(&mut ratios) } else { None };
-    ViewFigures { name: view.name.clone(), mask, depth_correlation, depth_residual, exposure, iou: None }
+    ViewFigures { name: view.name.clone(), mask, depth_correlation, depth_residual, ..ViewFigures::default() }
 }
 
 /// Rank correlation of a prior of the view's size with the points that the view shows; none where they are too few.
@@ -460,7 +469,7 @@ fn depth_findings(scene: &Scene, report: &mut Report) {
 
 // ---------------------------------------------------------------- exposure
 
-/// Brightness that differs by more than this part from the mean.
+/// Brightness that differs by more than this part from most photographs'.
 const DRIFT: f64 = 0.08;
 
 fn exposure_findings(report: &mut Report) {
@@ -468,8 +477,6 @@ fn exposure_findings(report: &mut Report) {
     if all.len() < 2 {
         return;
     }
-    let mean = all.iter().sum::<f64>() / all.len() as f64;
-    report.views.iter_mut().filter_map(|view| view.exposure.as_mut()).for_each(|e| *e /= mean);
     let off: Vec<(String, f64)> = report
         .views
         .iter()
@@ -479,7 +486,8 @@ fn exposure_findings(report: &mut Report) {
     let worst = off.iter().max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()));
     if let Some((name, by)) = worst {
         let message = format!(
-            "{} of {} photographs differ in brightness by more than {:.0} % (most: {name}, {:+.0} %); a fixed exposure trains better",
+            "{} of {} photographs show the same points brighter or darker by more than {:.0} % (most: {name}, {:+.0} %); a fixed \
+             exposure trains better",
             off.len(),
             all.len(),
             100.0 * DRIFT,
@@ -613,8 +621,7 @@ mod tests {
 
     #[test]
     fn priors_are_judged_by_the_points() {
-        let points: Vec<Seen> =
-            (0..64).map(|i| Seen { pixel: i, depth: 1.0 + i as f64 * 0.05, color: [100; 3] }).collect();
+        let points: Vec<Seen> = (0..64).map(|i| Seen { pixel: i, depth: 1.0 + i as f64 * 0.05 }).collect();
         let of = |kind, value: &dyn Fn(f64) -> f64| {
             let values = points.iter().map(|p| value(p.depth) as f32).collect();
             against_points(&Prior { kind, values }, &points)

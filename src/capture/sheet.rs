@@ -91,6 +91,7 @@ pub fn page(title: &str, sheet: &Sheet, report: &Report) -> String {
         let lines = figures.into_iter().flat_map(|f| {
             [
                 of(f.mask, &|v| format!("mask {:.1} %", 100.0 * v)),
+                of(f.points_in_picture, &|v| format!("points {:.1} %", 100.0 * v)),
                 of(f.depth_correlation, &|v| format!("depth {v:.2}")),
                 of(f.exposure, &|v| format!("brightness {v:.2}")),
                 of(f.iou, &|v| format!("IoU {v:.3}")),

@@ -9,7 +9,7 @@ use crate::capture::doctor::{self, Report, Severity};
 use crate::capture::reference::PROVENANCE;
 use crate::capture::sheet;
 
-/// Look over a scene before training: masks, names, sizes, depth, reference, exposure
+/// Look over a scene before training: masks, names, sizes, poses, depth, reference, exposure
 ///
 /// Problems and notes go to stdout, the worst first. A contact sheet of all views with their masks, as PNG and as a page,
 /// goes into the folder that --sheet names; of a scene that prepare made it shows what no view sees of the hole.

@@ -55,6 +55,13 @@ pub struct Image {
     pub camera: u32,
 }
 
+impl Image {
+    /// The camera's position in the world.
+    pub fn center(&self) -> [f64; 3] {
+        std::array::from_fn(|i| -(0..3).map(|k| self.rotation[k][i] * self.translation[k]).sum::<f64>())
+    }
+}
+
 /// A sparse model.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Model {
@@ -112,7 +119,7 @@ impl Lens {
         let finite = self.focal.iter().chain(&self.principal).chain(&self.coefficients).all(|v| is_finite(*v));
         if !finite {
             Some("a parameter is not a finite number".into())
-        } else if self.focal.iter().any(|f| *f <= 0.0) {
+        } else if self.focal.iter().any(|f| *f <= 0.0 || !(*f as f32).is_normal()) {
             Some(format!("the focal length is {} x {} pixels, it must be positive", self.focal[0], self.focal[1]))
         } else if self.size.contains(&0) {
             Some(format!("the size is {} x {} pixels", self.size[0], self.size[1]))

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use super::{Error, PriorKind, priors};
+use super::{Error, Note, Notes, PriorKind, priors};
 
 /// Extensions of pictures and masks, lower case.
 pub(crate) const PICTURES: [&str; 3] = ["png", "jpg", "jpeg"];
@@ -57,7 +57,7 @@ pub(super) struct Layout {
     pub references: Vec<ReferenceFiles>,
     /// The kind of prior that this layout has, if it has any.
     pub kind: Option<PriorKind>,
-    pub notes: Vec<String>,
+    pub notes: Notes,
     /// Test masks known to differ in size from their pictures: (mask size, picture size).
     pub tall_test_mask: Option<([u32; 2], [u32; 2])>,
 }
@@ -94,7 +94,7 @@ fn image_folder<'a>(scene: &Path, names: &[&'a str]) -> Result<&'a str, Error> {
 
 fn plain(scene: &Path) -> Result<Layout, Error> {
     let folder = image_folder(scene, &["images", "images_2", "images_4", "images_8"])?;
-    let mut passed_over = vec![];
+    let mut passed_over = Notes::default();
     let mut index = |folder: &str, extensions: &[&str]| index(&scene.join(folder), extensions, &mut passed_over);
     let (images, test_images) = (index(folder, &PICTURES)?, index("test_images", &PICTURES)?);
     if images.is_empty() {
@@ -140,32 +140,35 @@ const FOLDERS: [&str; 9] =
     ["images", "masks", "depth", "disparity", "reference", "test_images", "test_masks", "test_depth", "sparse"];
 
 /// Notes on folders that are called nearly like one that is not there.
-fn misspelt(scene: &Path) -> Result<Vec<String>, Error> {
-    let folders = list(scene, &mut vec![])?.into_iter().filter(|(path, _)| path.is_dir()).map(|(_, name)| name);
+fn misspelt(scene: &Path) -> Result<Notes, Error> {
+    let folders =
+        list(scene, &mut Notes::default())?.into_iter().filter(|(path, _)| path.is_dir()).map(|(_, name)| name);
     let near = |name: &str| {
         let missing = FOLDERS.into_iter().filter(|known| !scene.join(known).is_dir());
         missing.map(|known| (strsim::damerau_levenshtein(name, known), known)).filter(|(d, _)| *d <= 2).min()
     };
     let unknown = folders.filter(|name| !FOLDERS.contains(&name.as_str()) && !name.starts_with("images"));
     Ok(unknown
-        .filter_map(|name| near(&name).map(|(_, known)| format!("{name}/ is not read; should it be called {known}/?")))
+        .filter_map(|name| {
+            near(&name).map(|(_, known)| Note::Lost(format!("{name}/ is not read; should it be called {known}/?")))
+        })
         .collect())
 }
 
 /// A note on files that belong to no picture.
-fn strays(what: &str, files: &Index, pictures: &Index) -> Option<String> {
+fn strays(what: &str, files: &Index, pictures: &Index) -> Option<Note> {
     let strays: Vec<&str> = files.keys().filter(|name| !pictures.contains_key(*name)).map(String::as_str).collect();
     let first = strays.first()?;
-    Some(format!(
+    Some(Note::Lost(format!(
         "{} of {} files in {what}/ belong to no picture and are left out (first: {first})",
         strays.len(),
         files.len()
-    ))
+    )))
 }
 
 fn spin_nerf(scene: &Path, folder: &str) -> Result<Layout, Error> {
     let images = scene.join(folder);
-    let mut passed_over = vec![];
+    let mut passed_over = Notes::default();
     let masks = index(&images.join("label"), &PICTURES, &mut passed_over)?;
     let test_masks = index(&images.join("test_label"), &PICTURES, &mut passed_over)?;
     let split = spin_split(scene, &images, |name| masks.contains_key(name))?;
@@ -182,7 +185,7 @@ fn spin_nerf(scene: &Path, folder: &str) -> Result<Layout, Error> {
         test,
         references,
         kind: None,
-        notes: split.notes.into_iter().chain(note).chain(passed_over).collect(),
+        notes: split.notes.into_iter().chain(note.map(Note::from)).chain(passed_over).collect(),
         tall_test_mask: Some(SPIN_TALL_MASK),
     })
 }
@@ -191,7 +194,7 @@ fn gscream_copy(scene: &Path, by: &str) -> Result<Layout, Error> {
     let folder = image_folder(scene, &["images_4", "images", "images_2", "images_8"])?;
     let images = scene.join(folder);
     let mut masks = Index::new();
-    let mut passed_over = vec![];
+    let mut passed_over = Notes::default();
     let mut index = |folder: PathBuf, extensions: &[&str]| index(&folder, extensions, &mut passed_over);
     for at in [scene.join("lama_input"), images.join("lama_input")] {
         let files = index(at, &PICTURES)?;
@@ -215,7 +218,7 @@ fn gscream_copy(scene: &Path, by: &str) -> Result<Layout, Error> {
         |name: &String| test_masks.get(name).or_else(|| numbered.get(&format!("out_{:05}", position[name]))).cloned();
     let test = entries(&split.test, test_mask, prior);
     let (mut references, note) = spin_reference(scene, &images, &train, split.reference.as_deref())?;
-    let mut notes: Vec<String> = split.notes.into_iter().chain(note).chain(passed_over).collect();
+    let mut notes: Notes = split.notes.into_iter().chain(note.map(Note::from)).chain(passed_over).collect();
     for files in &mut references {
         let Some((path, kind)) = prior(&files.name).filter(|_| files.prior.is_none()) else { continue };
         notes.push(format!(
@@ -241,12 +244,12 @@ struct Split {
     test: Index,
     /// Name of the view that the benchmark inpaints.
     reference: Option<String>,
-    notes: Vec<String>,
+    notes: Notes,
 }
 
 /// The benchmark's split by position where all 100 pictures are there, else by which pictures have a train mask.
 fn spin_split(scene: &Path, images: &Path, has_train_mask: impl Fn(&str) -> bool) -> Result<Split, Error> {
-    let mut notes = vec![];
+    let mut notes = Notes::default();
     let mut all = index_flat(images, &PICTURES, &mut notes)?;
     // A single inpainted picture beside the photographs is not one of them.
     all.remove("reference");
@@ -321,7 +324,7 @@ fn references(folder: &Path, train: &[Entry]) -> Result<Vec<ReferenceFiles>, Err
     let kinds = [PriorKind::Depth, PriorKind::Disparity];
     let suffixed = |name: &str| kinds.into_iter().any(|k| name.ends_with(k.suffix()));
     let known = |name: &str| train.iter().any(|e| e.name == name);
-    let mut pictures = index(folder, &PICTURES, &mut vec![])?;
+    let mut pictures = index(folder, &PICTURES, &mut Notes::default())?;
     pictures.retain(|name, _| known(name) || !suffixed(name));
     let all = pictures.into_iter().map(|(name, image)| {
         if !known(&name) {
@@ -404,7 +407,7 @@ const DEEPEST: usize = 32;
 /// Links to folders are followed, but no folder is looked into twice, nor one that `folder` lies in: its files would be
 /// there several times, under names to which nothing else belongs. `passed_over` gets a sentence on each such link and on
 /// names that are no text.
-pub(super) fn index(folder: &Path, extensions: &[&str], passed_over: &mut Vec<String>) -> Result<Index, Error> {
+pub(super) fn index(folder: &Path, extensions: &[&str], passed_over: &mut Notes) -> Result<Index, Error> {
     let mut out = Index::new();
     let canonical = |path: &Path| path.canonicalize().map_err(|source| Error::Io { path: path.to_path_buf(), source });
     if !folder.is_dir() {
@@ -421,7 +424,7 @@ pub(super) fn index(folder: &Path, extensions: &[&str], passed_over: &mut Vec<St
             if prefix.matches('/').count() <= DEEPEST && seen.insert(target.clone()) {
                 folders.push((path, prefix));
             } else {
-                passed_over.push(looked_into_already(&path, &target));
+                passed_over.push(Note::Lost(looked_into_already(&path, &target)));
             }
             continue;
         };
@@ -436,7 +439,7 @@ pub(super) fn index(folder: &Path, extensions: &[&str], passed_over: &mut Vec<St
                         folders.push((path, format!("{prefix}{name}/")));
                     } else {
                         // It lies behind a link.
-                        passed_over.push(looked_into_already(&path, &target));
+                        passed_over.push(Note::Lost(looked_into_already(&path, &target)));
                     }
                 }
                 // Neither a pipe nor a device is a picture, and reading one may never end.
@@ -457,7 +460,7 @@ fn looked_into_already(path: &Path, target: &Path) -> String {
 }
 
 /// Like [`index`], without the folders below.
-fn index_flat(folder: &Path, extensions: &[&str], passed_over: &mut Vec<String>) -> Result<Index, Error> {
+fn index_flat(folder: &Path, extensions: &[&str], passed_over: &mut Notes) -> Result<Index, Error> {
     let mut out = Index::new();
     for (path, name) in list(folder, passed_over)? {
         if path.is_file() {
@@ -468,7 +471,7 @@ fn index_flat(folder: &Path, extensions: &[&str], passed_over: &mut Vec<String>)
 }
 
 /// Visible entries of a folder; none if there is no such folder. `passed_over` gets a sentence on names that are no text.
-fn list(folder: &Path, passed_over: &mut Vec<String>) -> Result<Vec<(PathBuf, String)>, Error> {
+fn list(folder: &Path, passed_over: &mut Notes) -> Result<Vec<(PathBuf, String)>, Error> {
     let failed = |source| Error::Io { path: folder.to_path_buf(), source };
     if !folder.is_dir() {
         return Ok(Vec::new());
@@ -479,7 +482,8 @@ fn list(folder: &Path, passed_over: &mut Vec<String>) -> Result<Vec<(PathBuf, St
         match path.file_name().and_then(|n| n.to_str()).map(str::to_owned) {
             Some(name) if name.starts_with('.') => {}
             Some(name) => out.push((path, name)),
-            None => passed_over.push(format!("{} is not read: its name is not UTF-8; rename it", path.display())),
+            None => passed_over
+                .push(Note::Lost(format!("{} is not read: its name is not UTF-8; rename it", path.display()))),
         }
     }
     Ok(out)

@@ -18,12 +18,14 @@
 //! All but `images/` and `sparse/` may be missing; [`Scene::notes`] says what follows. SPIn-NeRF's own layout and
 //! GScream's processed copy of it are recognised as well.
 
+mod bounds;
 mod camera;
 pub mod colmap;
 mod condition;
 mod config;
 mod error;
 mod layout;
+mod note;
 mod npy;
 pub mod path;
 mod picture;
@@ -43,6 +45,7 @@ pub use config::Config;
 use config::{NO_PRIOR, STEREO_PRIOR};
 pub use error::Error;
 pub(crate) use layout::{PICTURES, stem};
+pub use note::{Note, Notes};
 pub use picture::{decode, dimensions, object_mask};
 pub(crate) use priors::rank_correlation;
 pub use priors::read as read_prior;
@@ -103,13 +106,17 @@ pub struct Scene {
     pub references: Vec<Reference>,
     /// Points of the sparse model; at least one.
     pub points: Vec<Point>,
-    /// 1.1 x the largest distance of a train camera from the mean train camera, world units; 1 if that is zero.
+    /// 1.1 x the largest distance of a train camera from the mean train camera, world units, where cameras much farther out
+    /// than nine in ten do not count; 1 if that is zero.
     pub radius: f32,
     /// Lengths of the model's per world unit of this scene: 1 as read, see [`condition`].
     pub unit: f64,
     /// One line each: the layout found, scales worked out, what is absent and what follows.
-    pub notes: Vec<String>,
+    pub notes: Notes,
 }
+
+/// One picture of so many may be lost without being a problem.
+const FEW_LOST: usize = 20;
 
 /// At most this many pictures are decoded at once: decoding holds a full-size picture, mask and prior per thread.
 const DECODERS: usize = 8;
@@ -127,8 +134,9 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
         return Err(Error::File { path: dir.to_path_buf(), what: "there is no such folder".into() });
     }
     let mut layout = layout::find(dir)?;
-    let model = colmap::read(dir)?;
-    let mut notes = vec![layout.found.clone()];
+    let mut model = colmap::read(dir)?;
+    let mut points = std::mem::take(&mut model.points);
+    let mut notes = Notes::from_iter([layout.found.clone()]);
     notes.append(&mut layout.notes);
 
     let no_masks = layout.train.iter().all(|e| e.mask.is_none());
@@ -157,7 +165,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     let wanted = config.masks && config.reference;
     if !wanted && !references.is_empty() {
         references.clear();
-        notes.push("the reference view is ignored, as configured".into());
+        notes.push("the reference view is ignored, as configured");
     }
     for files in &references {
         let entry = layout.train.iter().find(|e| e.name == files.name).expect("the layout's reference is a train view");
@@ -171,7 +179,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     }
     if !config.masks && !no_masks {
         layout.train.iter_mut().for_each(|e| e.mask = None);
-        notes.push("the train masks are ignored, as configured: every pixel is trained on, the object included".into());
+        notes.push("the train masks are ignored, as configured: every pixel is trained on, the object included");
     }
     let no_priors = layout.train.iter().all(|e| e.prior.is_none());
     if !config.priors {
@@ -179,7 +187,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
         layout.train.iter_mut().for_each(|e| e.prior = None);
         references.iter_mut().for_each(|r| r.prior = None);
         if any {
-            notes.push("the depth priors are ignored, as configured: the depth losses are off".into());
+            notes.push("the depth priors are ignored, as configured: the depth losses are off");
         }
     }
 
@@ -197,17 +205,21 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
         let (kept, lost): (Vec<_>, Vec<_>) = entries.into_iter().partition(|e| poses.find(&e.name).is_some());
         if let Some(first) = lost.first() {
             let count = lost.len();
-            notes.push(format!(
+            let text = format!(
                 "{count} of {all} {what} pictures are not in the model and are left out (first: {})",
                 first.name
-            ));
+            );
+            // Structure from motion places nearly all of a good capture.
+            notes.push(if count > all / FEW_LOST { Note::Lost(text) } else { Note::Plain(text) });
         }
         kept
     };
     let mut train = posed(layout.train, "train");
     let mut test = posed(layout.test, "test");
+    let strays = leave_strays(&poses, [&mut train, &mut test], &mut points, &mut notes);
     if let Some(files) = references.iter().find(|files| !train.iter().any(|e| e.name == files.name)) {
-        let what = "the model has no pose for the view of this inpainted picture".into();
+        let what =
+            "the model has no pose for the view of this inpainted picture, or none that is near the others'".into();
         return Err(Error::File { path: files.image.clone(), what });
     }
     if !clean_views && config.test_every > 0 {
@@ -225,7 +237,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
         let what = "no view is left to train on; check images/ against the model, and test_every".into();
         return Err(Error::File { path: dir.to_path_buf(), what });
     }
-    let unused = model.images.len().saturating_sub(train.len() + test.len());
+    let unused = model.images.len().saturating_sub(train.len() + test.len() + strays);
     if unused > 0 {
         notes.push(format!("{unused} of {} images of the model have no picture here", model.images.len()));
     }
@@ -278,12 +290,12 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     }
     let mut references = read_references;
     references.sort_by_key(|r| r.view);
-    summarise(&train, &test, &references, model.points.len(), config, &mut notes);
+    summarise(&train, &test, &references, points.len(), config, &mut notes);
     let radius = radius(&train);
     if radius.is_none() {
-        notes.push("all train cameras stand at one place: the scene radius is taken as 1".into());
+        notes.push("all train cameras stand at one place: the scene radius is taken as 1");
     }
-    Ok(Scene { train, test, references, points: model.points, radius: radius.unwrap_or(1.0), unit: 1.0, notes })
+    Ok(Scene { train, test, references, points, radius: radius.unwrap_or(1.0), unit: 1.0, notes })
 }
 
 impl View {
@@ -324,7 +336,7 @@ impl Scene {
 }
 
 /// Replaces the priors of all views by those of [`Config::prior_folder`]: views without one there have none.
-fn take_priors(dir: &Path, config: &Config, layout: &mut layout::Layout, notes: &mut Vec<String>) -> Result<(), Error> {
+fn take_priors(dir: &Path, config: &Config, layout: &mut layout::Layout, notes: &mut Notes) -> Result<(), Error> {
     let folder = dir.join(&config.prior_folder);
     let files = depth_maps(&folder)?;
     let name = folder.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
@@ -343,7 +355,7 @@ fn take_priors(dir: &Path, config: &Config, layout: &mut layout::Layout, notes: 
         let own = files.get(&format!("reference/{}", reference.name)).cloned();
         match (own, &reference.prior) {
             (Some(path), _) => reference.prior = Some(layout::ReferencePrior { path, kind: Some(kind) }),
-            (None, Some(_)) => notes.push("the inpainted picture keeps its delivered prior: there is no other".into()),
+            (None, Some(_)) => notes.push("the inpainted picture keeps its delivered prior: there is no other"),
             (None, None) => {}
         }
     }
@@ -351,12 +363,7 @@ fn take_priors(dir: &Path, config: &Config, layout: &mut layout::Layout, notes: 
 }
 
 /// Makes [`Config::reference_file`] the inpainted picture. The delivered one's prior stays where both are of one view.
-fn take_reference(
-    dir: &Path,
-    config: &Config,
-    layout: &mut layout::Layout,
-    notes: &mut Vec<String>,
-) -> Result<(), Error> {
+fn take_reference(dir: &Path, config: &Config, layout: &mut layout::Layout, notes: &mut Notes) -> Result<(), Error> {
     if !config.truth_reference.is_empty() {
         let what = "scene.reference_file and scene.truth_reference are both set; name one of the two";
         return Err(Error::Setting(what.into()));
@@ -373,7 +380,7 @@ fn take_reference(
     delivered.retain(|d| d.name == name);
     let prior = delivered.pop().and_then(|d| d.prior);
     if prior.is_some() {
-        notes.push("its prior is the delivered picture's".into());
+        notes.push("its prior is the delivered picture's");
     }
     layout.references = vec![layout::ReferenceFiles { name, image, prior }];
     Ok(())
@@ -382,12 +389,7 @@ fn take_reference(
 /// Moves the test view that [`Config::truth_reference`] names to the train views and makes it the reference: its
 /// photograph is what a perfect inpainting would be. The view of the delivered reference stays, as a masked train view.
 /// Returns the view's name.
-fn take_truth(
-    dir: &Path,
-    config: &Config,
-    layout: &mut layout::Layout,
-    notes: &mut Vec<String>,
-) -> Result<String, Error> {
+fn take_truth(dir: &Path, config: &Config, layout: &mut layout::Layout, notes: &mut Notes) -> Result<String, Error> {
     let wanted = layout::stem(&config.truth_reference);
     let Some(at) = layout.test.iter().position(|e| e.name == wanted) else {
         return Err(Error::NoTruth {
@@ -430,12 +432,49 @@ fn take_truth(
     Ok(name)
 }
 
-/// 1.1 x the largest distance of a camera from the mean camera; `None` if they all coincide.
+/// Takes out the views whose cameras stand where no capture has any, and the points that lie beyond what any camera can
+/// measure. Returns how many views.
+fn leave_strays(
+    poses: &Poses,
+    views: [&mut Vec<layout::Entry>; 2],
+    points: &mut Vec<Point>,
+    notes: &mut Notes,
+) -> usize {
+    let pose = |entry: &layout::Entry| poses.find(&entry.name).expect("views without a pose were left out").0;
+    let centers: Vec<[f64; 3]> = views.iter().flat_map(|v| v.iter()).map(|e| pose(e).center()).collect();
+    let bounds = bounds::Bounds::of(&centers, points);
+    let mut at = bounds.stray.iter();
+    let mut names = vec![];
+    for views in views {
+        views.retain(|entry| {
+            let stray = at.next().is_some_and(|stray| *stray);
+            names.extend(stray.then(|| entry.name.clone()));
+            !stray
+        });
+    }
+    if let Some(first) = names.first() {
+        let more = if names.len() > 1 { format!(" and {} more", names.len() - 1) } else { String::new() };
+        notes.push(Note::Stray(format!(
+            "{first}{more} of {} views: the model has the camera where no capture has any, far from all others, so that the \
+             photograph is left out",
+            centers.len()
+        )));
+    }
+    let all = points.len();
+    points.retain(|point| !bounds.is_beyond(point));
+    if points.len() < all {
+        notes.push(format!(
+            "{} of {all} points lie far beyond what the cameras can measure, and are left out",
+            all - points.len()
+        ));
+    }
+    names.len()
+}
+
+/// 1.1 x the largest distance of a camera from the mean camera, but for the farthest of few; `None` if they all coincide.
 fn radius(train: &[View]) -> Option<f32> {
     let centers: Vec<[f64; 3]> = train.iter().map(|v| v.camera.center()).collect();
-    let mean: [f64; 3] = std::array::from_fn(|i| centers.iter().map(|c| c[i]).sum::<f64>() / centers.len() as f64);
-    let distance = |c: &[f64; 3]| (0..3).map(|i| (c[i] - mean[i]).powi(2)).sum::<f64>().sqrt();
-    let largest = 1.1 * centers.iter().map(distance).fold(0.0, f64::max);
+    let largest = 1.1 * bounds::radius(&centers);
     (largest > 1e-6).then_some(largest as f32)
 }
 
@@ -446,7 +485,7 @@ fn summarise(
     references: &[Reference],
     points: usize,
     config: &Config,
-    notes: &mut Vec<String>,
+    notes: &mut Notes,
 ) {
     let sizes: BTreeSet<[u32; 2]> = train.iter().map(|v| v.camera.size).collect();
     let size = match sizes.first() {
@@ -473,7 +512,7 @@ fn summarise(
     let masks: Vec<&GrayImage> = train.iter().filter_map(|v| v.mask.as_ref()).collect();
     if masks.is_empty() {
         if config.masks {
-            notes.push("no masks: every pixel is trained on, as in plain Scaffold-GS".into());
+            notes.push("no masks: every pixel is trained on, as in plain Scaffold-GS");
         }
     } else {
         if masks.len() < train.len() {
@@ -490,20 +529,20 @@ fn summarise(
             ));
         }
         if references.is_empty() {
-            notes.push("masks but no reference view: the hole is left unsupervised".into());
+            notes.push("masks but no reference view: the hole is left unsupervised");
         }
     }
     let priors = train.iter().filter(|v| v.prior.is_some()).count();
     let reference_prior = references.iter().any(|r| r.prior.is_some());
     if config.priors && priors == 0 && !reference_prior {
-        notes.push("no depth priors: the depth losses are off".into());
+        notes.push("no depth priors: the depth losses are off");
     } else if config.priors && (priors < train.len() || !references.is_empty() && !reference_prior) {
         let without = train.len() - priors;
         let hole = if !references.is_empty() && !reference_prior { ", nor has the inpainted picture" } else { "" };
         notes.push(format!("{without} of {} train views have no depth prior{hole}: no depth loss there", train.len()));
     }
     if test.is_empty() {
-        notes.push("no test views: there is nothing to evaluate on (test_every holds some out)".into());
+        notes.push("no test views: there is nothing to evaluate on (test_every holds some out)");
     }
 }
 
@@ -603,7 +642,7 @@ impl Reader<'_> {
         let ratio: [f64; 2] = std::array::from_fn(|i| f64::from(size[i]) / f64::from(intrinsics.size[i]));
         // The centre is kept, not the translation: rounding the rotation must not move a camera far from the origin.
         let rotation = pose.rotation.map(|row| row.map(|v| v as f32));
-        let center = std::array::from_fn(|i| -(0..3).map(|k| pose.rotation[k][i] * pose.translation[k]).sum::<f64>());
+        let center = pose.center();
         let camera = Camera {
             rotation,
             translation: Camera::translation_to(&rotation, center),
@@ -638,7 +677,7 @@ pub(crate) fn pictures(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Error
     if !folder.is_dir() {
         return Err(Error::File { path: folder.to_path_buf(), what: "there is no such folder".into() });
     }
-    let mut passed_over = vec![];
+    let mut passed_over = Notes::default();
     let found = layout::index(folder, &PICTURES, &mut passed_over)?;
     passed_over.iter().for_each(|line| log::warn!("{line}"));
     Ok(found)
@@ -656,7 +695,7 @@ pub(crate) fn depth_maps(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Err
     if !folder.is_dir() {
         return Err(Error::File { path: folder.to_path_buf(), what: "there is no such folder".into() });
     }
-    layout::index(folder, &priors::EXTENSIONS, &mut vec![])
+    layout::index(folder, &priors::EXTENSIONS, &mut Notes::default())
 }
 
 /// A picture at 1 / `downscale` of its size, reduced as [`load`] reduces photographs.

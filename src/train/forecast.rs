@@ -21,7 +21,7 @@ use crate::model::init::{self, Initial};
 use crate::primitives::limit::{Counter, Limits};
 use crate::render::Method;
 use crate::render::view::{Capacity, Forward, Model};
-use crate::scene::{Camera, Prior, Reference, Scene, View};
+use crate::scene::{Camera, Notes, Prior, Reference, Scene, View};
 use crate::stage;
 
 /// Why there is no forecast.
@@ -388,7 +388,7 @@ fn resized(scene: &Scene, from: u32, to: u32) -> Scene {
         points: scene.points.clone(),
         radius: scene.radius,
         unit: scene.unit,
-        notes: vec![],
+        notes: Notes::default(),
     }
 }
 

@@ -6,7 +6,7 @@
 use rayon::prelude::*;
 
 use crate::scene::priors::rank_correlation;
-use crate::scene::{Camera, Point, Prior, PriorKind, RELATED, Reference, Scene, View};
+use crate::scene::{Camera, Notes, Point, Prior, PriorKind, RELATED, Reference, Scene, View};
 
 /// Fewest points that tell whether a prior fits.
 const FEWEST: usize = 24;
@@ -163,7 +163,7 @@ pub(super) fn check_priors(scene: &mut Scene) {
     let of_references: Vec<Option<Verdict>> = scene.references.iter().map(of_reference).collect();
     scene.points = points;
     let mut converted = 0;
-    let mut apply = |name: &str, what: &str, verdict: Verdict, prior: &mut Option<Prior>, notes: &mut Vec<String>| {
+    let mut apply = |name: &str, what: &str, verdict: Verdict, prior: &mut Option<Prior>, notes: &mut Notes| {
         match verdict {
             Verdict::Kept => {}
             Verdict::Converted(depth) => {
@@ -265,7 +265,7 @@ mod tests {
         let before = scene.notes.len();
         check_priors(&mut scene);
         assert!(scene.train[3].prior.is_none());
-        let notes = scene.notes[before..].join("\n");
+        let notes = scene.notes[before..].iter().map(|note| &**note).collect::<Vec<&str>>().join("\n");
         let name = &scene.train[3].name;
         assert!(notes.contains(&format!("{name}: its depth prior does not follow the points")), "{notes}");
         assert!(notes.contains("1 disparity priors are turned into depth"), "{notes}");
