@@ -428,3 +428,17 @@ fn rounds_from_the_last_steps_on_never_come() {
         assert!(!plan.growth && plan.rounds.is_none(), "from {from}, every {every}: {:?}", plan.rounds);
     }
 }
+
+/// Points so far apart that each has a cell of the coarsest grid to itself: growth is expected everywhere, and there are
+/// fewer Gaussians to grow from than the formula asks for.
+#[test]
+fn points_far_apart_are_rehearsed() {
+    let gpu = testing::gpu();
+    let scene = common::tiny();
+    let mut settings = common::settings(14);
+    settings.model.voxel = 1e-3;
+    settings.densify.levels = 3;
+    let verdict = forecast::forecast(&gpu, &scene, &settings, Question::default()).expect("a forecast");
+    let forecast = verdict.forecast.expect("it fits a binding");
+    assert!(forecast.anchors > forecast.survey.anchors, "{} anchors", forecast.anchors);
+}

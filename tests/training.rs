@@ -13,9 +13,10 @@ use gscream_vk::gpu::{Descriptors, Form, Gpu, Options, testing};
 use gscream_vk::losses::config::Region;
 use gscream_vk::model::files;
 use gscream_vk::render::view::{Capacity, Renderer};
-use gscream_vk::scene::{self, Scene};
+use gscream_vk::scene::{self, Scene, synthetic};
 use gscream_vk::train::config::Coarse;
-use gscream_vk::train::run::{Run, Summary};
+use gscream_vk::train::run::{Observer, Progress, Run, Signal, Summary};
+use gscream_vk::train::{checkpoint, forecast};
 
 /// What a run ends with.
 struct Trained {
@@ -489,4 +490,122 @@ fn three_steps_of_photographs_alone() {
     let plan = three_steps(&scene, 12.0);
     assert!(!plan.masks && !plan.depth && !plan.depth_gradient && !plan.attention && plan.growth, "{plan:?}");
     assert!(plan.references.is_empty(), "{plan:?}");
+}
+
+/// Corrects the schedule behind these steps.
+struct Corrects(Vec<[u32; 2]>, Vec<[u32; 2]>);
+
+impl Observer for Corrects {
+    fn corrects(&mut self, last: &Progress) -> bool {
+        self.0.first().is_some_and(|[step, _]| *step <= last.step)
+    }
+    fn correction(&mut self, last: &Progress, _settings: &Settings) -> Option<u32> {
+        let [step, iterations] = self.0.remove(0);
+        assert_eq!(last.step, step, "nothing is in flight");
+        Some(iterations)
+    }
+    fn corrected(&mut self, corrections: &[[u32; 2]]) {
+        self.1 = corrections.to_vec();
+    }
+}
+
+/// A schedule that was corrected while the run went on is repeated by the settings written down, and resumed.
+#[test]
+fn corrections_are_repeated_to_the_byte() {
+    let (gpu, scene) = (testing::gpu(), scene_without_tests());
+    let mut settings = common::settings(14);
+    settings.train.coarse = Coarse { until: 6, factor: 2 };
+    settings.train.checkpoint_interval = 7;
+    let files = |folder: &std::path::Path| {
+        [files::POINT_CLOUD, files::WEIGHTS]
+            .map(|name| std::fs::read(folder.join("model").join(name)).expect("a model"))
+    };
+    let corrections = vec![[3, 20], [8, 16], [10, 12]];
+    let live = tempfile::tempdir().expect("a folder");
+    let mut watch = Corrects(corrections.clone(), vec![]);
+    let summary = Run::new(&gpu, &scene, &settings).expect("room").train(live.path(), &mut watch).expect("a run");
+    assert_eq!((summary.steps, watch.1), (12, corrections.clone()));
+
+    let mut written = settings.clone();
+    written.train.corrections = corrections;
+    let read = Settings::resolve(&[]).map(|_| toml::from_str::<Settings>(&written.to_toml()).expect("settings"));
+    assert_eq!(read.expect("defaults"), written);
+    let repeated = tempfile::tempdir().expect("a folder");
+    let summary =
+        Run::new(&gpu, &scene, &written).expect("room").train(repeated.path(), &mut Watch::default()).expect("a run");
+    assert_eq!(summary.steps, 12);
+    assert!(files(live.path()) == files(repeated.path()));
+
+    for stop in [2, 5, 9, 11] {
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut watch = StopsBehind(stop);
+        Run::new(&gpu, &scene, &written).expect("room").train(folder.path(), &mut watch).expect_err("stopped");
+        let owner = checkpoint::Owner::new(&scene, &written);
+        let (_, state) = checkpoint::latest(folder.path(), &owner).found.expect("a checkpoint");
+        let summary = Run::resume(&gpu, &scene, &written, state)
+            .expect("room")
+            .train(folder.path(), &mut Watch::default())
+            .expect("a run");
+        assert_eq!(summary.steps, 12, "{stop}");
+        assert!(files(live.path()) == files(folder.path()), "stopped behind step {stop}");
+    }
+    // The same without corrections is another run.
+    let plain = tempfile::tempdir().expect("a folder");
+    settings.train.iterations = 12;
+    Run::new(&gpu, &scene, &settings).expect("room").train(plain.path(), &mut Watch::default()).expect("a run");
+    assert!(files(live.path()) != files(plain.path()));
+}
+
+/// Ends a run behind a step.
+struct StopsBehind(u32);
+
+impl Observer for StopsBehind {
+    fn step(&mut self, progress: &Progress) {
+        self.0 = if progress.step >= self.0 { 0 } else { self.0 };
+    }
+    fn interrupted(&mut self) -> Option<Signal> {
+        (self.0 == 0).then_some(Signal::Interrupt)
+    }
+}
+
+/// Where a binding holds little, anchors grow to what fits and training goes on; a cloud that is too dense to begin with
+/// starts on a coarser grid.
+#[test]
+fn a_device_that_binds_little_trains_to_the_end() {
+    let open = |bytes| testing::fresh_gpu(Options { max_binding_bytes: Some(bytes), ..Options::default() });
+    let folder = tempfile::tempdir().expect("a folder");
+    let dir = folder.path().join("scene");
+    let options = synthetic::Options { seed: 1, width: 48, height: 36, train_views: 6, test_views: 2, points: 3_000 };
+    synthetic::write(&dir, &options).expect("a scene");
+    let scene = scene::load(&dir, &scene::Config::default()).expect("a scene");
+    let mut settings = common::settings(12);
+    settings.densify.gradient_threshold = 1e-9;
+    let initial = forecast::initial(&scene, &settings).expect("points").anchors.position.len() as u32;
+
+    // Room for a few more anchors than there are: 480 bytes of gradients of the outputs each.
+    let gpu = open(480 * (u64::from(initial) + 300));
+    let fitting = forecast::fitting(&gpu, &scene, &settings, None).expect("a forecast");
+    assert!(fitting.verdict.fits() && fitting.reduced.is_none(), "{:?}", fitting.reduced);
+    let trained = train(&gpu, &scene, &settings, None);
+    assert_eq!(trained.summary.steps, 12);
+    assert_eq!(trained.summary.anchors, initial + 300);
+    assert!(trained.watch.lines.iter().any(|line| line.contains("had no room")), "{:?}", trained.watch.lines);
+
+    let gpu = open(480 * u64::from(initial) * 4 / 5);
+    let fitting = forecast::fitting(&gpu, &scene, &settings, None).expect("a forecast");
+    let reduced = fitting.reduced.expect("it does not fit as it is");
+    assert!(reduced.contains("times coarser (model.voxel_factor="), "{reduced}");
+    let trained = train(&gpu, &scene, &fitting.settings, None);
+    assert_eq!(trained.summary.steps, 12);
+    assert!(trained.summary.anchors <= initial * 4 / 5);
+
+    // Little memory: growing stops earlier, or begins on a coarser grid.
+    let gpu = testing::gpu();
+    let whole =
+        forecast::fitting(&gpu, &scene, &settings, None).expect("a forecast").verdict.forecast.expect("it fits");
+    let between = u64::midpoint(whole.start, whole.peak) + gscream_vk::gpu::device::SPARE_BYTES;
+    let fitting = forecast::fitting(&gpu, &scene, &settings, Some(between)).expect("a forecast");
+    let reduced = fitting.reduced.expect("it does not fit as it is");
+    assert!(reduced.starts_with("growing stops earlier, at "), "{reduced}");
+    assert!(fitting.verdict.forecast.expect("it fits").needs() <= between);
 }

@@ -34,7 +34,7 @@ pub const TEST: &str = "test";
 pub const SEEN: &str = "seen";
 
 /// Who made a run and of what.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Record {
     /// Version of the program.
     pub version: String,
@@ -47,6 +47,31 @@ pub struct Record {
     /// Steps taken, once the run is complete.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub complete: Option<u32>,
+    /// What the settings were that were made to fit the device.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub asked: Option<Asked>,
+}
+
+/// The settings that are reduced where the device has no room for them, as they were asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Asked {
+    voxel: f64,
+    voxel_factor: f64,
+    max_anchors: u32,
+}
+
+impl Asked {
+    /// Those of these settings.
+    pub fn of(settings: &Settings) -> Self {
+        let Settings { model, densify, .. } = settings;
+        Self { voxel: model.voxel, voxel_factor: model.voxel_factor, max_anchors: densify.max_anchors }
+    }
+
+    /// Undoes the reduction.
+    pub fn restore(&self, settings: &mut Settings) {
+        (settings.model.voxel, settings.model.voxel_factor) = (self.voxel, self.voxel_factor);
+        settings.densify.max_anchors = self.max_anchors;
+    }
 }
 
 impl Record {
@@ -59,6 +84,7 @@ impl Record {
             scene: scene.to_owned(),
             command: command.join(" "),
             complete: None,
+            asked: None,
         }
     }
 

@@ -303,6 +303,7 @@ mod tests {
             scene: "/somewhere/garden & <gate>".into(),
             command: "gscream-vk train 'garden & <gate>'".into(),
             complete,
+            asked: None,
         }
     }
 

@@ -10,7 +10,7 @@ use crate::atomic::AtomicWriteFile;
 use anyhow::{Context as _, bail, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::folders::{MODEL, RECORD, Record, SEEN, SETTINGS, TEST};
+use super::folders::{Asked, MODEL, RECORD, Record, SEEN, SETTINGS, TEST};
 use super::shared::{DeviceArgs, SceneArgs, load_scene, with_gpu};
 use super::{index, instruments, minutes, next, pictures, preset};
 use crate::capture::doctor::{self, Severity};
@@ -22,7 +22,7 @@ use crate::model::files::{POINT_CLOUD, WEIGHTS};
 use crate::render::view::Rendered;
 use crate::scene::{Camera, Scene};
 use crate::train::checkpoint::{self, Owner, Search};
-use crate::train::forecast::{self, Question};
+use crate::train::forecast::{self, Fitting, Question};
 use crate::train::run::{LOG, Observer, Progress, Run, Signal, Summary};
 use crate::view::live::{Board, Host};
 use crate::view::server;
@@ -81,8 +81,9 @@ pub(super) struct Args {
     view: Option<SocketAddr>,
     /// Train for about so many minutes: the schedule is fitted to as many steps as this device takes in that time
     ///
-    /// The steps are counted before training begins, and the settings written down repeat the run to the byte. Learning
-    /// rates follow the number of steps, and nothing is evaluated before the end.
+    /// It is corrected while the training runs, as steps take longer or other programs take the machine. The settings
+    /// written down have the corrections and repeat the run to the byte. Learning rates follow the number of steps, and
+    /// nothing is evaluated before the end.
     #[arg(long, value_name = "N", conflicts_with_all = ["iterations", "resume", "resume_or_start"], value_parser = positive)]
     minutes: Option<f64>,
     /// Measure every pass: prints milliseconds per pass and writes trace.json (for chrome://tracing or Perfetto)
@@ -164,12 +165,15 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     eprintln!("doctor: {}", looked.verdict());
     let options = Options { timestamps: args.profile, ..args.device.options() };
     with_gpu(&options, |gpu| {
-        let settings = match args.minutes {
-            Some(time) => minutes::fitted(gpu, &scene, &settings, time, began)?,
-            None => settings,
+        let (settings, clock) = match args.minutes {
+            Some(time) => {
+                let (settings, clock) = minutes::fitted(gpu, &scene, &settings, time, began)?;
+                (settings, Some(clock))
+            }
+            None => (settings, None),
         };
         let board = args.view.map(|address| show(address, &name, &scene, &settings)).transpose()?;
-        let manner = Manner { began: Some(began), board, go_on: begun };
+        let manner = Manner { began: Some(began), board, go_on: begun, clock };
         eprintln!("device: {} ({})", gpu.info().name, gpu.info().driver);
         let Trained { summary, report, mut written } =
             train(gpu, &scene, &settings, &name, &folder, &manner, &Judge::default())?;
@@ -235,7 +239,10 @@ fn same_run(folder: &Path, record: &Record, name: &str, settings: &Settings) -> 
     if record.scene != name {
         bail!("{}: holds a run of another scene, {}, where {name} was asked for: {or}", folder.display(), record.scene);
     }
-    let theirs = Settings::resolve(&[Source::File(folder.join(SETTINGS))])?;
+    let mut theirs = Settings::resolve(&[Source::File(folder.join(SETTINGS))])?;
+    if let Some(asked) = &record.asked {
+        asked.restore(&mut theirs);
+    }
     if let Some(difference) = checkpoint::setting_difference(&theirs.to_toml(), &settings.to_toml()) {
         bail!("{}: holds a run with other settings, {difference}: {or}", folder.display());
     }
@@ -257,6 +264,8 @@ pub(super) struct Manner {
     pub board: Option<Arc<Board>>,
     /// Goes on with a run that is in the folder and not complete, instead of replacing it.
     pub go_on: bool,
+    /// Ends when the time is over.
+    pub clock: Option<minutes::Clock>,
 }
 
 /// What a finished run is.
@@ -281,13 +290,21 @@ pub(super) fn train(
     judge: &Judge,
 ) -> anyhow::Result<Trained> {
     if manner.go_on && Record::read(folder)?.complete.is_none() {
+        // Those that it began with: they may have been made to fit the device.
+        let settings = &Settings::resolve(&[Source::File(folder.join(SETTINGS))])?;
         return resume(gpu, scene, settings, name, folder, manner, judge);
     }
-    let run = start(gpu, scene, settings)?;
+    let asked = settings;
+    let Fitting { settings, verdict, reduced } = forecast::fitting(gpu, scene, asked, None)?;
+    if let Some(line) = &reduced {
+        eprintln!("memory: {line}");
+    }
+    let settings = &settings;
+    let run = start(gpu, scene, settings, &verdict)?;
     clear(folder)?;
     let path = folder.join(SETTINGS);
     write(&path, &settings.to_toml()).with_context(|| format!("{}: cannot be written", path.display()))?;
-    let record = Record::new(&gpu.info().name, name);
+    let record = Record { asked: reduced.map(|_| Asked::of(asked)), ..Record::new(&gpu.info().name, name) };
     record.write(folder)?;
     for left in &run.step().plan.left_out {
         eprintln!("left out: {} ({})", left.what, left.why);
@@ -297,8 +314,12 @@ pub(super) fn train(
 }
 
 /// A run from its first step, with room for what it is expected to take; refused where the device has not that much.
-fn start<'a>(gpu: &'a Gpu, scene: &'a Scene, settings: &'a Settings) -> anyhow::Result<Run<'a>> {
-    let verdict = forecast::forecast(gpu, scene, settings, Question::default())?;
+fn start<'a>(
+    gpu: &'a Gpu,
+    scene: &'a Scene,
+    settings: &'a Settings,
+    verdict: &forecast::Verdict,
+) -> anyhow::Result<Run<'a>> {
     if let Some(why) = verdict.describe() {
         ensure!(verdict.starts(), "{}: {why}", gpu.info().name);
         eprintln!("memory: {why}");
@@ -335,7 +356,7 @@ fn resume(
         ),
         None => {
             eprintln!("resuming: no checkpoint yet, the run starts again");
-            start(gpu, scene, settings)?
+            start(gpu, scene, settings, &forecast::forecast(gpu, scene, settings, Question::default())?)?
         }
         Some((path, state)) => {
             reasons.iter().for_each(|reason| eprintln!("{reason}"));
@@ -360,7 +381,8 @@ fn finish(mut run: Run<'_>, settings: &Settings, folder: &Path, manner: &Manner)
     let signals = Signals::listen()?;
     let bar = bar(settings.train.iterations, run.done());
     let host = manner.board.as_ref().map(Host::new);
-    let mut watch = Watch { bar, pictures: folder.join(TEST), failed: None, signals, began: manner.began, host };
+    let clock = manner.clock.clone().map(|clock| (clock, folder.join(SETTINGS), settings.clone()));
+    let mut watch = Watch { bar, pictures: folder.join(TEST), failed: None, signals, began: manner.began, host, clock };
     let result = run.train(folder, &mut watch);
     watch.bar.finish_and_clear();
     let mut summary = result.inspect_err(|_| index::of_stopped(folder))?;
@@ -498,6 +520,8 @@ struct Watch {
     /// Until the first step has ended.
     began: Option<Instant>,
     host: Option<Host>,
+    /// With the file of the settings, and these as the run began with them.
+    clock: Option<(minutes::Clock, PathBuf, Settings)>,
 }
 
 /// SIGINT and SIGTERM, remembered; a second one of a kind ends the program at once.
@@ -541,6 +565,26 @@ impl Observer for Watch {
         }
         self.bar.set_position(progress.step.into());
         self.bar.set_message(format!("loss {:.4}  {} anchors", progress.loss, progress.anchors));
+    }
+
+    fn corrects(&mut self, last: &Progress) -> bool {
+        self.clock.as_mut().is_some_and(|(clock, ..)| clock.is_due(clock.now(), last))
+    }
+
+    fn correction(&mut self, last: &Progress, settings: &Settings) -> Option<u32> {
+        let (clock, ..) = self.clock.as_mut()?;
+        let iterations = clock.correction(clock.now(), last, settings)?;
+        self.bar.set_length(iterations.into());
+        Some(iterations)
+    }
+
+    fn corrected(&mut self, corrections: &[[u32; 2]]) {
+        let Some((_, path, settings)) = &mut self.clock else { return };
+        settings.train.corrections = corrections.to_vec();
+        if let Err(error) = write(path, &settings.to_toml()) {
+            let line = format!("warning: {}: cannot be written: {error}", path.display());
+            self.say(&line);
+        }
     }
 
     fn visited(&mut self) -> bool {

@@ -143,6 +143,41 @@ impl Settings {
         new
     }
 
+    /// These settings with the rest of the schedule behind step `done` fitted to `iterations` steps in all: what starts and
+    /// ends later keeps its place in the rest of the run, and learning rates go on from where they are to the same end.
+    /// Nothing changes for the steps up to `done`.
+    pub fn corrected(&self, done: u32, iterations: u32) -> Self {
+        let mut new = self.clone();
+        let old = self.train.iterations;
+        let [left, rest] = [old, iterations].map(|n| f64::from(n.saturating_sub(done)));
+        let stretch = rest / left.max(1.0);
+        let at = |step: u32| {
+            if step <= done { step } else { done + (f64::from(step - done) * stretch).round() as u32 }
+        };
+        new.train.iterations = iterations;
+        new.train.coarse.until = at(self.train.coarse.until);
+        let length = if self.optimizer.schedule_length == 0 { old } else { self.optimizer.schedule_length };
+        if length > done {
+            new.optimizer.schedule_length = at(length).max(done + 1);
+            // The rate is log-linear in the step: the line through today's rate and the last one, continued to step 0.
+            let [before, after] = [length, new.optimizer.schedule_length].map(|n| f64::from(done) / f64::from(n));
+            for group in Group::ALL {
+                let rate = new.optimizer.learning_rate.of_mut(group);
+                let [initial, last] = *rate;
+                if initial > 0.0 && last > 0.0 && initial != last {
+                    let now = initial.ln() * (1.0 - before) + last.ln() * before;
+                    rate[0] = ((now - last.ln() * after) / (1.0 - after)).exp();
+                }
+            }
+        }
+        new.model.attention.start = at(self.model.attention.start);
+        let densify = &mut new.densify;
+        densify.statistics_from = at(self.densify.statistics_from);
+        densify.from = at(self.densify.from);
+        densify.until = at(self.densify.until).max(densify.from);
+        new
+    }
+
     /// The settings as TOML, every key written out; [`Settings::resolve`] reads it back to the same value.
     pub fn to_toml(&self) -> String {
         toml::to_string(self).expect("settings are tables of plain values")

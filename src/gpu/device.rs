@@ -61,6 +61,9 @@ pub struct Options {
     pub subgroup_size: Option<u32>,
     /// Form of the work in place of the one made for the device's kind.
     pub form: Option<Form>,
+    /// Bytes that one binding holds at most, where the device's own limit is higher. For tests alone.
+    #[doc(hidden)]
+    pub max_binding_bytes: Option<u64>,
 }
 
 impl Options {
@@ -162,6 +165,9 @@ impl Gpu {
         let missing = |feature| Error::Missing { device: found.info.name.clone(), feature };
         if let Some(size) = options.subgroup_size {
             info.subgroup_size = found.subgroups.wanted(size).map_err(missing)?;
+        }
+        if let Some(limit) = options.max_binding_bytes {
+            info.max_binding_bytes = info.max_binding_bytes.min(limit);
         }
         let push = match options.descriptors {
             Descriptors::Auto => info.push_descriptors,

@@ -44,7 +44,7 @@ impl Term {
     }
 
     /// Its place in [`Losses::terms`].
-    fn slot(self) -> u32 {
+    pub(crate) fn slot(self) -> u32 {
         Self::ALL.iter().position(|term| term.name == self.name).expect("all are listed") as u32
     }
 }

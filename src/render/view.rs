@@ -40,6 +40,28 @@ impl Capacity {
             pairs: fit(self.pairs, counters[Counter::Pairs as usize]),
         }
     }
+
+    /// The same with no more spare room than the device binds: what `counters` counted stays whatever the device's limit.
+    pub fn within(self, gpu: &Gpu, counters: [u32; COUNTERS]) -> Self {
+        let [visible, pairs] = [Counter::Visible, Counter::Pairs].map(|counter| counters[counter as usize]);
+        Self {
+            anchors: self.anchors,
+            visible: self.visible.min(self.anchors.max(visible).max(1)),
+            pairs: self.pairs.min(most_pairs(gpu).max(pairs).max(1)),
+        }
+    }
+}
+
+/// As many anchors of `offsets` Gaussians as the device trains: each of their arrays fits one binding, and so does each
+/// array that a view needs which shows all of them.
+pub fn most_anchors(gpu: &Gpu, offsets: u32) -> u32 {
+    let in_view = gpu.info().max_binding_bytes.min(u32::MAX.into()) / decode::widest(offsets);
+    Anchors::most(gpu, offsets).min(in_view as u32)
+}
+
+/// As many (Gaussian, tile) pairs as the device trains: the widest array over them holds three floats each.
+fn most_pairs(gpu: &Gpu) -> u32 {
+    (gpu.info().max_binding_bytes / 12).min(u32::MAX.into()) as u32
 }
 
 /// The forward stages, from anchors to a picture.

@@ -29,6 +29,10 @@ pub struct Config {
     /// Steps between two searches of all gradients, parameters and moments for values that are not finite. The losses and
     /// the networks' gradients are searched in every step. 0 searches nothing: a broken model trains on.
     pub sentinel_interval: u32,
+    /// `[step, iterations]`: behind that step the rest of the schedule was fitted to so many steps in all. Written by
+    /// `train --minutes` while it runs; with them the same settings repeat the run to the byte.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub corrections: Vec<[u32; 2]>,
     /// Smaller pictures first.
     pub coarse: Coarse,
 }
@@ -80,6 +84,7 @@ impl Default for Config {
             save_interval: 5_000,
             checkpoint_interval: 1_000,
             sentinel_interval: 50,
+            corrections: vec![],
             coarse: Coarse::default(),
         }
     }
@@ -103,6 +108,13 @@ impl Config {
         )?;
         let share = self.reference_share;
         ensure((0.0..=0.9).contains(&share), "reference_share", share, "must be between 0 and 0.9")?;
+        let ascending = self.corrections.windows(2).all(|two| two[0][0] < two[1][0]);
+        ensure(
+            ascending && self.corrections.iter().all(|[step, iterations]| step < iterations),
+            "corrections",
+            format_args!("{:?}", self.corrections),
+            "must be pairs of a step and a later last step, in the order of the steps",
+        )?;
         ensure(self.log_interval > 0, "log_interval", self.log_interval, "must be at least 1")?;
         let factor = self.coarse.factor;
         ensure((2..=16).contains(&factor), "coarse.factor", factor, "must be between 2 and 16")

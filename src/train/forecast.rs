@@ -20,7 +20,7 @@ use crate::model::anchors::Anchors;
 use crate::model::init::{self, Initial};
 use crate::primitives::limit::{Counter, Limits};
 use crate::render::Method;
-use crate::render::view::{Capacity, Forward, Model};
+use crate::render::view::{self, Capacity, Forward, Model};
 use crate::scene::{Camera, Notes, Prior, Reference, Scene, View};
 use crate::stage;
 
@@ -136,7 +136,7 @@ pub fn expected_anchors(gpu: &Gpu, plan: &Plan, settings: &Settings, initial: &I
 
 /// The most anchors that growing makes.
 fn most_anchors(gpu: &Gpu, settings: &Settings, count: u32) -> u32 {
-    let most = Anchors::most(gpu, settings.model.offsets);
+    let most = view::most_anchors(gpu, settings.model.offsets);
     let most = if settings.densify.max_anchors == 0 { most } else { most.min(settings.densify.max_anchors) };
     most.max(count)
 }
@@ -276,8 +276,11 @@ pub fn rehearse(
             let target = f64::from(survey.anchors) + grown * share(round) / share(rounds.len());
             let more = (target as u32).saturating_sub(step.anchors.count).div_ceil(settings.densify.levels);
             let room = most_anchors(&gpu, settings, survey.anchors);
-            let kept = (step.anchors.count + more * settings.densify.levels).min(room.max(step.anchors.count));
-            for (buffer, word) in [("candidate_count", 4 * more), ("free_count", more), ("kept_count", kept)] {
+            // A level has a candidate for every Gaussian at most, and no more free cells than candidates.
+            let candidates = more.saturating_mul(4).min(step.anchors.count.saturating_mul(settings.model.offsets));
+            let free = more.min(candidates);
+            let kept = (step.anchors.count + free * settings.densify.levels).min(room.max(step.anchors.count));
+            for (buffer, word) in [("candidate_count", candidates), ("free_count", free), ("kept_count", kept)] {
                 gpu.answer(buffer, word);
             }
             step.change_anchors(number)?;
@@ -413,22 +416,112 @@ const VIEWS: usize = 8;
 pub fn forecast(gpu: &Gpu, scene: &Scene, settings: &Settings, question: Question) -> Result<Verdict, Error> {
     let available = question.available.unwrap_or_else(|| gpu.available_bytes());
     let settings = &settings.fitted(scene);
-    let plan = Plan::new(scene, settings);
-    let first = initial(scene, settings)?;
-    let cameras = || scene.train.iter().map(|v| &v.camera);
-    let counts = surveyed(gpu, &first, settings, cameras())?;
-    let anchors = question.anchors.unwrap_or_else(|| expected_anchors(gpu, &plan, settings, &first));
-    let rehearsed = rehearse(gpu, scene, settings, &first, counts, anchors, question.also);
-    let forecast = match rehearsed {
-        Ok(forecast) => Ok(forecast),
-        Err(Error::Gpu(error @ gpu::Error::TooLarge { .. })) => Err(error.to_string()),
-        Err(error) => return Err(error),
-    };
+    let start = Start::of(gpu, scene, settings)?;
+    let anchors = question.anchors.unwrap_or_else(|| start.expected(gpu, scene, settings));
+    let forecast = start.rehearse(gpu, scene, settings, anchors, question.also)?;
     let mut verdict = Verdict { available, forecast, remedies: vec![] };
     if !verdict.fits() {
         verdict.remedies = remedies(gpu, scene, settings, question, available)?;
     }
     Ok(verdict)
+}
+
+/// What a run starts from, looked up once for several rehearsals.
+struct Start {
+    initial: Initial,
+    counts: Survey,
+}
+
+impl Start {
+    fn of(gpu: &Gpu, scene: &Scene, settings: &Settings) -> Result<Self, Error> {
+        let initial = initial(scene, settings)?;
+        let counts = surveyed(gpu, &initial, settings, scene.train.iter().map(|v| &v.camera))?;
+        Ok(Self { initial, counts })
+    }
+
+    fn expected(&self, gpu: &Gpu, scene: &Scene, settings: &Settings) -> u32 {
+        expected_anchors(gpu, &Plan::new(scene, settings), settings, &self.initial)
+    }
+
+    /// The run with so many anchors at its end, or the one buffer that the device cannot bind.
+    fn rehearse(
+        &self,
+        gpu: &Gpu,
+        scene: &Scene,
+        settings: &Settings,
+        anchors: u32,
+        also: Option<u32>,
+    ) -> Result<Result<Forecast, String>, Error> {
+        match rehearse(gpu, scene, settings, &self.initial, self.counts, anchors, also) {
+            Ok(forecast) => Ok(Ok(forecast)),
+            Err(Error::Gpu(error @ gpu::Error::TooLarge { .. })) => Ok(Err(error.to_string())),
+            Err(error) => Err(error),
+        }
+    }
+}
+
+/// Settings under which a run fits the device.
+#[derive(Clone, Debug)]
+pub struct Fitting {
+    /// Those asked for, or with fewer anchors.
+    pub settings: Settings,
+    /// What they come to; where nothing fits, that of the settings asked for.
+    pub verdict: Verdict,
+    /// One sentence on what was reduced.
+    pub reduced: Option<String>,
+}
+
+/// By how much the initial grid is made coarser, one after the other, until the first anchors fit.
+const COARSER: [f64; 10] = [1.0, 1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0];
+/// Shares of the expected growth that are tried, the most first.
+const GROWTH_SHARES: [f64; 6] = [1.0, 0.75, 0.5, 0.25, 0.1, 0.0];
+
+/// The settings, with no more anchors than the device has room for over the whole run: less growth first, then a coarser
+/// grid. `available` is what there is to plan for, instead of the bytes free now.
+///
+/// # Errors
+/// As [`forecast`].
+pub fn fitting(gpu: &Gpu, scene: &Scene, asked: &Settings, available: Option<u64>) -> Result<Fitting, Error> {
+    let available = available.unwrap_or_else(|| gpu.available_bytes());
+    let most = view::most_anchors(gpu, asked.model.offsets) as usize;
+    for coarser in COARSER {
+        let mut settings = asked.clone();
+        let model = &mut settings.model;
+        let grid = if model.voxel > 0.0 { &mut model.voxel } else { &mut model.voxel_factor };
+        *grid *= coarser;
+        let grid = *grid;
+        let count = initial(scene, &settings)?.anchors.position.len();
+        if count > most {
+            continue;
+        }
+        let start = Start::of(gpu, scene, &settings.fitted(scene))?;
+        let expected = start.expected(gpu, scene, &settings.fitted(scene));
+        for share in GROWTH_SHARES {
+            let anchors = count as u32 + (f64::from(expected.saturating_sub(count as u32)) * share) as u32;
+            if share < 1.0 {
+                settings.densify.max_anchors = anchors;
+            }
+            let forecast = start.rehearse(gpu, scene, &settings.fitted(scene), anchors, None)?;
+            let verdict = Verdict { available, forecast, remedies: vec![] };
+            if verdict.fits() {
+                let what = if coarser > 1.0 {
+                    let key = if asked.model.voxel > 0.0 { "model.voxel" } else { "model.voxel_factor" };
+                    Some(format!("the first anchors stand on a grid {coarser} times coarser ({key}={grid})"))
+                } else {
+                    (share < 1.0).then(|| "growing stops earlier".to_owned())
+                };
+                let reduced = what.map(|what| {
+                    format!("{what}, at {anchors} anchors at most (densify.max_anchors), which is what the device has room for")
+                });
+                return Ok(Fitting { settings, verdict, reduced });
+            }
+            if expected as usize <= count {
+                break;
+            }
+        }
+    }
+    let verdict = forecast(gpu, scene, asked, Question { available: Some(available), ..Question::default() })?;
+    Ok(Fitting { settings: asked.clone(), verdict, reduced: None })
 }
 
 /// As [`survey`]; where the device has no room for that either, or no memory at all, as if all anchors were in view.

@@ -70,6 +70,13 @@ const CHUNKS: usize = 1024;
 
 const SECOND_CHUNKS: usize = 8192;
 
+/// Bytes per anchor in view of the widest buffer that decoding it needs, for `offsets` Gaussians each: the hidden units,
+/// the gradients of the outputs, or a vector of four per Gaussian.
+pub fn widest(offsets: u32) -> u64 {
+    let rows = Layout { offsets: offsets as usize }.rows();
+    4 * (HEADS * HIDDEN).max(rows).max(4 * offsets as usize) as u64
+}
+
 /// Anchors of one chunk.
 fn chunk_anchors(anchors: usize) -> usize {
     BLOCK * anchors.div_ceil(BLOCK * CHUNKS).max(1)

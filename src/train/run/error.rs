@@ -24,6 +24,14 @@ pub enum Error {
     /// A checkpoint.
     #[error(transparent)]
     Checkpoint(#[from] checkpoint::WriteError),
+    /// What is trained cannot become anything.
+    #[error(
+        "the training comes to nothing: {what}; `gscream-vk doctor` says whether cameras, points and photographs belong together"
+    )]
+    Nothing {
+        /// One clause on how that shows.
+        what: String,
+    },
     /// Somebody asked for an end.
     #[error("stopped by {signal}")]
     Interrupted {
@@ -88,7 +96,7 @@ impl Error {
 fn how_to_go_on(source: &Error, kept: Option<u32>, folder: &Path) -> String {
     match kept {
         // The same step would end the same way.
-        Some(step) if matches!(source, Error::NotFinite { found: Some(_), .. }) => {
+        Some(step) if matches!(source, Error::NotFinite { found: Some(_), .. } | Error::Nothing { .. }) => {
             format!("the last good state, behind step {step}, is {}", checkpoint::path(folder, step).display())
         }
         Some(step) => {

@@ -2,12 +2,13 @@
 
 mod error;
 mod observer;
+mod vain;
 
 use crate::atomic::AtomicWriteFile;
 use crate::config::Settings;
 use crate::evaluate::{self, Report, ViewMetrics};
 use crate::gpu::{self, Buffer, Gpu, NotFinite, Submission, Timing, Timings};
-use crate::losses::Term;
+use crate::losses::{Term, photometric};
 use crate::model::{files, init};
 use crate::primitives::finite::NOT_FINITE;
 use crate::primitives::limit::{COUNTERS, Counter};
@@ -28,6 +29,7 @@ use std::fs::File;
 use std::io::Write as _;
 use std::path::Path;
 use std::time::Instant;
+use vain::Vain;
 
 /// A line of `log.jsonl`.
 #[derive(Serialize)]
@@ -89,6 +91,7 @@ struct Session<'f> {
     rate: (u32, Instant),
     /// Nothing is written, and the state before every step is kept until the step has turned out well.
     careful: bool,
+    vain: Vain,
     timings: Timings,
     last_timings: Vec<Timing>,
 }
@@ -118,6 +121,7 @@ impl<'f> Session<'f> {
             paused: 0.0,
             rate: (0, now),
             careful: true,
+            vain: Vain::default(),
             timings: Timings::default(),
             last_timings: vec![],
         }
@@ -149,11 +153,24 @@ fn fresh(gpu: &Gpu, scene: &Scene, settings: &Settings) -> Result<Step, Error> {
     Ok(Step::new(gpu, plan, settings, &initial.anchors, &weights, initial.voxel)?)
 }
 
+/// The settings for the step behind `done`.
+fn corrected(asked: &Settings, corrections: &[[u32; 2]], done: u32) -> Settings {
+    let due = corrections.iter().filter(|[step, _]| *step <= done);
+    due.fold(asked.clone(), |settings, [step, iterations]| settings.corrected(*step, *iterations))
+}
+
 /// A training run.
 pub struct Run<'a> {
     gpu: &'a Gpu,
     scene: &'a Scene,
-    settings: &'a Settings,
+    /// As the run began with them.
+    asked: &'a Settings,
+    /// As they are for the next step, all corrections up to there in them.
+    settings: Settings,
+    /// Those made or to be made, in order.
+    corrections: Vec<[u32; 2]>,
+    /// How many of them are in `settings`.
+    corrected: usize,
     photographs: Vec<Photograph>,
     step: Step,
     order: Order,
@@ -179,7 +196,8 @@ impl<'a> Run<'a> {
     /// # Errors
     /// When the device has no room.
     pub fn resume(gpu: &'a Gpu, scene: &'a Scene, settings: &'a Settings, state: State) -> Result<Self, Error> {
-        let step = state.model.restore(gpu, Plan::new(scene, settings), &settings.fitted(scene))?;
+        let now = corrected(settings, &settings.train.corrections, state.history.last.step);
+        let step = state.model.restore(gpu, Plan::new(scene, &now), &now.fitted(scene))?;
         Self::with(gpu, scene, settings, step, state.history)
     }
 
@@ -203,10 +221,14 @@ impl<'a> Run<'a> {
             })
             .collect::<Result<_, gpu::Error>>()?;
         let order = Order::of(scene, &settings.train);
+        let corrections = settings.train.corrections.clone();
         Ok(Self {
             gpu,
             scene,
-            settings,
+            asked: settings,
+            settings: corrected(settings, &corrections, history.last.step),
+            corrected: corrections.iter().filter(|[step, _]| *step <= history.last.step).count(),
+            corrections,
             photographs,
             step,
             order,
@@ -294,7 +316,7 @@ impl<'a> Run<'a> {
     }
 
     fn record_view(&self, rec: &mut gpu::Recorder<'_>, step: u32, view: usize) {
-        let rates = Rates::at(self.settings, f64::from(self.scene.radius), step);
+        let rates = Rates::at(&self.settings, f64::from(self.scene.radius), step);
         self.step.record(rec, &self.photographs[view], step, rates);
     }
 
@@ -372,7 +394,6 @@ impl<'a> Run<'a> {
         history: &mut History,
         watch: &mut dyn Observer,
     ) -> Result<Option<Report>, Halt> {
-        let iterations = self.settings.train.iterations;
         let mut in_flight: VecDeque<InFlight<'a>> = VecDeque::new();
         let mut next = history.last.step + 1;
         let mut report = None;
@@ -389,7 +410,7 @@ impl<'a> Run<'a> {
         if session.careful {
             good = Some(Box::new(State { history: history.clone(), model: Model::of(self.gpu, &self.step)? }));
         }
-        while history.last.step < iterations && !(halt.is_some() && in_flight.is_empty()) {
+        while history.last.step < self.settings.train.iterations && !(halt.is_some() && in_flight.is_empty()) {
             if halt.is_none() {
                 halt = watch.interrupted().map(|signal| Error::Interrupted { signal });
             }
@@ -400,10 +421,18 @@ impl<'a> Run<'a> {
                 session.paused += pause.elapsed().as_secs_f64();
                 continue;
             }
+            // A correction of the schedule comes between two steps.
+            let due = self.next_correction().is_some_and(|[step, _]| step < next);
+            let corrects = due || halt.is_none() && !session.careful && watch.corrects(&history.last);
+            if corrects && in_flight.is_empty() {
+                self.correct(&history.last, due, watch);
+                continue;
+            }
             // What follows a change of the anchors or of the pictures' size, an evaluation, a save or a checkpoint waits until it is made.
             let behind = next > history.last.step + 1;
-            let blocked = halt.is_some() || visited || behind && (session.careful || self.pauses_behind(next - 1));
-            if next <= iterations && in_flight.len() < DEPTH && !blocked {
+            let blocked =
+                halt.is_some() || visited || corrects || behind && (session.careful || self.pauses_behind(next - 1));
+            if next <= self.settings.train.iterations && in_flight.len() < DEPTH && !blocked {
                 match self.submit(next, next as usize % DEPTH) {
                     Ok(submitted) => in_flight.push_back(submitted),
                     Err(error) => halt = Some(error),
@@ -466,6 +495,11 @@ impl<'a> Run<'a> {
             history.last = progress;
             history.told = false;
             session.rate.0 += 1;
+            if halt.is_none() && !session.careful {
+                let photometric = values[photometric::TERM.slot() as usize];
+                halt =
+                    session.vain.step(self.scene, &self.settings, counters[Counter::Drawn as usize], photometric).err();
+            }
             if self.step.changes_anchors(step) {
                 watch.say(&self.step.change_anchors(step)?);
             }
@@ -497,10 +531,32 @@ impl<'a> Run<'a> {
         }
         match halt {
             // It came too late to matter.
-            Some(Error::Interrupted { .. }) if history.last.step == iterations && history.told => Ok(report),
+            Some(Error::Interrupted { .. }) if history.last.step == self.settings.train.iterations && history.told => {
+                Ok(report)
+            }
             Some(error) => Err(Halt::Good(error)),
             None => Ok(report),
         }
+    }
+
+    /// The first correction that is not in the settings yet.
+    fn next_correction(&self) -> Option<[u32; 2]> {
+        self.corrections.get(self.corrected).copied()
+    }
+
+    /// Corrects the schedule behind the last step, as it is written down or as `watch` asks for. Nothing may be in flight.
+    fn correct(&mut self, last: &Progress, due: bool, watch: &mut dyn Observer) {
+        if !due {
+            let Some(iterations) = watch.correction(last, &self.settings) else { return };
+            // What was to be corrected later was fitted to another time.
+            self.corrections.truncate(self.corrected);
+            self.corrections.push([last.step, iterations.max(last.step + 1)]);
+            watch.corrected(&self.corrections);
+        }
+        let [step, iterations] = self.corrections[self.corrected];
+        self.corrected += 1;
+        self.settings = self.settings.corrected(step, iterations);
+        self.step.reschedule(self.settings.fitted(self.scene), &Plan::new(self.scene, &self.settings));
     }
 
     /// Makes what is written of the last step: the model's files, the evaluation, the line of the log.
@@ -596,15 +652,18 @@ impl<'a> Run<'a> {
     /// Repeats the steps from the last good checkpoint, or from the first step, to `noticed`, that one included. Returns
     /// the first whose results are not finite and the state before it; `noticed` and the state behind it if all are.
     fn repeat(&mut self, folder: &Path, noticed: u32) -> Result<(u32, Option<State>), Error> {
-        let settings = &self.settings.fitted(self.scene);
         // The stages' memory goes before a second model is made.
         self.step.resize(Capacity { anchors: 1, visible: 1, pairs: 1 })?;
         let candidates = checkpoint::list(folder).into_iter().filter(|(step, _)| *step < noticed);
         let base = candidates.filter_map(|(_, path)| checkpoint::read(&path, self.owner()).ok()).next();
+        let done = base.as_ref().map_or(0, |state| state.history.last.step);
+        self.settings = corrected(self.asked, &self.corrections, done);
+        self.corrected = self.corrections.iter().filter(|[step, _]| *step <= done).count();
+        let settings = &self.settings.fitted(self.scene);
         let mut history = History::default();
         match base {
             Some(state) => {
-                self.step = state.model.restore(self.gpu, self.step.plan.clone(), settings)?;
+                self.step = state.model.restore(self.gpu, Plan::new(self.scene, &self.settings), settings)?;
                 history = state.history;
             }
             None => self.step = fresh(self.gpu, self.scene, settings)?,
@@ -665,7 +724,7 @@ impl<'a> Run<'a> {
 
     /// Whose the checkpoints of this run are.
     pub fn owner(&self) -> &Owner {
-        self.owner.get_or_init(|| Owner::new(self.scene, self.settings))
+        self.owner.get_or_init(|| Owner::new(self.scene, self.asked))
     }
 
     /// Writes the model as it is now into `folder/model`, in place of the one before.
@@ -679,7 +738,8 @@ impl<'a> Run<'a> {
     }
 
     fn grow(&mut self, counters: &[u32]) -> Result<(), Error> {
-        let capacity = self.step.capacity().fit(std::array::from_fn(|i| counters[i]));
+        let counters = std::array::from_fn(|i| counters[i]);
+        let capacity = self.step.capacity().fit(counters).within(self.gpu, counters);
         self.step.resize(capacity)?;
         self.lower()
     }

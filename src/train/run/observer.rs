@@ -1,6 +1,7 @@
 //! Who watches a run, and what it is told.
 
 use super::error::Signal;
+use crate::config::Settings;
 use crate::evaluate::Report;
 use crate::gpu::{self, Timing, Timings};
 use crate::render::view::Rendered;
@@ -77,6 +78,16 @@ pub trait Observer {
     /// Lets somebody look, where [`Observer::visited`] said so, once nothing is in flight: `draw` renders the model as it is
     /// now ([`Step::glance`](crate::train::step::Step::glance)). The clock stands still, and training goes on as if nobody had looked.
     fn look(&mut self, _draw: &mut dyn FnMut(&Camera) -> Result<Option<Rendered>, gpu::Error>) {}
+    /// Whether the schedule is to be corrected before the next step; asked before every step.
+    fn corrects(&mut self, _last: &Progress) -> bool {
+        false
+    }
+    /// The last step as it is to be, where [`Observer::corrects`] said so, once nothing is in flight; nothing leaves it.
+    fn correction(&mut self, _last: &Progress, _settings: &Settings) -> Option<u32> {
+        None
+    }
+    /// All corrections so far ([`Config::corrections`](crate::train::Config::corrections)), each time there is another.
+    fn corrected(&mut self, _corrections: &[[u32; 2]]) {}
     /// Steps to evaluate at besides those of the settings.
     fn samples(&self) -> Vec<u32> {
         vec![]

@@ -3,6 +3,7 @@
 use super::Step;
 use crate::densify;
 use crate::gpu::Error;
+use crate::render::view;
 use crate::stage;
 
 impl Step {
@@ -28,14 +29,17 @@ impl Step {
 
     fn grow_and_prune(&mut self, step: u32) -> Result<String, Error> {
         let Some(statistics) = &mut self.statistics else { return Ok(String::new()) };
-        let config = &self.config.densify;
+        let most = view::most_anchors(&self.gpu, self.anchors.offsets);
+        let asked = self.config.densify.max_anchors;
+        let max_anchors = if asked == 0 { most } else { asked.min(most) };
+        let config = &densify::Config { max_anchors, ..self.config.densify.clone() };
         let round = densify::Round { voxel: self.voxel as f32, seed: self.config.train.seed, step };
         let before = self.anchors.count;
         let grown = densify::grow::run(&self.gpu, &mut self.anchors, statistics, config, round)?;
         let pruned = densify::prune::run(&self.gpu, &mut self.anchors, statistics, config)?;
         // As large a share of the anchors is in view as before.
         let [visible, old, new] = [self.capacity.visible, self.capacity.anchors, self.anchors.capacity].map(u64::from);
-        self.capacity.visible = (visible * new).div_ceil(old.max(1)).max(visible) as u32;
+        self.capacity.visible = (visible * new).div_ceil(old.max(1)).max(visible).min(new.max(1)) as u32;
         let mut text =
             format!("step {step}: {} new anchors, {pruned} pruned: {before} -> {}", grown.added, self.anchors.count);
         if grown.refused > 0 {

@@ -190,6 +190,13 @@ impl Step {
         Ok(())
     }
 
+    /// Goes on under settings and a plan that differ in when things happen alone.
+    pub fn reschedule(&mut self, settings: Settings, plan: &Plan) {
+        self.config = settings;
+        let Plan { rounds, counted, iterations, .. } = *plan;
+        (self.plan.rounds, self.plan.counted, self.plan.iterations) = (rounds, counted, iterations);
+    }
+
     fn stages(&self) -> &Stages {
         self.stages.as_ref().expect("the stages are away only within a call")
     }
