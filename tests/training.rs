@@ -492,7 +492,7 @@ fn three_steps_of_photographs_alone() {
     assert!(plan.references.is_empty(), "{plan:?}");
 }
 
-/// Corrects the schedule behind these steps.
+/// Corrects the schedule behind these steps, or behind what is in flight then, and notes where.
 struct Corrects(Vec<[u32; 2]>, Vec<[u32; 2]>);
 
 impl Observer for Corrects {
@@ -501,7 +501,7 @@ impl Observer for Corrects {
     }
     fn correction(&mut self, last: &Progress, _settings: &Settings) -> Option<u32> {
         let [step, iterations] = self.0.remove(0);
-        assert_eq!(last.step, step, "nothing is in flight");
+        assert!((step..step + 2).contains(&last.step), "a step in flight at most");
         Some(iterations)
     }
     fn corrected(&mut self, corrections: &[[u32; 2]]) {
@@ -520,11 +520,12 @@ fn corrections_are_repeated_to_the_byte() {
         [files::POINT_CLOUD, files::WEIGHTS]
             .map(|name| std::fs::read(folder.join("model").join(name)).expect("a model"))
     };
-    let corrections = vec![[3, 20], [8, 16], [10, 12]];
     let live = tempfile::tempdir().expect("a folder");
-    let mut watch = Corrects(corrections.clone(), vec![]);
+    let mut watch = Corrects(vec![[2, 20], [6, 16], [9, 12]], vec![]);
     let summary = Run::new(&gpu, &scene, &settings).expect("room").train(live.path(), &mut watch).expect("a run");
-    assert_eq!((summary.steps, watch.1), (12, corrections.clone()));
+    let corrections = watch.1;
+    let iterations: Vec<u32> = corrections.iter().map(|[_, iterations]| *iterations).collect();
+    assert_eq!((summary.steps, iterations), (12, vec![20, 16, 12]));
 
     let mut written = settings.clone();
     written.train.corrections = corrections;
@@ -575,20 +576,22 @@ fn a_device_that_binds_little_trains_to_the_end() {
     let open = |bytes| testing::fresh_gpu(Options { max_binding_bytes: Some(bytes), ..Options::default() });
     let folder = tempfile::tempdir().expect("a folder");
     let dir = folder.path().join("scene");
-    let options = synthetic::Options { seed: 1, width: 48, height: 36, train_views: 6, test_views: 2, points: 3_000 };
+    let options = synthetic::Options { seed: 1, width: 48, height: 36, train_views: 6, test_views: 2, points: 8_000 };
     synthetic::write(&dir, &options).expect("a scene");
     let scene = scene::load(&dir, &scene::Config::default()).expect("a scene");
     let mut settings = common::settings(12);
     settings.densify.gradient_threshold = 1e-9;
     let initial = forecast::initial(&scene, &settings).expect("points").anchors.position.len() as u32;
 
+    // A first guess has room for 2^17 pairs of three floats, less than for these anchors.
+    assert!(480 * u64::from(initial) * 4 / 5 > 12 << 17, "{initial}");
     // Room for a few more anchors than there are: 480 bytes of gradients of the outputs each.
     let gpu = open(480 * (u64::from(initial) + 300));
     let fitting = forecast::fitting(&gpu, &scene, &settings, None).expect("a forecast");
     assert!(fitting.verdict.fits() && fitting.reduced.is_none(), "{:?}", fitting.reduced);
     let trained = train(&gpu, &scene, &settings, None);
     assert_eq!(trained.summary.steps, 12);
-    assert_eq!(trained.summary.anchors, initial + 300);
+    assert!(trained.summary.anchors <= initial + 300);
     assert!(trained.watch.lines.iter().any(|line| line.contains("had no room")), "{:?}", trained.watch.lines);
 
     let gpu = open(480 * u64::from(initial) * 4 / 5);
