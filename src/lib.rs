@@ -26,6 +26,10 @@
 //! | guessed | a place that no photograph shows |
 //! | unit | the length that counts as one in the settings, in lengths of the capture's files |
 
+// First: the macros of this crate are known from here on.
+#[macro_use]
+mod print;
+
 pub mod atomic;
 pub mod bench;
 pub mod capture;

@@ -6,15 +6,10 @@ use clap::Parser as _;
 use gscream_vk::cli;
 
 fn main() -> ExitCode {
-    // `| head` ends the program as it ends any other.
-    sigpipe::reset();
     let arguments = cli::Arguments::parse();
     env_logger::Builder::from_env(env_logger::Env::default().default_filter_or("warn")).format_target(false).init();
     match cli::run(arguments) {
         Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            eprintln!("{}", cli::message(&error));
-            cli::exit_code(&error)
-        }
+        Err(error) => cli::fail(&error),
     }
 }

@@ -574,7 +574,7 @@ fn the_doctor_tells_right_from_wrong() {
     problems(&["they seem to be 0 on the object"]);
 }
 
-/// Scenes whose cameras, points and photographs have nothing to do with each other: RELIABILITY's dozen.
+/// Scenes whose cameras, points and photographs have nothing to do with each other.
 #[test]
 fn the_doctor_finds_senseless_scenes() {
     let folder = capture();
@@ -709,5 +709,49 @@ fn the_doctor_passes_clean_captures() {
             None => assert_eq!(problems, Vec::<&str>::new(), "{name}"),
             Some(says) => assert!(problems.len() == 1 && problems[0].starts_with(says), "{name}: {problems:?}"),
         }
+    }
+
+/// A program called `colmap` whose mapper leaves the models in `$MODELS`, as it does where it cannot join them.
+#[cfg(unix)]
+fn mapper(folder: &Path, models: &[(&str, u64)]) {
+    use std::os::unix::fs::PermissionsExt as _;
+    for (name, images) in models {
+        let model = folder.join("models").join(name);
+        fs::create_dir_all(&model).expect("a writable folder");
+        for file in ["cameras.bin", "images.bin", "points3D.bin"] {
+            let mut bytes = fs::read(folder.join("full/sparse/0").join(file)).expect("a binary model");
+            if file == "images.bin" {
+                bytes[..8].copy_from_slice(&images.to_le_bytes());
+            }
+            // Which one it is.
+            bytes.extend(name.bytes());
+            fs::write(model.join(file), bytes).expect("a writable folder");
+        }
+    }
+    let script = "#!/bin/sh\n[ \"$1\" = mapper ] || exit 0\nwhile [ \"$1\" != --output_path ]; do shift; done\ncp -r \"$MODELS\"/* \"$2\"\n";
+    let program = folder.join("bin/colmap");
+    fs::create_dir_all(folder.join("bin")).expect("a writable folder");
+    fs::write(&program, script).expect("a writable folder");
+    fs::set_permissions(&program, fs::Permissions::from_mode(0o755)).expect("our own file");
+}
+
+#[cfg(unix)]
+#[test]
+fn of_colmaps_models_the_largest_is_taken() {
+    let folder = capture();
+    let folder = folder.path();
+    mapper(folder, &[("0", 3), ("1", u64::from(VIEWS) - 1), ("2", 4)]);
+    let path = format!("{}:{}", folder.join("bin").display(), std::env::var("PATH").unwrap_or_default());
+    let mut program = cargo_bin_cmd!("gscream-vk");
+    program.current_dir(folder).env("PATH", path).env("MODELS", folder.join("models"));
+    program.env("XDG_CACHE_HOME", env!("CARGO_TARGET_TMPDIR"));
+    let output =
+        program.args(["prepare", "photos/images", "--out", "scene", "--only", "poses"]).output().expect("it starts");
+    let says = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{says}");
+    assert!(says.contains(&format!("colmap placed {} of {VIEWS} photographs", VIEWS - 1)), "{says}");
+    for file in ["cameras.bin", "images.bin", "points3D.bin"] {
+        let taken = fs::read(folder.join("scene/sparse/0").join(file)).expect("a model");
+        assert!(taken == fs::read(folder.join("models/1").join(file)).expect("a model"), "{file} of another model");
     }
 }

@@ -148,7 +148,7 @@ pub fn make(scene: &Scene, splats: &mut Splats, masks: &[GrayImage], watch: &mut
     let mut maps = vec![];
     for (i, view) in scene.train.iter().enumerate() {
         maps.push(DepthMap::of(splats, &view.camera, |_| false)?);
-        watch.at(i as u64 + 1);
+        watch.turn(i as u64 + 1)?;
     }
     let kept: Vec<Vec<f32>> = (0..maps.len()).into_par_iter().map(|i| agreed(&maps, i)).collect();
     let mut batch = Batch::default();
@@ -196,7 +196,7 @@ pub fn by_network(
         let prior = Prior { kind: PriorKind::Depth, values: resample::map(&values, size, view.camera.size) };
         correlations.extend(doctor::follows_points(scene, view, &prior));
         maps.push((values, size));
-        watch.at(2 * i as u64 + 2);
+        watch.turn(2 * i as u64 + 2)?;
     }
     correlations.sort_by(f64::total_cmp);
     let median = correlations.get(correlations.len() / 2).copied();

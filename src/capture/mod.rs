@@ -10,6 +10,7 @@ pub mod network;
 pub mod patchmatch;
 pub mod planes;
 pub mod poses;
+mod program;
 pub mod record;
 pub mod reference;
 pub mod sheet;
@@ -23,6 +24,7 @@ use image::GrayImage;
 use crate::gpu::{self, Gpu};
 use crate::scene::{self, PriorKind, Scene, resample};
 use crate::train::checkpoint::Fingerprint;
+use crate::train::run::Signal;
 
 use fit::Fit;
 use network::Inpainting;
@@ -67,6 +69,12 @@ pub enum Error {
     /// The fit's files.
     #[error(transparent)]
     Model(#[from] crate::model::files::Error),
+    /// Somebody asked for an end.
+    #[error("stopped by {signal}; the same command goes on with the step that was under way")]
+    Interrupted {
+        /// How.
+        signal: Signal,
+    },
     /// Photographs alone, and no COLMAP.
     #[error(
         "{}: no sparse/ with a COLMAP model, no transforms.json, and the program colmap is not installed to find the cameras \
@@ -85,6 +93,17 @@ pub enum Error {
         /// The last line it wrote.
         what: String,
     },
+}
+
+impl Error {
+    /// The signal that ended the preparation, if one did.
+    pub fn signal(&self) -> Option<Signal> {
+        match self {
+            Self::Interrupted { signal } => Some(*signal),
+            Self::Fit(error) => error.signal(),
+            _ => None,
+        }
+    }
 }
 
 /// The steps, in their order.
@@ -189,9 +208,24 @@ pub trait Watch {
     fn end(&mut self) {}
     /// Something worth a line.
     fn say(&mut self, _line: &str) {}
-    /// Whether to end; asked during the fit.
-    fn interrupted(&mut self) -> Option<crate::train::run::Signal> {
+    /// Whether to end; asked before every step and between its units, and while another program is waited for.
+    fn interrupted(&mut self) -> Option<Signal> {
         None
+    }
+    /// Goes on unless it is time to end.
+    ///
+    /// # Errors
+    /// [`Error::Interrupted`].
+    fn go_on(&mut self) -> Result<(), Error> {
+        self.interrupted().map_or(Ok(()), |signal| Err(Error::Interrupted { signal }))
+    }
+    /// So many units of the step are done: [`Watch::at`] and [`Watch::go_on`].
+    ///
+    /// # Errors
+    /// [`Error::Interrupted`].
+    fn turn(&mut self, unit: u64) -> Result<(), Error> {
+        self.at(unit);
+        self.go_on()
     }
 }
 
@@ -482,12 +516,13 @@ impl Networks {
 
 impl Preparation<'_> {
     /// Whether a step has nothing to do, which is said.
-    fn skips(&mut self, step: Step, inputs: &str) -> bool {
+    fn skips(&mut self, step: Step, inputs: &str) -> Result<bool, Error> {
+        self.watch.go_on()?;
         let fresh = self.folder.is_fresh(step.name(), inputs);
         if fresh {
             self.watch.say(&format!("{}: nothing has changed", step.name()));
         }
-        fresh
+        Ok(fresh)
     }
 
     fn write(&mut self, step: Step, inputs: String, batch: Batch) -> Result<(), Error> {
@@ -504,12 +539,11 @@ impl Preparation<'_> {
 
     fn poses(&mut self, capture: &Capture) -> Result<(), Error> {
         let inputs = capture.inputs()?;
-        if self.skips(Step::Poses, &inputs) {
+        if self.skips(Step::Poses, &inputs)? {
             return Ok(());
         }
         self.watch.begin(Step::Poses, 1);
-        let watch = &mut *self.watch;
-        let batch = capture.collect(&self.request.out, &mut |line| watch.say(line))?;
+        let batch = capture.collect(&self.request.out, self.watch)?;
         self.write(Step::Poses, inputs, batch)?;
         self.watch.end();
         Ok(())
@@ -539,7 +573,7 @@ impl Preparation<'_> {
         let settings = fit::settings(self.request, scene.points.len());
         let fingerprint = serde_json::to_string(&Fingerprint::of(scene)).expect("names and hashes");
         let inputs = Inputs::default().with(fingerprint).with(settings.to_toml()).finish();
-        if self.skips(Step::Fit, &inputs) {
+        if self.skips(Step::Fit, &inputs)? {
             return Fit::read(self.folder.root(), settings);
         }
         if !self.request.wants(Step::Fit) && self.folder.record().steps.contains_key(Step::Fit.name()) {
@@ -571,7 +605,7 @@ impl Preparation<'_> {
             inputs = inputs.with(name).with(mask.as_raw()).with(from);
         }
         let inputs = inputs.finish();
-        if self.skips(Step::Masks, &inputs) {
+        if self.skips(Step::Masks, &inputs)? {
             return Ok(());
         }
         let posed = |name: &str| scene.train.iter().any(|view| view.name == name);
@@ -591,7 +625,7 @@ impl Preparation<'_> {
             if let Some(Given { mask, .. }) = given.get(&view.name) {
                 votes.add(splats, &view.camera, &masks::parts(mask, view.camera.size))?;
                 unit += 1;
-                self.watch.at(unit);
+                self.watch.turn(unit)?;
             }
         }
         let colors = masks::colors(splats, &scene.train)?;
@@ -625,7 +659,7 @@ impl Preparation<'_> {
             };
             shown += usize::from(mask.as_raw().iter().any(|v| *v != 0));
             unit += 1;
-            self.watch.at(unit);
+            self.watch.turn(unit)?;
         }
         if shown < 3 {
             batch.notes.push(format!(
@@ -707,7 +741,7 @@ impl Preparation<'_> {
             return Ok(());
         }
         let inputs = self.networks.inputs(self.inputs_behind_masks(masks), false).finish();
-        if self.skips(Step::Depth, &inputs) {
+        if self.skips(Step::Depth, &inputs)? {
             return Ok(());
         }
         self.watch.begin(Step::Depth, 2 * scene.train.len() as u64);
@@ -727,7 +761,7 @@ impl Preparation<'_> {
         let named = self.request.reference.clone().unwrap_or_default();
         let inputs = self.inputs_behind_masks(masks).with(named).with([u8::from(self.depth)]);
         let inputs = self.networks.inputs(inputs, true).finish();
-        if self.skips(Step::Reference, &inputs) {
+        if self.skips(Step::Reference, &inputs)? {
             return Ok(());
         }
         let fine = self.load(reference::SIDE)?;

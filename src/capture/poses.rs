@@ -7,7 +7,7 @@ use std::fmt::Write as _;
 use std::fs::File;
 use std::io::Read as _;
 use std::path::{Component, Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::{Command, ExitStatus};
 
 use glam::{DMat3, DQuat, DVec3, dvec3};
 use image::GrayImage;
@@ -15,9 +15,10 @@ use rand::RngExt;
 use rand_pcg::Pcg64;
 use serde::Deserialize;
 
-use super::Error;
 use super::lens::{self, Pinhole};
+use super::program::{self, Halt};
 use super::record::{self, Batch, Inputs};
+use super::{Error, Watch};
 use crate::scene::{self, colmap, undistort};
 
 /// Where a scene keeps its photographs and its model.
@@ -235,7 +236,7 @@ impl Capture {
     ///
     /// # Errors
     /// Unreadable files; poses that cannot be found.
-    pub fn collect(&self, out: &Path, say: &mut dyn FnMut(&str)) -> Result<Batch, Error> {
+    pub fn collect(&self, out: &Path, watch: &mut dyn Watch) -> Result<Batch, Error> {
         let mut batch = Batch::default();
         let in_place = self.in_place(out);
         if !self.pinholes.is_empty() {
@@ -245,12 +246,13 @@ impl Capture {
                 return Err(Error::File { path: out.to_owned(), what: what.into() });
             }
             if matches!(self.source, Source::Colmap(_)) {
-                self.collect_resampled(&mut batch)?;
+                self.collect_resampled(&mut batch, watch)?;
                 return Ok(batch);
             }
         }
         if !in_place || matches!(self.source, Source::Photographs(_) | Source::Transforms { .. }) {
             for (name, path) in &self.photographs {
+                watch.go_on()?;
                 if let Some(pinhole) = self.pinholes.get(name) {
                     let picture = pinhole.photograph(&scene::photograph(path, 1)?);
                     let from = format!("{}, resampled from {} to a pinhole", path.display(), pinhole.lens.model);
@@ -302,19 +304,20 @@ impl Capture {
                     batch.notes.push(format!("{lost} depth maps of resampled photographs were left out"));
                 }
             }
-            Source::Photographs(folder) => self.collect_colmap(folder, &mut batch, say)?,
+            Source::Photographs(folder) => self.collect_colmap(folder, &mut batch, watch)?,
         }
         Ok(batch)
     }
 
     /// The photographs of a COLMAP model with lenses of which some are resampled: all of them, and a camera for each.
-    fn collect_resampled(&self, batch: &mut Batch) -> Result<(), Error> {
+    fn collect_resampled(&self, batch: &mut Batch, watch: &mut dyn Watch) -> Result<(), Error> {
         let (lenses, images) = colmap::lenses(&self.folder)?;
         let [tests, test_masks] = TEST.map(|name| existing(&self.folder.join(name)));
         let (tests, test_masks) = (tests?, test_masks?);
         let mut shots = vec![];
         let mut models: Vec<&str> = vec![];
         for image in &images {
+            watch.go_on()?;
             let (name, lens) = (scene::stem(&image.name), lenses[&image.camera]);
             let own = self.photographs.get(name).map(|path| (IMAGES, path));
             let Some((folder, path)) = own.or_else(|| Some((TEST[0], tests.get(name)?))) else { continue };
@@ -408,12 +411,12 @@ impl Capture {
     }
 
     /// Structure from motion by the `colmap` program, step by step and without a display.
-    fn collect_colmap(&self, images: &Path, batch: &mut Batch, say: &mut dyn FnMut(&str)) -> Result<(), Error> {
-        let help = Command::new("colmap").arg("help").env("QT_QPA_PLATFORM", "offscreen").output();
-        if help.is_err() {
+    fn collect_colmap(&self, images: &Path, batch: &mut Batch, watch: &mut dyn Watch) -> Result<(), Error> {
+        let work = tempfile::tempdir().map_err(|source| Error::Io { path: std::env::temp_dir(), source })?;
+        let words = work.path().join("words.txt");
+        if ask_colmap(&["help".into()], &words, watch)?.is_none() {
             return Err(Error::NoPoses { folder: self.folder.clone() });
         }
-        let work = tempfile::tempdir().map_err(|source| Error::Io { path: std::env::temp_dir(), source })?;
         let (database, models) = (work.path().join("database.db"), work.path().join("sparse"));
         std::fs::create_dir_all(&models).map_err(|source| Error::Io { path: models.clone(), source })?;
         let mut sizes = vec![];
@@ -430,11 +433,20 @@ impl Capture {
         }
         let single = if sizes.len() == 1 { "1" } else { "0" };
         // Newer versions have renamed the options: what a version has is in its help.
-        let without_gpu = |command: &str, names: [&'static str; 2]| -> Vec<OsString> {
-            let text = Command::new("colmap").args([command, "--help"]).env("QT_QPA_PLATFORM", "offscreen").output();
-            let text = text.map(|out| String::from_utf8_lossy(&out.stdout).into_owned()).unwrap_or_default();
+        let without_gpu = |command: &str, names: [&'static str; 2], watch: &mut dyn Watch| -> Result<Vec<_>, Error> {
+            ask_colmap(&[command.into(), "--help".into()], &words, watch)?;
+            let text = said(&words)?;
             let known = names.into_iter().find(|name| text.contains(&name[2..]));
-            known.into_iter().flat_map(|name| [name.into(), "0".into()]).collect()
+            Ok(known.into_iter().flat_map(|name| [OsString::from(name), "0".into()]).collect())
+        };
+        let run = |command: &str, arguments: &[OsString], watch: &mut dyn Watch| -> Result<(), Error> {
+            let arguments = [&[command.into()], arguments].concat();
+            if ask_colmap(&arguments, &words, watch)?.is_some_and(|status| status.success()) {
+                return Ok(());
+            }
+            let text = said(&words)?;
+            let last = text.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("it said nothing").trim();
+            Err(Error::Colmap { command: command.to_owned(), what: last.to_owned() })
         };
         let option = |name: &str, value: &std::ffi::OsStr| [OsString::from(name), value.to_owned()];
         let (database, models) = (option("--database_path", database.as_ref()), models);
@@ -443,17 +455,18 @@ impl Capture {
             option("--ImageReader.single_camera", single.as_ref()),
             option("--ImageReader.camera_model", "SIMPLE_RADIAL".as_ref()),
         ];
-        say("poses: features of the photographs (colmap feature_extractor)");
-        let on_cpu = without_gpu("feature_extractor", ["--FeatureExtraction.use_gpu", "--SiftExtraction.use_gpu"]);
-        run_colmap("feature_extractor", &[&database, &pictures, camera.as_flattened(), &on_cpu].concat())?;
+        watch.say("poses: features of the photographs (colmap feature_extractor)");
+        let on_cpu =
+            without_gpu("feature_extractor", ["--FeatureExtraction.use_gpu", "--SiftExtraction.use_gpu"], watch)?;
+        run("feature_extractor", &[&database, &pictures, camera.as_flattened(), &on_cpu].concat(), watch)?;
         // All pairs, as long as there are not too many of them; then those of neighbouring names.
         let matcher = if self.photographs.len() <= 200 { "exhaustive_matcher" } else { "sequential_matcher" };
-        say(&format!("poses: matches between the photographs (colmap {matcher})"));
-        let on_cpu = without_gpu(matcher, ["--FeatureMatching.use_gpu", "--SiftMatching.use_gpu"]);
-        run_colmap(matcher, &[&database[..], &on_cpu].concat())?;
-        say("poses: cameras and points (colmap mapper)");
+        watch.say(&format!("poses: matches between the photographs (colmap {matcher})"));
+        let on_cpu = without_gpu(matcher, ["--FeatureMatching.use_gpu", "--SiftMatching.use_gpu"], watch)?;
+        run(matcher, &[&database[..], &on_cpu].concat(), watch)?;
+        watch.say("poses: cameras and points (colmap mapper)");
         let output = option("--output_path", models.as_ref());
-        run_colmap("mapper", &[&database[..], &pictures, &output].concat())?;
+        run("mapper", &[&database[..], &pictures, &output].concat(), watch)?;
         // The mapper may leave several models that it could not join.
         let found = std::fs::read_dir(&models).into_iter().flatten().flatten().filter_map(|entry| {
             // images.bin begins with how many there are.
@@ -487,21 +500,21 @@ fn picture_extension(path: &Path) -> String {
     if jpeg { "jpg".into() } else { "png".into() }
 }
 
-fn run_colmap(command: &str, arguments: &[OsString]) -> Result<(), Error> {
-    let output = Command::new("colmap")
-        .arg(command)
-        .args(arguments)
-        .env("QT_QPA_PLATFORM", "offscreen")
-        .stdin(Stdio::null())
-        .output()
-        .map_err(|source| Error::Io { path: "colmap".into(), source })?;
-    if output.status.success() {
-        return Ok(());
+/// Runs the program `colmap`; nothing where it is not installed. What it says goes into the file `words`.
+fn ask_colmap(arguments: &[OsString], words: &Path, watch: &mut dyn Watch) -> Result<Option<ExitStatus>, Error> {
+    let mut command = Command::new("colmap");
+    command.args(arguments).env("QT_QPA_PLATFORM", "offscreen");
+    match program::run(&mut command, words, || watch.interrupted()) {
+        Ok(status) => Ok(Some(status)),
+        Err(Halt::Io(_, error)) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
+        Err(Halt::Io(path, source)) => Err(Error::Io { path, source }),
+        Err(Halt::Interrupted(signal)) => Err(Error::Interrupted { signal }),
     }
-    let text = [output.stdout, output.stderr].concat();
-    let text = String::from_utf8_lossy(&text);
-    let last = text.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("it said nothing").trim();
-    Err(Error::Colmap { command: command.to_owned(), what: last.to_owned() })
+}
+
+fn said(words: &Path) -> Result<String, Error> {
+    let bytes = std::fs::read(words).map_err(|source| Error::Io { path: words.to_owned(), source })?;
+    Ok(String::from_utf8_lossy(&bytes).into_owned())
 }
 
 fn from_transforms(folder: &Path, file: &Path) -> Result<Capture, Error> {

@@ -208,7 +208,7 @@ fn votes(task: &Task<'_>, fit: &Fit, splats: &mut Splats, watch: &mut dyn Watch)
     let every = task.scene.train.len().div_ceil(VOTERS).max(1);
     for (i, (view, mask)) in task.scene.train.iter().zip(task.masks).enumerate().step_by(every) {
         votes.add(splats, &view.camera, &masks::parts(mask, view.camera.size))?;
-        watch.at(i as u64);
+        watch.turn(i as u64)?;
     }
     let colors = masks::colors(splats, &task.scene.train)?;
     Ok(votes.count(&fit.anchors.position, &colors))
@@ -226,7 +226,7 @@ pub fn make(task: &Task<'_>, fit: &Fit, splats: &mut Splats, watch: &mut dyn Wat
     let mut maps = vec![];
     for (i, view) in train.iter().enumerate() {
         maps.push(DepthMap::of(splats, &view.camera, |_| false)?);
-        watch.at(n / 2 + i as u64 / 2);
+        watch.turn(n / 2 + i as u64 / 2)?;
     }
     let small: Vec<GrayImage> =
         train.iter().zip(task.masks).map(|(view, mask)| depth::enlarged(mask, view.camera.size)).collect();
@@ -256,12 +256,12 @@ pub fn make(task: &Task<'_>, fit: &Fit, splats: &mut Splats, watch: &mut dyn Wat
                 if best.as_ref().is_none_or(|best| seen > best.2) {
                     best = Some((i, behind, seen));
                 }
-                watch.at(n + k as u64);
+                watch.turn(n + k as u64)?;
             }
             best.expect("there is a view with a hole")
         }
     };
-    watch.at(2 * n);
+    watch.turn(2 * n)?;
     fill(task, of, &behind, &Others { of, maps: &maps, masks: &small }, seen, watch)
 }
 
@@ -339,7 +339,7 @@ fn fill(
             }
         })
         .collect();
-    watch.at(2 * task.scene.train.len() as u64 + 1);
+    watch.turn(2 * task.scene.train.len() as u64 + 1)?;
 
     // Disparity behind the hole and around it, from the fit without the object.
     let around = resample::dilate(&hole, WINDOW as u32 + 2);
@@ -355,7 +355,7 @@ fn fill(
     for (i, plane) in region.iter().zip(&swept) {
         disparity[*i] *= (1.0 + PLANE * f64::from(*plane)) as f32;
     }
-    watch.at(2 * task.scene.train.len() as u64 + 2);
+    watch.turn(2 * task.scene.train.len() as u64 + 2)?;
 
     let found: Vec<(usize, Option<[f32; 3]>)> = region
         .par_iter()
@@ -375,7 +375,7 @@ fn fill(
     let around = surroundings(hole.as_raw(), [w, h]);
     let surfaces = continue_surfaces(&view.camera, &guessed, hole.as_raw(), &mut disparity, others, &around, task.seed);
     membrane(&mut disparity, [w, h], |_| true);
-    watch.at(2 * task.scene.train.len() as u64 + 3);
+    watch.turn(2 * task.scene.train.len() as u64 + 3)?;
     let guesser = match task.inpainting {
         Some(network) => {
             network.fill(&mut rgb, &guessed, [w, h])?;

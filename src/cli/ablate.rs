@@ -14,7 +14,7 @@ use super::folders::{RECORD, Record};
 use super::report::last_part;
 use super::shared::{DeviceArgs, SYNTHETIC, SceneArgs, load_scene, with_gpu};
 use super::train::{Manner, Trained, default_folder, is_begun, train};
-use super::{index, next};
+use super::{index, next, signals};
 use crate::config::{Settings, SettingsArgs};
 use crate::evaluate::{Judge, Mean, Metrics, PUBLISHED_ROWS, Published, Region, decibel};
 use crate::folder::{self, Lock};
@@ -485,6 +485,7 @@ fn of_scene(
         if args.seeds > 1 {
             which = format!("{which}, seed {seed}");
         }
+        signals::check(|| "the same command with --resume goes on".into())?;
         eprintln!("{}", format!("== {which} {}", known.pace.next(known.done)).trim_end());
         if complete && known.has(&variant.name, label, seed) {
             bail!(

@@ -1,6 +1,3 @@
-use std::io::Write as _;
-
-use anyhow::Context as _;
 use clap::CommandFactory as _;
 
 use super::{Arguments, next};
@@ -20,7 +17,7 @@ pub(super) struct Args {
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let mut script = vec![];
     clap_complete::generate(args.shell, &mut Arguments::command(), "gscream-vk", &mut script);
-    std::io::stdout().write_all(&script).context("stdout: cannot be written")?;
+    print!("{}", String::from_utf8_lossy(&script));
     next::say(&[("gscream-vk completions --help".into(), "where a shell looks for it")]);
     Ok(())
 }

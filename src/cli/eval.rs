@@ -136,7 +136,7 @@ fn of_run(args: &Args, judge: &Judge) -> anyhow::Result<Report> {
     }
     if !args.pictures && origin.model().join(crate::model::files::POINT_CLOUD).is_file() {
         return args.device.with_gpu(|gpu| {
-            let measured = instruments::measure(gpu, &origin.model(), &scene, &settings, judge)?;
+            let measured = instruments::measure(gpu, &origin.model(), &scene, &settings, judge, &|| Ok(()))?;
             measured.write_seen(&scene, &run.join(folders::SEEN))?;
             Ok(measured.report)
         });

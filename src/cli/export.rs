@@ -145,7 +145,7 @@ pub(super) struct Pose {
 }
 
 impl Pose {
-    fn new(name: &str, camera: &Camera) -> Self {
+    pub(super) fn new(name: &str, camera: &Camera) -> Self {
         let longer = usize::from(camera.size[1] >= camera.size[0]);
         let half = 0.5 * f64::from(camera.size[longer]) / f64::from(camera.focal[longer]);
         Self {

@@ -57,16 +57,17 @@ impl Drawn {
     }
 }
 
-/// Draws the train and test views of `scene` from the model in `folder` and judges them.
+/// Draws the train and test views of `scene` from the model in `folder` and judges them; `go_on` is asked before each.
 ///
 /// # Errors
-/// A model that cannot be read; a device without room; pictures that cannot be compared.
+/// A model that cannot be read; a device without room; pictures that cannot be compared; what `go_on` says.
 pub(super) fn measure(
     gpu: &Gpu,
     folder: &Path,
     scene: &Scene,
     settings: &Settings,
     judge: &Judge,
+    go_on: &dyn Fn() -> anyhow::Result<()>,
 ) -> anyhow::Result<Measured> {
     let (mut anchors, mut weights) = model::files::load(folder)?;
     model::files::rescale(&mut anchors, &mut weights, 1.0 / scene.unit);
@@ -75,7 +76,10 @@ pub(super) fn measure(
     let style = ProgressStyle::with_template("judging {wide_bar} {pos}/{len} views, {eta} left")?;
     let bar = ProgressBar::new((scene.train.len() + scene.test.len()) as u64).with_style(style);
     let mut draw = |views: &[View]| -> anyhow::Result<Vec<Drawn>> {
-        let mut one = |view: &View| Ok(Drawn::new(&renderer.render(&view.camera)?));
+        let mut one = |view: &View| {
+            go_on()?;
+            Ok(Drawn::new(&renderer.render(&view.camera)?))
+        };
         views.iter().map(|view| one(view).inspect(|_| bar.inc(1))).collect()
     };
     let (train, test) = (draw(&scene.train)?, draw(&scene.test)?);
@@ -87,6 +91,7 @@ pub(super) fn measure(
     let factor = hole::unit(known).filter(|factor| (factor - 1.0).abs() > SAME_UNIT);
     let (mut judging, mut seen) = (judge.start(), vec![]);
     for (drawn, view) in pairs() {
+        go_on()?;
         let map = seen_map(drawn.shown(view), &shown);
         let metrics = judging.add(&view.name, &drawn.picture, &view.image, view.mask.as_ref(), Some(&map))?;
         if let (Some(depth), Some(mask)) = (&view.depth, &view.mask) {
@@ -95,6 +100,7 @@ pub(super) fn measure(
         }
         seen.push(map);
     }
+    go_on()?;
     let mut report = judging.report().with_residues(residues(scene, &train, &shown));
     report.depth_factor = factor;
     let shown = index::chosen(scene).into_iter().map(|at| (at, train[at].picture.clone())).collect();

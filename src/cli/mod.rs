@@ -26,6 +26,7 @@ mod preset;
 mod render;
 mod report;
 pub mod shared;
+mod signals;
 mod synth;
 mod train;
 mod verify;
@@ -33,6 +34,8 @@ mod view;
 
 use std::fmt::Write as _;
 use std::process::ExitCode;
+
+use crate::train::run::Signal;
 
 /// Removes an object from a 3D Gaussian scene, on any Vulkan 1.3 device.
 ///
@@ -49,8 +52,8 @@ Start here:
   gscream-vk eval renders --truth scene/test_images --masks scene/test_masks
   gscream-vk devices                               what can be run on
 
-Exit codes: 0 done, 1 something went wrong, 2 the arguments or settings make no sense, 130 and 143 stopped by
-SIGINT and SIGTERM.
+Exit codes: 0 done, 1 something went wrong, 2 the arguments or settings make no sense, 129, 130 and
+143 stopped by SIGHUP, SIGINT and SIGTERM.
 Set RUST_LOG=info or debug for more on stderr."
 )]
 pub struct Arguments {
@@ -127,13 +130,27 @@ fn is_of_full_disk(cause: &(dyn std::error::Error + 'static)) -> bool {
     kind.is_some_and(|kind| matches!(kind, StorageFull | QuotaExceeded | FileTooLarge))
 }
 
-/// 2 for settings that make no sense, as for arguments that do not parse; 130 and 143 for SIGINT and SIGTERM; 1
-/// otherwise.
+/// Says what went wrong; returns the exit code.
+pub fn fail(error: &anyhow::Error) -> ExitCode {
+    eprintln!("{}", message(error));
+    exit_code(error)
+}
+
+/// 2 for settings that make no sense, as for arguments that do not parse; 129, 130 and 143 for SIGHUP, SIGINT and SIGTERM;
+/// 1 otherwise.
 pub fn exit_code(error: &anyhow::Error) -> ExitCode {
-    if let Some(signal) = error.downcast_ref::<crate::train::run::Error>().and_then(crate::train::run::Error::signal) {
+    if let Some(signal) = error.chain().find_map(signal) {
         return ExitCode::from(signal.exit_code());
     }
     ExitCode::from(if error.is::<crate::config::Error>() { 2 } else { 1 })
+}
+
+/// The signal that ended the work, if this is what an error says.
+fn signal(error: &(dyn std::error::Error + 'static)) -> Option<Signal> {
+    let stopped = error.downcast_ref::<signals::Stopped>().map(|stopped| stopped.signal);
+    let run = || error.downcast_ref::<crate::train::run::Error>()?.signal();
+    let capture = || error.downcast_ref::<crate::capture::Error>()?.signal();
+    stopped.or_else(run).or_else(capture)
 }
 
 #[cfg(test)]

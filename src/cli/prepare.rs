@@ -1,13 +1,10 @@
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use anyhow::Context as _;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::next;
 use super::shared::DeviceArgs;
+use super::{next, signals};
 use crate::capture::{self, Evidence, Request, Step, Watch};
 use crate::train::run::Signal;
 
@@ -127,13 +124,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         ..Request::new(&args.photographs, &args.out)
     };
     args.device.with_gpu(|gpu| {
-        let stop = Arc::new(AtomicBool::new(false));
-        for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-            signal_hook::flag::register_conditional_shutdown(signal, 130, Arc::clone(&stop))
-                .and_then(|_| signal_hook::flag::register(signal, Arc::clone(&stop)))
-                .context("signals cannot be listened to")?;
-        }
-        let mut watch = Bars { bar: None, began: Instant::now(), step: None, stop };
+        signals::listen()?;
+        let mut watch = Bars { bar: None, began: Instant::now(), step: None };
         let result = capture::prepare(gpu, &request, &mut watch);
         if let Some(bar) = watch.bar.take() {
             bar.finish_and_clear();
@@ -153,7 +145,6 @@ struct Bars {
     bar: Option<ProgressBar>,
     began: Instant,
     step: Option<Step>,
-    stop: Arc<AtomicBool>,
 }
 
 impl Watch for Bars {
@@ -188,6 +179,6 @@ impl Watch for Bars {
     }
 
     fn interrupted(&mut self) -> Option<Signal> {
-        self.stop.load(Ordering::Relaxed).then_some(Signal::Interrupt)
+        signals::caught()
     }
 }

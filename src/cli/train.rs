@@ -3,7 +3,6 @@
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use crate::atomic::AtomicWriteFile;
@@ -12,7 +11,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::folders::{Asked, MODEL, RECORD, Record, SEEN, SETTINGS, TEST};
 use super::shared::{DeviceArgs, SceneArgs, load_scene, with_gpu};
-use super::{index, instruments, minutes, next, pictures, preset};
+use super::{index, instruments, minutes, next, pictures, preset, signals};
 use crate::capture::doctor::{self, Severity};
 use crate::config::{Settings, SettingsArgs, Source};
 use crate::evaluate::{Judge, Report};
@@ -279,7 +278,7 @@ pub(super) struct Trained {
 }
 
 /// Trains into `folder`, of which the caller holds the lock, in place of any run that is there unless it is gone on with,
-/// and evaluates, with a progress bar on stderr.
+/// and evaluates, with a progress bar on stderr. Signals end it from here on; what it has come to is kept.
 pub(super) fn train(
     gpu: &Gpu,
     scene: &Scene,
@@ -289,6 +288,7 @@ pub(super) fn train(
     manner: &Manner,
     judge: &Judge,
 ) -> anyhow::Result<Trained> {
+    signals::listen()?;
     if manner.go_on && Record::read(folder)?.complete.is_none() {
         // Those that it began with: they may have been made to fit the device.
         let settings = &Settings::resolve(&[Source::File(folder.join(SETTINGS))])?;
@@ -378,11 +378,10 @@ fn resume(
 /// Trains to the end and evaluates.
 fn finish(mut run: Run<'_>, settings: &Settings, folder: &Path, manner: &Manner) -> anyhow::Result<Trained> {
     eprintln!("anchors: {}", run.step().anchors.count);
-    let signals = Signals::listen()?;
     let bar = bar(settings.train.iterations, run.done());
     let host = manner.board.as_ref().map(Host::new);
     let clock = manner.clock.clone().map(|clock| (clock, folder.join(SETTINGS), settings.clone()));
-    let mut watch = Watch { bar, pictures: folder.join(TEST), failed: None, signals, began: manner.began, host, clock };
+    let mut watch = Watch { bar, pictures: folder.join(TEST), failed: None, began: manner.began, host, clock };
     let result = run.train(folder, &mut watch);
     watch.bar.finish_and_clear();
     let mut summary = result.inspect_err(|_| index::of_stopped(folder))?;
@@ -411,7 +410,12 @@ fn judged(
 ) -> anyhow::Result<Trained> {
     let mut shown = vec![];
     if trained.report.is_some() {
-        let measured = instruments::measure(gpu, &folder.join(MODEL), scene, settings, judge)?;
+        // A run without a checkpoint could only begin again: it is judged to the end.
+        let kept = !checkpoint::list(folder).is_empty();
+        let how = || format!("`gscream-vk train --resume {}` judges the trained model", folder.display());
+        let go_on = || if kept { Ok(signals::check(how)?) } else { Ok(()) };
+        let measured = instruments::measure(gpu, &folder.join(MODEL), scene, settings, judge, &go_on);
+        let measured = measured.inspect_err(|_| index::of_stopped(folder))?;
         measured.write_seen(scene, &folder.join(SEEN))?;
         measured.report.write_json(&folder.join(METRICS))?;
         trained.report = Some(measured.report);
@@ -516,43 +520,11 @@ struct Watch {
     bar: ProgressBar,
     pictures: PathBuf,
     failed: Option<pictures::Error>,
-    signals: Signals,
     /// Until the first step has ended.
     began: Option<Instant>,
     host: Option<Host>,
     /// With the file of the settings, and these as the run began with them.
     clock: Option<(minutes::Clock, PathBuf, Settings)>,
-}
-
-/// SIGINT and SIGTERM, remembered; a second one of a kind ends the program at once.
-struct Signals {
-    caught: [(Signal, Arc<AtomicBool>); 2],
-    registered: Vec<signal_hook::SigId>,
-}
-
-impl Signals {
-    fn listen() -> anyhow::Result<Self> {
-        let caught = [Signal::Interrupt, Signal::Terminate].map(|signal| (signal, Arc::new(AtomicBool::new(false))));
-        let mut registered = vec![];
-        for (signal, flag) in &caught {
-            let (number, code) = (signal.number().into(), signal.exit_code().into());
-            // In this order: the first time the flag is still down.
-            let shutdown = signal_hook::flag::register_conditional_shutdown(number, code, flag.clone());
-            let note = signal_hook::flag::register(number, flag.clone());
-            for id in [shutdown, note] {
-                registered.push(id.with_context(|| format!("{signal} cannot be caught"))?);
-            }
-        }
-        Ok(Self { caught, registered })
-    }
-}
-
-impl Drop for Signals {
-    fn drop(&mut self) {
-        for id in self.registered.drain(..) {
-            signal_hook::low_level::unregister(id);
-        }
-    }
 }
 
 impl Observer for Watch {
@@ -615,6 +587,6 @@ impl Observer for Watch {
     }
 
     fn interrupted(&mut self) -> Option<Signal> {
-        self.signals.caught.iter().find(|(_, flag)| flag.load(Ordering::Relaxed)).map(|(signal, _)| *signal)
+        signals::caught()
     }
 }

@@ -89,11 +89,7 @@ fn page(args: &Args) -> anyhow::Result<Page> {
             let first = cameras.cameras.first().map_or("none", |pose| &pose.name);
             anyhow!("--camera {name}: no training view has this name; they are called like {first}")
         })?,
-        None => cameras
-            .cameras
-            .iter()
-            .min_by(|a, b| a.roll.total_cmp(&b.roll))
-            .with_context(|| format!("{}: names no camera", figures.display()))?,
+        None => most_upright(&cameras.cameras).with_context(|| format!("{}: names no camera", figures.display()))?,
     };
     let origin = Origin::find(run).ok();
     let photograph = origin.filter(|_| !args.no_photograph).and_then(|origin| {
@@ -111,6 +107,11 @@ fn page(args: &Args) -> anyhow::Result<Page> {
         background: cameras.background,
         photograph,
     })
+}
+
+/// The camera that is rolled least out of the horizon.
+fn most_upright(cameras: &[Pose]) -> Option<&Pose> {
+    cameras.iter().min_by(|a, b| a.roll.total_cmp(&b.roll))
 }
 
 /// The camera looks along its axis at the point nearest to what all cameras look at.
@@ -136,4 +137,35 @@ fn photograph(origin: &Origin, pose: &Pose) -> anyhow::Result<Vec<u8>> {
     let mut jpeg = vec![];
     picture.write_with_encoder(JpegEncoder::new_with_quality(&mut jpeg, 92))?;
     Ok(jpeg)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::export::up;
+
+    /// Of cameras that are rolled to either side, as `export` writes them.
+    #[test]
+    fn the_view_starts_at_the_most_upright_camera() {
+        let rolled = |degrees: f32| {
+            let (s, c) = degrees.to_radians().sin_cos();
+            let camera = Camera {
+                rotation: [[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]],
+                translation: [0.0; 3],
+                focal: [50.0; 2],
+                principal: [20.0, 15.0],
+                distortion: [0.0; 4],
+                size: [40, 30],
+            };
+            assert!((up::roll(&camera).to_degrees() - f64::from(degrees.abs())).abs() < 1e-3);
+            Pose::new(&degrees.to_string(), &camera)
+        };
+        let chosen = |degrees: &[f32]| {
+            let poses: Vec<Pose> = degrees.iter().map(|degrees| rolled(*degrees)).collect();
+            most_upright(&poses).map(|pose| pose.name.clone())
+        };
+        assert_eq!(chosen(&[20.0, -3.0, 7.0, -40.0]).as_deref(), Some("-3"));
+        assert_eq!(chosen(&[-9.0, 4.0]).as_deref(), Some("4"));
+        assert_eq!(chosen(&[]), None);
+    }
 }

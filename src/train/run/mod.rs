@@ -575,12 +575,14 @@ impl<'a> Run<'a> {
         let mut report = None;
         if self.evaluates(step) {
             let mut index = 0;
-            report = self.evaluate(|view, picture| {
+            report = self.evaluate_while(|view, picture| {
                 watch.compared(index, picture);
                 index += 1;
                 if last {
                     watch.rendered(view, picture)
                 }
+                // The step is told again when the run goes on.
+                watch.interrupted().map_or(Ok(()), |signal| Err(Error::Interrupted { signal }))
             })?;
             if let Some(report) = &report {
                 watch.evaluated(&history.last, report);
@@ -757,6 +759,17 @@ impl<'a> Run<'a> {
     /// # Errors
     /// When the device has no room, or a picture cannot be compared.
     pub fn evaluate(&mut self, mut look: impl FnMut(&str, &Rendered)) -> Result<Option<Report>, Error> {
+        self.evaluate_while(|view, picture| {
+            look(view, picture);
+            Ok(())
+        })
+    }
+
+    /// [`Run::evaluate`], until `look` has an error.
+    fn evaluate_while(
+        &mut self,
+        mut look: impl FnMut(&str, &Rendered) -> Result<(), Error>,
+    ) -> Result<Option<Report>, Error> {
         let views = &self.scene.test;
         if views.is_empty() {
             return Ok(None);
@@ -766,8 +779,7 @@ impl<'a> Run<'a> {
             let view = &views[i];
             let metrics = evaluate::compare(&rendered.to_rgb8(), &view.image, view.mask.as_ref())?;
             figures.push(ViewMetrics { name: view.name.clone(), metrics });
-            look(&view.name, &rendered);
-            Ok::<_, Error>(())
+            look(&view.name, &rendered)
         })?;
         Ok(Some(Report::new(figures)))
     }

@@ -67,7 +67,8 @@ pub trait Observer {
     fn say(&mut self, _line: &str) {}
     /// A test view as rendered after the last step.
     fn rendered(&mut self, _view: &str, _picture: &Rendered) {}
-    /// Whether to end behind the steps in flight, with a checkpoint; asked before every step.
+    /// Whether to end behind the steps in flight, with a checkpoint; asked before every step, and between the views of an
+    /// evaluation.
     fn interrupted(&mut self) -> Option<Signal> {
         None
     }
