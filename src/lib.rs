@@ -27,6 +27,7 @@
 //! | unit | the length that counts as one in the settings, in lengths of the capture's files |
 
 // First: the macros of this crate are known from here on.
+#[cfg(not(test))]
 #[macro_use]
 mod print;
 

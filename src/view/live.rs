@@ -4,7 +4,8 @@
 //! The training's thread and the server's meet at a [`Board`]. A visitor leaves a camera on it, one at a time; between two
 //! steps the trainer looks at a flag, and where it is up it renders that camera and lays the picture down ([`Host`]).
 //! Nothing is rendered unasked. A picture that took a while is followed by a pause so long that pictures take
-//! [`SHARE`] of the time at most, however many visitors there are. JPEG is made of it by the visitor's thread.
+//! [`SHARE`] of the time at most, however many visitors there are. JPEG is made of it by the visitor's thread, and all text
+//! by visitors' threads, once for everybody: the trainer waits for no visitor.
 //!
 //! Rendering changes nothing of the model, and what fails is said to the visitor alone: the trained bytes are the same with
 //! visitors and without.
@@ -38,6 +39,12 @@ const QUALITY: u8 = 88;
 /// Most points of the loss curve; when there are more, each two become one.
 const POINTS: usize = 400;
 const PAGE: &str = include_str!("live.html");
+/// The page's program.
+const PROGRAM: &str = include_str!("live.js");
+/// Visitors that wait for a picture; more are told to come again.
+const MOST_WAITING: usize = 8;
+/// How old what is said of the training may be: visitors that ask without pause get the same text.
+const FRESH: Duration = Duration::from_millis(50);
 
 /// A training view to look from.
 #[derive(Debug, Clone, Serialize)]
@@ -111,19 +118,32 @@ struct State {
     cost: f64,
     /// Step and time that this session began with.
     began: Option<(u32, Instant)>,
+    /// Counts the changes of what is said of the training.
+    changes: u64,
+    /// Visitors in [`Board::picture`].
+    waiting: usize,
+}
+
+/// What was last said of the training.
+struct Said {
+    text: Arc<str>,
+    made: Instant,
+    /// [`State::changes`] then.
+    changes: u64,
 }
 
 /// Where visitors and the trainer meet.
 pub struct Board {
-    title: String,
     iterations: u32,
-    /// Up in the world, roughly, and what the training cameras look at.
-    up: [f64; 3],
+    /// What the training cameras look at.
     focus: [f64; 3],
-    poses: Vec<Pose>,
+    /// The scene as a visitor gets it.
+    scene: String,
     /// Centres farther away than this are refused.
     reach: f64,
     state: Mutex<State>,
+    /// Never taken by the trainer, which would wait for JSON.
+    said: Mutex<Option<Said>>,
     /// The slot has changed.
     turned: Condvar,
     /// Whether a camera waits, for the trainer to look at between steps.
@@ -149,14 +169,15 @@ impl Board {
             }
         };
         let far = cameras.iter().map(|c| DVec3::from_array(c.center()).distance(DVec3::from_array(focus)));
+        let poses: Vec<Pose> = scene.train.iter().map(pose).collect();
+        let title: String = title.into();
         Arc::new(Self {
-            title: title.into(),
             iterations,
-            up,
             focus,
-            poses: scene.train.iter().map(pose).collect(),
+            scene: json!({ "title": title, "up": up, "focus": focus, "cameras": poses }).to_string(),
             reach: 100.0 * far.fold(1.0, f64::max),
             state: Mutex::default(),
+            said: Mutex::default(),
             turned: Condvar::new(),
             asked: AtomicBool::new(false),
         })
@@ -169,40 +190,61 @@ impl Board {
 
     /// A picture from there, when the trainer has time.
     fn picture(&self, camera: Camera) -> Result<Rendered, Refusal> {
-        let deadline = Instant::now() + PATIENCE;
-        let wait = |state| {
-            let left = deadline.saturating_duration_since(Instant::now());
-            let (state, _) = self.turned.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner);
-            (state, Instant::now() >= deadline)
-        };
+        self.picture_within(camera, PATIENCE)
+    }
+
+    fn picture_within(&self, camera: Camera, patience: Duration) -> Result<Rendered, Refusal> {
         let mut state = self.lock();
+        if state.waiting >= MOST_WAITING {
+            return Err(Refusal::Busy);
+        }
+        state.waiting += 1;
+        let (mut state, picture) = self.picture_in_turn(state, camera, patience);
+        state.waiting -= 1;
+        picture
+    }
+
+    fn picture_in_turn<'a>(
+        &'a self,
+        mut state: MutexGuard<'a, State>,
+        camera: Camera,
+        patience: Duration,
+    ) -> (MutexGuard<'a, State>, Result<Rendered, Refusal>) {
+        let deadline = Instant::now() + patience;
+        let left = || deadline.saturating_duration_since(Instant::now());
+        let wait = |state| self.turned.wait_timeout(state, left()).unwrap_or_else(PoisonError::into_inner).0;
         while !matches!(state.slot, Slot::Free) {
-            let late;
-            (state, late) = wait(state);
-            if late {
-                return Err(Refusal::Busy);
+            if left().is_zero() {
+                return (state, Err(Refusal::Busy));
             }
+            state = wait(state);
         }
         if state.ended {
-            return Err(Refusal::Gone);
+            return (state, Err(Refusal::Gone));
         }
         state.slot = Slot::Asked(camera);
         self.asked.store(true, Ordering::Release);
         loop {
-            let late;
-            (state, late) = wait(state);
             match std::mem::take(&mut state.slot) {
                 Slot::Drawn(picture) => {
                     self.turned.notify_all();
-                    return picture.ok_or(Refusal::Busy);
+                    return (state, picture.ok_or(Refusal::Busy));
                 }
-                Slot::Asked(_) if late || state.ended => {
+                Slot::Asked(_) if state.ended || left().is_zero() => {
                     self.asked.store(false, Ordering::Release);
                     self.turned.notify_all();
-                    return Err(if state.ended { Refusal::Gone } else { Refusal::Busy });
+                    let refusal = if state.ended { Refusal::Gone } else { Refusal::Busy };
+                    return (state, Err(refusal));
                 }
-                // What is being drawn comes soon.
-                other => state.slot = other,
+                Slot::Asked(camera) => {
+                    state.slot = Slot::Asked(camera);
+                    state = wait(state);
+                }
+                // What is being drawn comes, however long it takes ([`Drawing`]).
+                other => {
+                    state.slot = other;
+                    state = self.turned.wait(state).unwrap_or_else(PoisonError::into_inner);
+                }
             }
         }
     }
@@ -235,19 +277,32 @@ impl Board {
         })
     }
 
-    fn status(&self) -> String {
+    /// What is known of the training, as JSON.
+    fn status(&self) -> Arc<str> {
+        // Whoever asks meanwhile waits for the same text.
+        let mut said = self.said.lock().unwrap_or_else(PoisonError::into_inner);
         let state = self.lock();
-        let Progress { step, seconds, ref view, loss, ref losses, anchors, gaussians, .. } = state.progress;
-        let left = state.began.filter(|(first, _)| step > *first).map(|(first, began)| {
+        if let Some(said) = &*said
+            && (said.changes == state.changes || said.made.elapsed() < FRESH && !state.ended)
+        {
+            return said.text.clone();
+        }
+        let State { ended, cost, began, changes, .. } = *state;
+        let (progress, curve, figures) = (state.progress.clone(), state.curve.points.clone(), state.figures.clone());
+        drop(state);
+        let Progress { step, seconds, view, loss, losses, anchors, gaussians, .. } = progress;
+        let left = began.filter(|(first, _)| step > *first).map(|(first, began)| {
             began.elapsed().as_secs_f64() / f64::from(step - first) * f64::from(self.iterations.saturating_sub(step))
         });
-        let losses: BTreeMap<&str, f32> = losses.iter().filter(|(_, value)| *value != 0.0).copied().collect();
-        json!({
+        let losses: BTreeMap<&str, f32> = losses.into_iter().filter(|(_, value)| *value != 0.0).collect();
+        let text = json!({
             "step": step, "iterations": self.iterations, "seconds": seconds, "left": left, "view": view, "loss": loss,
-            "losses": losses, "anchors": anchors, "gaussians": gaussians, "curve": state.curve.points,
-            "figures": state.figures, "cost": state.cost, "ended": state.ended,
-        })
-        .to_string()
+            "losses": losses, "anchors": anchors, "gaussians": gaussians, "curve": curve,
+            "figures": figures, "cost": cost, "ended": ended,
+        });
+        let text: Arc<str> = text.to_string().into();
+        *said = Some(Said { text: text.clone(), made: Instant::now(), changes });
+        text
     }
 }
 
@@ -259,15 +314,15 @@ fn numbers<const N: usize>(text: &str) -> Option<[f64; N]> {
 
 impl Site for Board {
     fn get(&self, path: &str, query: &str) -> Result<Answer<'_>, Refusal> {
+        fn borrowed<'a>(kind: &'static str, text: &'a str) -> Result<Answer<'a>, Refusal> {
+            Ok(Answer { kind, gzip: false, bytes: Cow::Borrowed(text.as_bytes()) })
+        }
         let owned = |kind, bytes: Vec<u8>| Ok(Answer { kind, gzip: false, bytes: Cow::Owned(bytes) });
         match path {
-            "/" => Ok(Answer { kind: "text/html; charset=utf-8", gzip: false, bytes: Cow::Borrowed(PAGE.as_bytes()) }),
-            "/scene.json" => {
-                let Self { title, up, focus, poses, .. } = self;
-                let scene = json!({ "title": title, "up": up, "focus": focus, "cameras": poses });
-                owned("application/json", scene.to_string().into_bytes())
-            }
-            "/state.json" => owned("application/json", self.status().into_bytes()),
+            "/" => borrowed("text/html; charset=utf-8", PAGE),
+            "/live.js" => borrowed("text/javascript", PROGRAM),
+            "/scene.json" => borrowed("application/json", &self.scene),
+            "/state.json" => owned("application/json", self.status().as_bytes().to_vec()),
             "/picture.jpg" => {
                 let camera = self.camera(query).ok_or(Refusal::BadRequest)?;
                 let picture = self.picture(camera)?.to_rgb8();
@@ -300,14 +355,17 @@ impl Host {
         // A resumed run's first steps are not this session's.
         state.began.get_or_insert_with(|| (progress.step, Instant::now()));
         state.curve.push(progress.step, progress.loss);
-        state.progress = progress.clone();
+        state.progress.clone_from(progress);
+        state.changes += 1;
     }
 
     /// Notes an evaluation.
     pub fn evaluated(&self, progress: &Progress, report: &Report) {
         if let Some(mean) = report.mean.as_ref().map(|mean| &mean.metrics) {
             let masked = mean.mask.as_ref().map(|figures| figures.psnr);
-            self.board.lock().figures.push((progress.step, mean.full.psnr, masked));
+            let mut state = self.board.lock();
+            state.figures.push((progress.step, mean.full.psnr, masked));
+            state.changes += 1;
         }
     }
 
@@ -325,9 +383,10 @@ impl Host {
             state.slot = Slot::Drawing;
             camera
         };
+        let mut drawing = Drawing { board: &self.board, picture: None };
         let began = Instant::now();
         // A device that is lost is so for the next step, too, which says it.
-        let picture = draw(&camera).unwrap_or_else(|error| {
+        drawing.picture = draw(&camera).unwrap_or_else(|error| {
             log::info!("a visitor's picture: {error}");
             None
         });
@@ -335,15 +394,29 @@ impl Host {
         self.rest = Instant::now() + took.mul_f64(1.0 / SHARE - 1.0);
         let mut state = self.board.lock();
         state.cost = took.as_secs_f64() / f64::from(camera.size[0] * camera.size[1]);
-        state.slot = Slot::Drawn(picture);
-        drop(state);
+        state.changes += 1;
+    }
+}
+
+/// A picture that is being drawn. Its visitor gets it when this is gone, or nothing where drawing has panicked.
+struct Drawing<'a> {
+    board: &'a Board,
+    picture: Option<Rendered>,
+}
+
+impl Drop for Drawing<'_> {
+    fn drop(&mut self) {
+        self.board.lock().slot = Slot::Drawn(self.picture.take());
         self.board.turned.notify_all();
     }
 }
 
 impl Drop for Host {
     fn drop(&mut self) {
-        self.board.lock().ended = true;
+        let mut state = self.board.lock();
+        state.ended = true;
+        state.changes += 1;
+        drop(state);
         self.board.turned.notify_all();
     }
 }
@@ -471,6 +544,106 @@ mod tests {
         host.look(&mut |_| Ok(None));
         assert_eq!(visitor.join().unwrap(), Some(Refusal::Busy));
         assert!(!host.visited());
+    }
+
+    /// A device may panic, as everything may.
+    #[test]
+    fn a_visitor_of_what_panics_is_told_to_come_again() {
+        let board = board();
+        let mut host = Host::new(&board);
+        let visitor = {
+            let board = board.clone();
+            std::thread::spawn(move || board.get("/picture.jpg", QUERY).err())
+        };
+        while !host.visited() {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        let panicked = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| host.look(&mut |_| panic!("a fault"))));
+        assert!(panicked.is_err());
+        assert_eq!(visitor.join().unwrap(), Some(Refusal::Busy));
+        drop(host);
+        assert_eq!(board.get("/picture.jpg", QUERY).unwrap_err(), Refusal::Gone);
+    }
+
+    /// Of the processor of this thread: waiting costs none.
+    #[cfg(target_os = "linux")]
+    fn ticks(thread: &str) -> u64 {
+        let stat = std::fs::read_to_string(format!("/proc/self/task/{thread}/stat")).unwrap();
+        let fields: Vec<&str> = stat.rsplit_once(") ").unwrap().1.split(' ').collect();
+        fields[11..13].iter().map(|field| field.parse::<u64>().unwrap()).sum()
+    }
+
+    /// Also behind the visitor's own deadline, which is brought forward here.
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn a_visitor_of_a_slow_picture_sleeps() {
+        let board = board();
+        let mut host = Host::new(&board);
+        let (send, thread) = std::sync::mpsc::channel();
+        let visitor = {
+            let board = board.clone();
+            std::thread::spawn(move || {
+                let link = std::fs::read_link("/proc/thread-self").unwrap();
+                send.send(link.file_name().unwrap().to_string_lossy().into_owned()).unwrap();
+                let camera = board.camera(QUERY).unwrap();
+                board.picture_within(camera, Duration::from_secs(2)).is_ok()
+            })
+        };
+        let thread = thread.recv().unwrap();
+        while !host.visited() {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        host.look(&mut |camera| {
+            std::thread::sleep(Duration::from_millis(2200));
+            let before = ticks(&thread);
+            std::thread::sleep(Duration::from_millis(1000));
+            // A tick is 10 ms: a thread that spins has some hundred.
+            assert!(ticks(&thread) - before < 20, "the visitor spins");
+            Ok(Some(rendered(camera)))
+        });
+        assert!(visitor.join().unwrap(), "what is being drawn is worth waiting for");
+    }
+
+    #[test]
+    fn visitors_that_nobody_draws_for_are_told_to_come_again() {
+        let board = board();
+        let _host = Host::new(&board);
+        let camera = board.camera(QUERY).unwrap();
+        let began = Instant::now();
+        let ask = || board.picture_within(camera, Duration::from_millis(200)).err();
+        std::thread::scope(|scope| {
+            let visitors: Vec<_> = (0..3).map(|_| scope.spawn(ask)).collect();
+            for visitor in visitors {
+                assert_eq!(visitor.join().unwrap(), Some(Refusal::Busy));
+            }
+        });
+        assert!(began.elapsed() < PATIENCE, "{:?}", began.elapsed());
+        // More than may wait are not let in at all.
+        board.lock().waiting = MOST_WAITING;
+        assert_eq!(board.picture_within(camera, PATIENCE).err(), Some(Refusal::Busy));
+        assert!(began.elapsed() < PATIENCE, "{:?}", began.elapsed());
+    }
+
+    #[test]
+    fn the_text_of_a_step_is_made_once() {
+        let board = board();
+        let host = Host::new(&board);
+        let step = |step| host.step(&Progress { step, loss: 1.0, ..Progress::default() });
+        let said = || board.status();
+        step(1);
+        let first = said();
+        assert!(first.contains("\"step\":1,"), "{first}");
+        std::thread::sleep(2 * FRESH);
+        assert!(Arc::ptr_eq(&first, &said()), "nothing has changed");
+        step(2);
+        let second = said();
+        assert!(second.contains("\"step\":2,"), "{second}");
+        // Steps that follow quickly share a text.
+        step(3);
+        let third = said();
+        assert!(Arc::ptr_eq(&second, &third) || third.contains("\"step\":3,"), "{third}");
+        drop(host);
+        assert!(said().contains("\"ended\":true"), "the end is said at once");
     }
 
     #[test]

@@ -29,8 +29,17 @@ const STYLE: &[u8] = include_bytes!("supersplat/index.css");
 /// The viewer's licence.
 pub const LICENSE: &str = include_str!("supersplat/LICENSE");
 const TEMPLATE: &str = include_str!("page.html");
-const CONFIG: &str = "<!--config-->";
-const ASSETS: &str = "<!--assets-->";
+/// The page's own program.
+const PROGRAM: &str = include_str!("page.js");
+/// Places in the template, in their order.
+const PLACES: [&str; 4] = ["<!--policy-->", "<!--config-->", "<!--assets-->", "<!--program-->"];
+/// As [`server::POLICY`], for a page that holds all it needs.
+const SINGLE_POLICY: &str = "default-src 'none'; script-src 'unsafe-inline' blob: 'wasm-unsafe-eval'; \
+    style-src 'unsafe-inline' blob:; img-src blob: data:; font-src data:; connect-src blob: data:; worker-src blob:; \
+    base-uri 'none'; form-action 'none'";
+
+/// The page's program where it is served.
+const SCRIPT: &str = "<script type=\"module\" src=\"page.js\"></script>";
 
 /// Where the page starts, in the axes of the PLY, in which up is -y.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -149,19 +158,26 @@ impl Page {
         })
     }
 
-    fn html(&self, assets: &str) -> String {
+    fn html(&self, policy: &str, assets: &str, program: &str) -> String {
         // Within a script element, `<` would begin the end of it.
         let config = self.config().to_string().replace('<', "\\u003c");
-        let (head, rest) = TEMPLATE.split_once(CONFIG).expect("the page has a place for its settings");
-        let (middle, tail) = rest.split_once(ASSETS).expect("the page has a place for its assets");
-        [head, &config, middle, assets, tail].concat()
+        let mut html = String::new();
+        let mut rest = TEMPLATE;
+        for (place, text) in PLACES.into_iter().zip([policy, &config, assets, program]) {
+            let (before, after) = rest.split_once(place).expect("the page has a place for it");
+            html += before;
+            html += text;
+            rest = after;
+        }
+        html + rest
     }
 
     /// The page and what it fetches, for a server.
     pub fn resources(&self) -> Vec<Resource> {
         let plain = |path: &'static str, kind, bytes: Vec<u8>| Resource { path, kind, gzip: false, bytes };
         let mut all = vec![
-            plain("/", "text/html; charset=utf-8", self.html("").into_bytes()),
+            plain("/", "text/html; charset=utf-8", self.html("", "", SCRIPT).into_bytes()),
+            plain("/page.js", "text/javascript", PROGRAM.as_bytes().to_vec()),
             Resource { path: "/viewer.js", kind: "text/javascript", gzip: true, bytes: VIEWER.to_vec() },
             plain("/viewer.css", "text/css", STYLE.to_vec()),
             plain("/scene.ply", "application/octet-stream", self.ply.clone()),
@@ -193,7 +209,8 @@ impl Page {
         if let Some(jpeg) = &self.photograph {
             add("photograph.jpg", &packed(jpeg)?);
         }
-        Ok(self.html(&assets))
+        let policy = format!("<meta http-equiv=\"Content-Security-Policy\" content=\"{SINGLE_POLICY}\">");
+        Ok(self.html(&policy, &assets, &format!("<script type=\"module\">\n{PROGRAM}</script>")))
     }
 }
 
@@ -273,11 +290,52 @@ mod tests {
 
     #[test]
     fn a_name_cannot_break_out_of_the_page() {
-        let html = page().html("");
+        let html = page().html("", "", SCRIPT);
         let script = html.split_once("id=\"config\">").expect("the settings").1;
         let text = script.split_once("</script>").expect("its end").0;
         let config: Value = serde_json::from_str(text).expect("JSON");
         assert_eq!(config["title"], json!(page().title));
+    }
+
+    /// The policy of served pages lets no script run that stands in the page.
+    #[test]
+    fn served_pages_have_their_programs_in_files() {
+        let resources = page().resources();
+        let text = |path: &str| {
+            let found = resources.iter().find(|resource| resource.path == path).expect(path);
+            std::str::from_utf8(&found.bytes).expect("text").to_owned()
+        };
+        let html = text("/");
+        assert!(html.contains("<script type=\"module\" src=\"page.js\"></script>") && !html.contains("createViewer"));
+        assert!(text("/page.js").contains("createViewer"));
+        assert!(PLACES.iter().all(|place| !html.contains(place)));
+    }
+
+    /// The README says what the viewer's program is and how it was changed.
+    #[test]
+    fn the_viewer_is_the_one_that_its_readme_names() {
+        use std::fmt::Write as _;
+
+        use sha2::Digest as _;
+        let mut program = vec![];
+        std::io::Read::read_to_end(&mut flate2::read::GzDecoder::new(VIEWER), &mut program).expect("gzip");
+        let mut hash = String::new();
+        sha2::Sha256::digest(&program).iter().for_each(|byte| write!(hash, "{byte:02x}").expect("a string"));
+        let readme = include_str!("supersplat/README.md");
+        assert!(readme.contains(&format!("SHA-256 of what is packed here: `{hash}`")), "{hash}");
+        // Handlers that stand in elements are this one, which the servers' policy names.
+        let handler = "event.stopPropagation()";
+        let hash = BASE64_STANDARD.encode(sha2::Sha256::digest(handler));
+        assert!(server::POLICY.contains(&format!("'unsafe-hashes' 'sha256-{hash}'")), "{hash}");
+        // Models of controllers in VR came from there.
+        let program = String::from_utf8(program).expect("text");
+        for event in ["onpointerdown", "onwheel"] {
+            assert_eq!(
+                program.matches(&format!(" {event}=")).count(),
+                program.matches(&format!(" {event}=\\\"{handler}")).count()
+            );
+        }
+        assert!(!program.contains("cdn.") && !program.contains("jsdelivr"), "nothing is fetched from elsewhere");
     }
 
     #[test]
@@ -294,5 +352,7 @@ mod tests {
         }
         assert!(html.contains("Permission is hereby granted"), "the viewer's licence is in the page");
         assert!(!html.contains("src=\"http") && !html.contains("href=\"http"), "nothing is fetched");
+        assert!(html.contains("<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; "));
+        assert!(html.contains("const { createViewer } = await import("), "its program is in the page");
     }
 }

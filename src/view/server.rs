@@ -1,14 +1,20 @@
 //! A web server for a handful of files in memory, or what a [`Site`] makes of a request: GET and HEAD, one answer per
 //! connection.
 //!
-//! Whatever a client sends or does not send costs a thread for ten seconds at most and nothing else.
+//! Whatever clients send or do not send, they cost a bounded part of the machine ([`Limits`]): a connection has one deadline
+//! for its request and one for taking the answer; where there are too many, the one that has used most of its time goes;
+//! and only so many requests a second are looked at.
+//!
+//! A request must name this machine as its host. Otherwise the name of any web site could be pointed at the loopback
+//! address, and its pages would read what is served here (DNS rebinding). Pages may load nothing from elsewhere
+//! ([`POLICY`]), and other sites may embed nothing from here.
 
 use std::borrow::Cow;
-use std::io::{self, BufRead as _, BufReader, Read as _, Write as _};
-use std::net::{SocketAddr, TcpListener, TcpStream};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::time::Duration;
+use std::collections::{BTreeMap, VecDeque};
+use std::io::{self, Read as _, Write as _};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, Shutdown, SocketAddr, TcpListener, TcpStream};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
 
 /// A file to serve.
 #[derive(Debug, Clone)]
@@ -41,8 +47,16 @@ pub enum Refusal {
     BadRequest,
     /// There is nothing of this name.
     NotFound,
+    /// Only GET and HEAD are answered.
+    Method,
+    /// The request has not come to its end in time.
+    Late,
     /// There will be nothing more of this name.
     Gone,
+    /// The request is for another machine.
+    OtherHost,
+    /// The request is too long.
+    TooLong,
     /// Not now.
     Busy,
 }
@@ -52,7 +66,11 @@ impl Refusal {
         match self {
             Self::BadRequest => "400 Bad Request",
             Self::NotFound => "404 Not Found",
+            Self::Method => "405 Method Not Allowed",
+            Self::Late => "408 Request Timeout",
             Self::Gone => "410 Gone",
+            Self::OtherHost => "421 Misdirected Request",
+            Self::TooLong => "431 Request Header Fields Too Large",
             Self::Busy => "503 Service Unavailable",
         }
     }
@@ -75,12 +93,54 @@ impl Site for Vec<Resource> {
     }
 }
 
-/// Longest request head that is read.
-const MOST_BYTES: u64 = 16 << 10;
-/// Connections at once; more are told to come again.
-const MOST_CLIENTS: usize = 64;
-/// How long a client may take over its request, and over each part of the answer.
-const PATIENCE: Duration = Duration::from_secs(10);
+/// How much of the machine clients may have.
+#[derive(Debug, Clone, Copy)]
+pub struct Limits {
+    /// Connections at once.
+    pub clients: usize,
+    /// Time for a request to come to its end.
+    pub request: Duration,
+    /// Time for an answer to be taken, besides that of its bytes.
+    pub answer: Duration,
+    /// Bytes of an answer per second that a client takes at least.
+    pub rate: f64,
+    /// Time between two connections, on average over [`BURST`] of them; others wait for their turn.
+    pub pace: Duration,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            clients: 64,
+            request: Duration::from_secs(10),
+            answer: Duration::from_secs(10),
+            // A scene of 100 MB over a slow line takes its half hour.
+            rate: f64::from(64 << 10),
+            // A connection costs some 0.1 ms of one core: a fiftieth of it at most.
+            pace: Duration::from_millis(5),
+        }
+    }
+}
+
+/// Connections that need not wait for one another: more than a page has files.
+const BURST: u32 = 32;
+/// Longest head of a request that is read, bytes.
+const MOST_BYTES: usize = 16 << 10;
+/// Most fields of a head.
+const MOST_FIELDS: usize = 64;
+/// What is still read of a request that was refused, bytes and time: closing a connection with unread bytes resets it, and
+/// the refusal would be lost.
+const REST: (usize, Duration) = (1 << 20, Duration::from_millis(500));
+/// Answers are written in pieces of so many bytes, and the deadline is looked at before each.
+const PIECE: usize = 64 << 10;
+
+/// What pages may do: scripts and data come from the server itself or are made by the page (`blob:`), styles may stand in
+/// elements. Nothing is loaded from or sent elsewhere, and no other page embeds them. The viewer compiles WebAssembly, and
+/// the one handler that stands in its elements is named by its hash.
+pub const POLICY: &str = "default-src 'none'; script-src 'self' blob: 'wasm-unsafe-eval' 'unsafe-hashes' \
+    'sha256-jHF5hTIlMDyGZRAsNK0HO/WFYrwPvI2I1q0o1xKKB6I='; style-src 'self' 'unsafe-inline'; \
+    img-src 'self' blob: data:; font-src 'self' data:; connect-src 'self' blob: data:; worker-src 'self' blob:; \
+    base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
 /// Binds the address; port 0 is any free one.
 ///
@@ -95,148 +155,295 @@ pub fn bind(address: SocketAddr) -> io::Result<TcpListener> {
 /// # Errors
 /// Never while the listener is whole.
 pub fn serve(listener: &TcpListener, site: &Arc<impl Site>) -> io::Result<()> {
-    let clients = Arc::new(AtomicUsize::new(0));
+    serve_within(listener, site, Limits::default())
+}
+
+/// [`serve`] with limits of one's own.
+///
+/// # Errors
+/// As [`serve`].
+pub fn serve_within(listener: &TcpListener, site: &Arc<impl Site>, limits: Limits) -> io::Result<()> {
+    let clients = Arc::new(Clients::default());
+    // Kept for a while: their requests are unread, see [`REST`].
+    let mut turned_away = VecDeque::new();
+    let mut next = Instant::now();
     loop {
+        // Connections that are not accepted yet wait in the system.
+        let now = Instant::now();
+        next = now.checked_sub(limits.pace * BURST).map_or(next, |earliest| next.max(earliest)) + limits.pace;
+        std::thread::sleep(next.saturating_duration_since(now));
         // A client that is gone again, or a moment without file handles, is none of the others' business.
         let Ok((stream, _)) = listener.accept() else {
             std::thread::sleep(Duration::from_millis(50));
             continue;
         };
-        let before = clients.fetch_add(1, Ordering::Relaxed);
-        let client = Client { site: site.clone(), clients: clients.clone() };
-        let busy = before >= MOST_CLIENTS;
+        let stream = Arc::new(stream);
+        let Some(number) = clients.admit(&stream, limits) else {
+            // A new connection has room for it.
+            let _ = stream.set_nonblocking(true);
+            let _ = (&*stream).write_all(&refusal(Refusal::Busy)).and_then(|()| stream.shutdown(Shutdown::Write));
+            turned_away.push_back(stream);
+            if turned_away.len() > limits.clients {
+                turned_away.pop_front();
+            }
+            continue;
+        };
+        let client = Client { site: site.clone(), clients: clients.clone(), number, limits, stream };
         // Errors are the client's: it went away. Without a thread for it, it is as good as gone.
-        let _ = std::thread::Builder::new().spawn(move || client.answer(&stream, busy));
+        let _ = std::thread::Builder::new().spawn(move || client.talk());
+    }
+}
+
+/// The connections there are, by number in their order.
+#[derive(Default)]
+struct Clients(Mutex<(u64, BTreeMap<u64, Connection>)>);
+
+struct Connection {
+    stream: Arc<TcpStream>,
+    /// Since when the client has been waited for, and for how long that may be; nothing while it waits for us.
+    waited_for: Option<(Instant, Duration)>,
+}
+
+impl Connection {
+    /// Part of its time that a client has used.
+    fn used(&self) -> Option<f64> {
+        self.waited_for.map(|(since, time)| since.elapsed().as_secs_f64() / time.as_secs_f64())
+    }
+}
+
+impl Clients {
+    /// What a thread that panicked has left is whole: every change is one call.
+    fn lock(&self) -> MutexGuard<'_, (u64, BTreeMap<u64, Connection>)> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Takes a connection in, in place of the slowest client's where there are too many; none where all wait for us.
+    fn admit(&self, stream: &Arc<TcpStream>, limits: Limits) -> Option<u64> {
+        let (last, all) = &mut *self.lock();
+        if all.len() >= limits.clients {
+            let used = all.iter().filter_map(|(number, connection)| Some((connection.used()?, *number)));
+            let (_, slowest) = used.max_by(|a, b| a.0.total_cmp(&b.0))?;
+            // Its thread wakes up to a closed connection.
+            let _ = all.remove(&slowest).map(|gone| gone.stream.shutdown(Shutdown::Both));
+        }
+        *last += 1;
+        all.insert(*last, Connection { stream: stream.clone(), waited_for: Some((Instant::now(), limits.request)) });
+        Some(*last)
     }
 }
 
 /// One connection; it is counted until this is gone.
 struct Client<S> {
     site: Arc<S>,
-    clients: Arc<AtomicUsize>,
+    clients: Arc<Clients>,
+    number: u64,
+    limits: Limits,
+    stream: Arc<TcpStream>,
 }
 
 impl<S> Drop for Client<S> {
     fn drop(&mut self) {
-        self.clients.fetch_sub(1, Ordering::Relaxed);
+        self.clients.lock().1.remove(&self.number);
     }
 }
 
 impl<S: Site> Client<S> {
-    fn answer(&self, stream: &TcpStream, busy: bool) -> io::Result<()> {
-        stream.set_read_timeout(Some(PATIENCE))?;
-        stream.set_write_timeout(Some(PATIENCE))?;
-        if busy {
-            return refuse(stream, Refusal::Busy.status());
+    fn waits(&self, time: Option<Duration>) {
+        if let Some(connection) = self.clients.lock().1.get_mut(&self.number) {
+            connection.waited_for = time.map(|time| (Instant::now(), time));
         }
-        answer(stream, &*self.site)
+    }
+
+    fn talk(&self) -> io::Result<()> {
+        // Answers are written whole: nothing is gained by waiting for more.
+        self.stream.set_nodelay(true)?;
+        let request = self.request(Instant::now() + self.limits.request)?;
+        self.waits(None);
+        let (method, answer) = match request.and_then(|head| self.answered(&head)) {
+            Ok(answered) => answered,
+            Err(refused) => {
+                self.waits(Some(self.limits.answer));
+                self.write(&refusal(refused), Instant::now() + self.limits.answer)?;
+                return self.drain();
+            }
+        };
+        let head = head("200 OK", answer.kind, answer.bytes.len(), answer.gzip);
+        let body: &[u8] = if method == Method::Get { &answer.bytes } else { &[] };
+        let time = self.limits.answer + Duration::from_secs_f64(body.len() as f64 / self.limits.rate);
+        self.waits(Some(time));
+        let until = Instant::now() + time;
+        if body.len() < PIECE {
+            return self.write(&[head.as_bytes(), body].concat(), until);
+        }
+        self.write(head.as_bytes(), until)?;
+        self.write(body, until)
+    }
+
+    /// Reads the head of a request.
+    fn request(&self, until: Instant) -> io::Result<Result<Vec<u8>, Refusal>> {
+        let mut head = Vec::with_capacity(1024);
+        let mut piece = [0; 4096];
+        loop {
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Ok(Err(Refusal::Late));
+            }
+            self.stream.set_read_timeout(Some(left))?;
+            let read = match (&*self.stream).read(&mut piece) {
+                Ok(0) => return Err(io::ErrorKind::UnexpectedEof.into()),
+                Ok(read) => read,
+                Err(error) if is_pause(&error) => continue,
+                Err(error) => return Err(error),
+            };
+            // The end of the head may lie across two pieces.
+            let from = head.len().saturating_sub(2);
+            head.extend_from_slice(&piece[..read]);
+            let new = &head[from..];
+            let ends = |end: &[u8]| new.windows(end.len()).any(|window| window == end);
+            if head.len() > MOST_BYTES {
+                return Ok(Err(Refusal::TooLong));
+            }
+            if ends(b"\n\n") || ends(b"\n\r\n") {
+                return Ok(Ok(head));
+            }
+        }
+    }
+
+    fn answered(&self, head: &[u8]) -> Result<(Method, Answer<'_>), Refusal> {
+        let mut fields = [httparse::EMPTY_HEADER; MOST_FIELDS];
+        let request = Request::parse(head, &mut fields)?;
+        // Behind some addresses there is more than one of this machine's: the client has chosen which.
+        let ours = self.stream.local_addr().map_or(Ipv4Addr::LOCALHOST.into(), |address| address.ip());
+        if !names(request.field("host")?.ok_or(Refusal::BadRequest)?, ours) {
+            return Err(Refusal::OtherHost);
+        }
+        let method = request.method.ok_or(Refusal::Method)?;
+        Ok((method, self.site.get(request.path, request.query)?))
+    }
+
+    fn write(&self, bytes: &[u8], until: Instant) -> io::Result<()> {
+        let mut rest = bytes;
+        while !rest.is_empty() {
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Err(io::ErrorKind::TimedOut.into());
+            }
+            self.stream.set_write_timeout(Some(left))?;
+            match (&*self.stream).write(&rest[..rest.len().min(PIECE)]) {
+                Ok(0) => return Err(io::ErrorKind::WriteZero.into()),
+                Ok(written) => rest = &rest[written..],
+                Err(error) if is_pause(&error) => {}
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(())
+    }
+
+    /// Reads what is left of a request that was refused, see [`REST`].
+    fn drain(&self) -> io::Result<()> {
+        self.stream.shutdown(Shutdown::Write)?;
+        let (bytes, time) = REST;
+        let until = Instant::now() + time;
+        let mut piece = [0; 4096];
+        for _ in 0..bytes / piece.len() {
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                break;
+            }
+            self.stream.set_read_timeout(Some(left))?;
+            if (&*self.stream).read(&mut piece)? == 0 {
+                break;
+            }
+        }
+        Ok(())
     }
 }
 
-fn answer(mut stream: &TcpStream, site: &impl Site) -> io::Result<()> {
-    let mut head = BufReader::new(stream.take(MOST_BYTES));
-    let mut request = String::new();
-    head.read_line(&mut request)?;
-    // The rest of the head is read, so that closing the connection does not reset it, and not used.
-    let mut line = String::new();
-    while head.read_line(&mut line)? > 2 {
-        line.clear();
+/// Whether a call may be made again: its time was over, or a signal came.
+fn is_pause(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut | io::ErrorKind::Interrupted)
+}
+
+/// What may be asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Method {
+    Get,
+    Head,
+}
+
+/// The head of a request.
+struct Request<'a> {
+    /// Nothing where it is none that is known here.
+    method: Option<Method>,
+    path: &'a str,
+    query: &'a str,
+    fields: &'a [httparse::Header<'a>],
+}
+
+impl<'a> Request<'a> {
+    fn parse(head: &'a [u8], fields: &'a mut [httparse::Header<'a>]) -> Result<Self, Refusal> {
+        let mut request = httparse::Request::new(fields);
+        match request.parse(head) {
+            Ok(httparse::Status::Complete(_)) => {}
+            Err(httparse::Error::TooManyHeaders) => return Err(Refusal::TooLong),
+            Ok(httparse::Status::Partial) | Err(_) => return Err(Refusal::BadRequest),
+        }
+        let target = request.path.filter(|path| path.starts_with('/')).ok_or(Refusal::BadRequest)?;
+        let target = target.split('#').next().unwrap_or_default();
+        let (path, query) = target.split_once('?').unwrap_or((target, ""));
+        let method = match request.method {
+            Some("GET") => Some(Method::Get),
+            Some("HEAD") => Some(Method::Head),
+            _ => None,
+        };
+        Ok(Self { method, path, query, fields: request.headers })
     }
-    let mut words = request.split_whitespace();
-    let (method, target) = (words.next().unwrap_or_default(), words.next().unwrap_or_default());
-    if !words.next().is_some_and(|version| version.starts_with("HTTP/1.")) {
-        return refuse(stream, "400 Bad Request");
+
+    /// The field of this name, which is there once at most.
+    fn field(&self, name: &str) -> Result<Option<&'a str>, Refusal> {
+        let mut all = self.fields.iter().filter(|field| field.name.eq_ignore_ascii_case(name));
+        let Some(field) = all.next() else { return Ok(None) };
+        let text = std::str::from_utf8(field.value).map_err(|_| Refusal::BadRequest)?;
+        if all.next().is_some() { Err(Refusal::BadRequest) } else { Ok(Some(text.trim())) }
     }
-    if !matches!(method, "GET" | "HEAD") {
-        return refuse(stream, "405 Method Not Allowed");
-    }
-    let target = target.split('#').next().unwrap_or_default();
-    let (path, query) = target.split_once('?').unwrap_or((target, ""));
-    let answer = match site.get(path, query) {
-        Ok(answer) => answer,
-        Err(refusal) => return refuse(stream, refusal.status()),
+}
+
+/// Whether the field `Host` names this machine: as localhost, by a loopback address, or by the address that the client
+/// has connected to. The port is not compared: it is another one behind `ssh -L`.
+fn names(host: &str, ours: IpAddr) -> bool {
+    let (name, port) = match host.strip_prefix('[').and_then(|host| host.split_once(']')) {
+        Some((name, port)) => (name, port),
+        None => host.split_at(host.find(':').unwrap_or(host.len())),
     };
-    let encoding = if answer.gzip { "Content-Encoding: gzip\r\n" } else { "" };
-    write!(
-        stream,
-        "HTTP/1.1 200 OK\r\nContent-Type: {}\r\nContent-Length: {}\r\n{encoding}Cache-Control: no-store\r\nConnection: close\r\n\r\n",
-        answer.kind,
-        answer.bytes.len()
-    )?;
-    if method == "GET" {
-        stream.write_all(&answer.bytes)?;
-    }
-    stream.flush()
+    let port = port.is_empty() || port.strip_prefix(':').is_some_and(|digits| digits.parse::<u16>().is_ok());
+    let address: Option<IpAddr> = if host.starts_with('[') {
+        name.parse::<Ipv6Addr>().ok().map(Into::into)
+    } else {
+        name.parse::<Ipv4Addr>().ok().map(Into::into)
+    };
+    let loopback: [IpAddr; 2] = [Ipv4Addr::LOCALHOST.into(), Ipv6Addr::LOCALHOST.into()];
+    let address = address.map(|address| address.to_canonical());
+    let ours = |address: IpAddr| loopback.contains(&address) || address == ours.to_canonical();
+    port && (name.eq_ignore_ascii_case("localhost") || address.is_some_and(ours))
 }
 
-fn refuse(mut stream: &TcpStream, status: &str) -> io::Result<()> {
-    write!(
-        stream,
-        "HTTP/1.1 {status}\r\nContent-Type: text/plain\r\nContent-Length: {}\r\nConnection: close\r\n\r\n{status}\n",
-        status.len() + 1
+fn head(status: &str, kind: &str, bytes: usize, gzip: bool) -> String {
+    let encoding = if gzip { "Content-Encoding: gzip\r\n" } else { "" };
+    format!(
+        "HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {bytes}\r\n{encoding}Cache-Control: no-store\r\n\
+         Content-Security-Policy: {POLICY}\r\nCross-Origin-Resource-Policy: same-origin\r\nReferrer-Policy: no-referrer\r\n\
+         X-Content-Type-Options: nosniff\r\nConnection: close\r\n\r\n"
     )
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn start() -> SocketAddr {
-        let listener = bind(([127, 0, 0, 1], 0).into()).expect("a free port");
-        let address = listener.local_addr().expect("it is bound");
-        let file = |path, gzip, bytes: &[u8]| Resource { path, kind: "text/plain", gzip, bytes: bytes.to_vec() };
-        let resources = vec![file("/", false, b"page"), file("/big", true, &vec![b'Q'; 3_000_000])];
-        std::thread::spawn(move || serve(&listener, &Arc::new(resources)));
-        address
-    }
-
-    fn ask(address: SocketAddr, request: &[u8]) -> String {
-        let mut stream = TcpStream::connect(address).expect("the server listens");
-        stream.write_all(request).expect("the server reads");
-        let mut answer = String::new();
-        stream.read_to_string(&mut answer).expect("the server answers");
-        answer
-    }
-
-    #[test]
-    fn files_are_served_and_nothing_else() {
-        let address = start();
-        let page = ask(address, b"GET /?noui HTTP/1.1\r\nHost: here\r\n\r\n");
-        assert!(page.starts_with("HTTP/1.1 200 OK\r\n") && page.ends_with("\r\n\r\npage"), "{page}");
-        let head = ask(address, b"HEAD /big HTTP/1.1\r\n\r\n");
-        assert!(head.contains("Content-Encoding: gzip\r\n") && head.ends_with("\r\n\r\n"), "{head}");
-        assert_eq!(ask(address, b"GET /big HTTP/1.0\r\n\r\n").matches('Q').count(), 3_000_000);
-        for (request, status) in [
-            (b"GET /../etc/passwd HTTP/1.1\r\n\r\n".as_slice(), "404"),
-            (b"POST / HTTP/1.1\r\n\r\n", "405"),
-            (b"\r\n\r\n", "400"),
-            (b"GET /\r\n\r\n", "400"),
-        ] {
-            let answer = ask(address, request);
-            assert!(answer.starts_with(&format!("HTTP/1.1 {status} ")), "{answer}");
-        }
-    }
-
-    #[test]
-    fn clients_that_go_away_or_never_ask_leave_the_server_alone() {
-        let address = start();
-        let silent: Vec<TcpStream> = (0..20).map(|_| TcpStream::connect(address).expect("it listens")).collect();
-        for _ in 0..20 {
-            let mut stream = TcpStream::connect(address).expect("it listens");
-            stream.write_all(b"GET /big HTTP/1.1\r\n\r\n").expect("it reads");
-            // Closed in the middle of the answer.
-            drop(stream);
-        }
-        // Not text, and a head without an end.
-        let mut stream = TcpStream::connect(address).expect("it listens");
-        let _ = stream.write_all(&[0xff; 40_000]);
-        drop(stream);
-        assert!(ask(address, b"GET / HTTP/1.1\r\n\r\n").ends_with("page"));
-        drop(silent);
-    }
-
-    #[test]
-    fn a_busy_port_is_an_error() {
-        assert_eq!(bind(start()).expect_err("in use").kind(), io::ErrorKind::AddrInUse);
-    }
+fn refusal(refusal: Refusal) -> Vec<u8> {
+    let status = refusal.status();
+    let text = match refusal {
+        Refusal::OtherHost => format!("{status}: open it as localhost or by its address\n"),
+        _ => format!("{status}\n"),
+    };
+    (head(status, "text/plain", text.len(), false) + &text).into_bytes()
 }
+
+#[cfg(test)]
+mod tests;

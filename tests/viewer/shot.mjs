@@ -17,6 +17,11 @@ try {
     const { protocol, host } = new URL(request.url());
     if (!['data:', 'blob:', 'file:'].includes(protocol) && host !== new URL(url).host) problems.push(request.url());
   });
+  // What the page's own policy forbids.
+  await page.evaluateOnNewDocument(() => {
+    globalThis.violations = [];
+    addEventListener('securitypolicyviolation', (event) => globalThis.violations.push(`${event.violatedDirective} ${event.blockedURI}`));
+  });
   // The footer takes the rest.
   await page.setViewport({ width: Number(width), height: Number(height) + 60 });
   await page.goto(url);
@@ -37,6 +42,7 @@ try {
     }, more[i]);
     await shoot(more[i + 1]);
   }
+  problems.push(...await page.evaluate(() => globalThis.violations));
   if (problems.length) throw new Error(problems.join('; '));
 } finally {
   await browser.close();
