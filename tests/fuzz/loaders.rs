@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use gscream_vk::capture::graph_cut::Strokes;
 use gscream_vk::capture::lens::Pinhole;
-use gscream_vk::capture::{doctor, poses, record};
+use gscream_vk::capture::{Silent, doctor, poses, record};
 use gscream_vk::config::{Settings, Source};
 use gscream_vk::evaluate::network::Weights;
 use gscream_vk::export::{gltf, ply, spz};
@@ -201,7 +201,7 @@ fn captures() {
         [text("OPENCV", ""), text("OPENCV_FISHEYE", ", \"ply_file_path\": null"), text("PINHOLE", ", \"a\": {}")];
     let seeds: Vec<Vec<u8>> = seeds.map(String::into_bytes).into();
     let out = folder.path().join("out");
-    let load = |folder: &Path| poses::find(folder)?.collect(&out, &mut |_| {});
+    let load = |folder: &Path| poses::find(folder)?.collect(&out, &mut Silent);
     Loader::of_text("transforms.json", seeds).rarely(20).run(of_scene(&folder, "transforms.json", load));
 }
 
