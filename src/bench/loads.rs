@@ -22,7 +22,7 @@ use crate::gpu::{self, Gpu};
 use crate::model::files::{Anchors, FEATURES};
 use crate::model::init;
 use crate::render::Method;
-use crate::render::view::Capacity;
+use crate::render::forward::Capacity;
 use crate::report::Error;
 use crate::report::kernels::{Bench, Warm};
 use crate::report::variants::Variant;

@@ -3,18 +3,19 @@
 //! A Gaussian is named by its anchor and its number within it, `anchor K + k`: decoded Gaussians differ from view to view,
 //! their names do not.
 
-use crate::gpu::{Buffer, Error, Gpu};
+use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::model::anchors::Anchors;
 use crate::model::files;
-use crate::primitives::limit::Limits;
+use crate::render::bin::Binned;
+use crate::render::forward::{Capacity, Model};
 use crate::render::rasterize::{self, Backward, Outputs, Picture, PictureGradient, Projected};
-use crate::render::view::{Capacity, Forward, Model, Rendered};
-use crate::render::{Config, Method};
+use crate::render::session::{Room, Stages};
+use crate::render::view::Rendered;
+use crate::render::{Config, Session};
 use crate::scene::Camera;
 
-/// The stages of one picture size.
-struct Stages {
-    forward: Forward,
+/// What is drawn and asked beside the forward stages.
+struct Canvas {
     backward: Backward,
     picture: Picture,
     gradient: Buffer<[f32; 3]>,
@@ -22,17 +23,24 @@ struct Stages {
     opacity: Buffer<f32>,
 }
 
+impl Canvas {
+    fn new(gpu: &Gpu, room: Room) -> Result<Self, Error> {
+        Ok(Self {
+            backward: Backward::new(gpu, room.method, room.slots, room.pairs, Outputs::Color)?,
+            picture: Picture::new(gpu, room.size, room.pixels(), Outputs::Transmittance)?,
+            gradient: gpu.buffer("grad_rgb", room.pixels())?,
+            color: gpu.buffer("color", room.slots)?,
+            opacity: gpu.buffer("opacity", room.slots)?,
+        })
+    }
+}
+
 /// Draws and questions a model Gaussian by Gaussian.
 pub struct Splats {
     gpu: Gpu,
     anchors: Anchors,
     weights: Buffer<f32>,
-    method: Method,
-    near: f32,
-    cull: bool,
-    limits: Limits,
-    capacity: Capacity,
-    stages: Option<Stages>,
+    session: Session<Canvas>,
 }
 
 impl Splats {
@@ -43,17 +51,8 @@ impl Splats {
     pub fn new(gpu: &Gpu, anchors: &files::Anchors, weights: &files::Weights, config: &Config) -> Result<Self, Error> {
         let weights = gpu.upload("weights", &weights.decoders())?;
         let anchors = Anchors::upload(gpu, anchors, 0)?;
-        Ok(Self {
-            gpu: gpu.clone(),
-            method: Method::new(gpu, config)?,
-            near: config.near as f32,
-            cull: config.cull,
-            limits: Limits::new(gpu)?,
-            capacity: Capacity::guess(anchors.count),
-            anchors,
-            weights,
-            stages: None,
-        })
+        let session = Session::new(gpu, config, Capacity::guess(anchors.count), Canvas::new)?;
+        Ok(Self { gpu: gpu.clone(), anchors, weights, session })
     }
 
     /// How many names there are.
@@ -71,51 +70,25 @@ impl Splats {
         self.len() == 0
     }
 
-    /// Stages whose forward part was recorded and run for a camera, with the names of the Gaussians by slot.
-    fn decode(&mut self, camera: &Camera) -> Result<(Stages, Vec<(u32, u32)>), Error> {
-        loop {
-            let stages = match self.stages.take() {
-                Some(stages) if stages.picture.size == camera.size => stages,
-                old => {
-                    drop(old);
-                    self.make(camera.size)?
-                }
-            };
-            let mut rec = self.gpu.recorder()?;
-            let model = Model { anchors: &self.anchors, weights: &self.weights };
-            stages.forward.record(&mut rec, model, camera, self.near, &self.limits);
-            rec.submit()?.wait()?;
-            if self.gpu.read(self.limits.overflow())?[0] == 0 {
-                let visible = self.gpu.read(&stages.forward.visible.count)?[0];
-                let list = self.gpu.read_range(&stages.forward.visible.list, visible as usize)?;
-                let existing = &stages.forward.decode.existing;
-                let count = self.gpu.read(&existing.count)?[0] as usize;
-                let offsets = self.anchors.offsets;
-                let named = |slot: u32| (slot, list[(slot % visible) as usize] * offsets + slot / visible);
-                let names = self.gpu.read_range(&existing.list, count)?.into_iter().map(named).collect();
-                return Ok((stages, names));
-            }
-            drop(stages);
-            let counters = self.gpu.read(self.limits.counters())?;
-            self.capacity = self.capacity.fit(std::array::from_fn(|i| counters[i]));
-            let mut rec = self.gpu.recorder()?;
-            self.limits.lower(&mut rec);
-            rec.submit()?.wait()?;
-        }
+    /// Runs the forward stages and `work` for a camera.
+    fn run(
+        &mut self,
+        camera: &Camera,
+        work: impl Fn(&mut Recorder<'_>, &Stages<Canvas>, Binned<'_>),
+    ) -> Result<&Stages<Canvas>, Error> {
+        self.session.run(Model { anchors: &self.anchors, weights: &self.weights }, camera, work)
     }
 
-    fn make(&self, size: [u32; 2]) -> Result<Stages, Error> {
-        let (gpu, capacity, offsets) = (&self.gpu, self.capacity, self.anchors.offsets);
-        let pixels = size[0] as usize * size[1] as usize;
-        let slots = (capacity.visible * offsets) as usize;
-        Ok(Stages {
-            forward: Forward::new(gpu, capacity, offsets, self.method, size, self.cull)?,
-            backward: Backward::new(gpu, self.method, slots, capacity.pairs as usize, Outputs::Color)?,
-            picture: Picture::new(gpu, size, pixels, Outputs::Transmittance)?,
-            gradient: gpu.buffer("grad_rgb", pixels)?,
-            color: gpu.buffer("color", slots)?,
-            opacity: gpu.buffer("opacity", slots)?,
-        })
+    /// Runs the forward stages for a camera; returns the slots of the Gaussians that exist, with their names.
+    fn decode(&mut self, camera: &Camera) -> Result<Vec<(u32, u32)>, Error> {
+        let (gpu, offsets) = (self.gpu.clone(), self.anchors.offsets);
+        let forward = &self.run(camera, |_, _, _| {})?.forward;
+        let visible = gpu.read(&forward.visible.count)?[0];
+        let list = gpu.read_range(&forward.visible.list, visible as usize)?;
+        let existing = &forward.decode.existing;
+        let count = gpu.read(&existing.count)?[0] as usize;
+        let named = |slot: u32| (slot, list[(slot % visible) as usize] * offsets + slot / visible);
+        Ok(gpu.read_range(&existing.list, count)?.into_iter().map(named).collect())
     }
 
     /// The colours that the Gaussians near this camera's view have in it, by name; hidden ones, too.
@@ -123,9 +96,8 @@ impl Splats {
     /// # Errors
     /// When the device has no room, or is lost.
     pub fn colors(&mut self, camera: &Camera) -> Result<Vec<(u32, [f32; 3])>, Error> {
-        let (stages, names) = self.decode(camera)?;
-        let colors = self.gpu.read(&stages.forward.decode.color)?;
-        self.stages = Some(stages);
+        let names = self.decode(camera)?;
+        let colors = self.gpu.read(&self.session.stages().forward.decode.color)?;
         Ok(names.into_iter().map(|(slot, name)| (name, colors[slot as usize])).collect())
     }
 
@@ -142,24 +114,22 @@ impl Splats {
     /// Unless there is a weight per pixel.
     pub fn shares(&mut self, camera: &Camera, weights: &[[f32; 3]]) -> Result<Vec<(u32, [f32; 3])>, Error> {
         assert_eq!(weights.len(), camera.size[0] as usize * camera.size[1] as usize, "a weight per pixel");
-        let (stages, names) = self.decode(camera)?;
-        let Stages { forward, backward, picture, gradient, .. } = &stages;
-        self.gpu.write(gradient, weights)?;
-        let picture = picture.color();
-        let mut rec = self.gpu.recorder()?;
-        let model = Model { anchors: &self.anchors, weights: &self.weights };
-        let binned = forward.record(&mut rec, model, camera, self.near, &self.limits);
-        rasterize::forward(&mut rec, self.method, forward.projected(), binned, [0.0; 3], &picture);
-        let gradient = PictureGradient { rgb: gradient, depth: None, transmittance: None };
-        backward.record(&mut rec, self.method, forward.projected(), binned, &picture, gradient);
-        let drawn = binned.drawn;
-        rec.submit()?.wait()?;
-        let count = self.gpu.read(&drawn.count)?[0] as usize;
-        let drawn = self.gpu.read_range(&drawn.list, count)?;
-        let sums = self.gpu.read(&backward.grad_color)?;
+        let names = self.decode(camera)?;
+        let gpu = self.gpu.clone();
+        gpu.write(&self.session.stages().own.gradient, weights)?;
+        let stages = self.run(camera, |rec, stages, binned| {
+            let Stages { room, forward, own: Canvas { backward, picture, gradient, .. } } = stages;
+            let picture = picture.color();
+            rasterize::forward(rec, room.method, forward.projected(), binned, [0.0; 3], &picture);
+            let gradient = PictureGradient { rgb: gradient, depth: None, transmittance: None };
+            backward.record(rec, room.method, forward.projected(), binned, &picture, gradient);
+        })?;
+        let drawn = stages.forward.bin.drawn();
+        let count = gpu.read(&drawn.count)?[0] as usize;
+        let drawn = gpu.read_range(&drawn.list, count)?;
+        let sums = gpu.read(&stages.own.backward.grad_color)?;
         let mut of_slot = vec![u32::MAX; sums.len()];
         names.iter().for_each(|(slot, name)| of_slot[*slot as usize] = *name);
-        self.stages = Some(stages);
         Ok(drawn.into_iter().map(|slot| (of_slot[slot as usize], sums[slot as usize])).collect())
     }
 
@@ -173,10 +143,11 @@ impl Splats {
         camera: &Camera,
         look: impl Fn(u32, [f32; 3]) -> Option<[f32; 3]>,
     ) -> Result<Rendered, Error> {
-        let (stages, names) = self.decode(camera)?;
-        let Stages { forward, picture, color, opacity, .. } = &stages;
-        let mut colors = self.gpu.read(&forward.decode.color)?;
-        let mut opacities = self.gpu.read(&forward.decode.opacity)?;
+        let names = self.decode(camera)?;
+        let gpu = self.gpu.clone();
+        let Stages { forward, own: Canvas { color, opacity, .. }, .. } = self.session.stages();
+        let mut colors = gpu.read(&forward.decode.color)?;
+        let mut opacities = gpu.read(&forward.decode.opacity)?;
         for (slot, name) in names {
             let slot = slot as usize;
             match look(name, colors[slot]) {
@@ -186,24 +157,14 @@ impl Splats {
             }
         }
         let slots = color.len().min(colors.len());
-        self.gpu.write(color, &colors[..slots])?;
-        self.gpu.write(opacity, &opacities[..slots])?;
-        let mut rec = self.gpu.recorder()?;
-        let model = Model { anchors: &self.anchors, weights: &self.weights };
+        gpu.write(color, &colors[..slots])?;
+        gpu.write(opacity, &opacities[..slots])?;
         // Binned with the opacities that they have: the lists of those left out are walked in vain.
-        let binned = forward.record(&mut rec, model, camera, self.near, &self.limits);
-        let gaussians = Projected { color, opacity, ..forward.projected() };
-        rasterize::forward(&mut rec, self.method, gaussians, binned, [0.0; 3], picture);
-        rec.submit()?.wait()?;
-        let (depth, transmittance) =
-            picture.depth.as_ref().zip(picture.transmittance.as_ref()).expect("the picture was made with depth");
-        let rendered = Rendered {
-            size: camera.size,
-            rgb: self.gpu.read(&picture.rgb)?,
-            depth: self.gpu.read(depth)?,
-            transmittance: self.gpu.read(transmittance)?,
-        };
-        self.stages = Some(stages);
-        Ok(rendered)
+        let stages = self.run(camera, |rec, stages, binned| {
+            let Stages { room, forward, own: Canvas { picture, color, opacity, .. } } = stages;
+            let gaussians = Projected { color, opacity, ..forward.projected() };
+            rasterize::forward(rec, room.method, gaussians, binned, [0.0; 3], picture);
+        })?;
+        Rendered::read(&gpu, &stages.own.picture)
     }
 }

@@ -10,10 +10,11 @@ use crate::gpu::{Buffer, Gpu};
 use crate::math::harmonics::ZEROTH;
 use crate::model::anchors::Anchors;
 use crate::model::files;
-use crate::primitives::limit::Limits;
+use crate::render::forward::{Capacity, Model};
 use crate::render::rasterize::{self, Backward, Outputs, Picture, PictureGradient};
-use crate::render::view::{Capacity, Forward, Model, to_rgb8};
-use crate::render::{Config, Method};
+use crate::render::session::{Room, Stages};
+use crate::render::view::to_rgb8;
+use crate::render::{Config, Session};
 use crate::scene::Camera;
 
 /// Gaussians whose samples all stay below what a viewer skips are not seen.
@@ -49,23 +50,31 @@ impl Sums {
 /// Reads anchors off from one pose after the other.
 pub struct Baker {
     gpu: Gpu,
-    config: Config,
+    near: f64,
     background: [f32; 3],
-    limits: Limits,
-    capacity: Capacity,
+    session: Session<Shares>,
     anchors: Anchors,
     weights: Buffer<f32>,
     /// \[gaussian\] world.
     position: Vec<[f64; 3]>,
     sums: Vec<Sums>,
-    stages: Option<Stages>,
 }
 
-struct Stages {
-    forward: Forward,
+/// A pose's picture, and what each Gaussian gave to it.
+struct Shares {
     picture: Picture,
     backward: Backward,
     ones: Buffer<[f32; 3]>,
+}
+
+impl Shares {
+    fn new(gpu: &Gpu, room: Room) -> Result<Self, crate::gpu::Error> {
+        Ok(Self {
+            picture: Picture::new(gpu, room.size, room.pixels(), Outputs::Color)?,
+            backward: Backward::new(gpu, room.method, room.slots, room.pairs, Outputs::Color)?,
+            ones: gpu.upload("ones", &vec![[1.0; 3]; room.pixels()])?,
+        })
+    }
 }
 
 impl Baker {
@@ -90,15 +99,13 @@ impl Baker {
         let capacity = Capacity::guess(anchors.position.len() as u32);
         Ok(Self {
             gpu: gpu.clone(),
-            config: config.clone(),
+            near: config.near,
             background,
-            limits: Limits::new(gpu)?,
-            capacity,
+            session: Session::new(gpu, config, capacity, Shares::new)?,
             anchors: Anchors::upload(gpu, anchors, 0)?,
             weights: gpu.upload("weights", &weights.decoders())?,
             sums: vec![Sums::default(); position.len()],
             position,
-            stages: None,
         })
     }
 
@@ -112,53 +119,21 @@ impl Baker {
     /// # Errors
     /// When the device has no room for it, or is lost.
     pub fn look(&mut self, camera: &Camera) -> Result<image::RgbImage, Error> {
-        let picture = loop {
-            self.furnish(camera.size)?;
-            let Stages { forward, picture, backward, ones } = self.stages.as_ref().expect("just made");
-            let mut rec = self.gpu.recorder()?;
-            let model = Model { anchors: &self.anchors, weights: &self.weights };
-            let binned = forward.record(&mut rec, model, camera, self.config.near as f32, &self.limits);
-            let method = forward.method();
-            rasterize::forward(&mut rec, method, forward.projected(), binned, self.background, picture);
+        let model = Model { anchors: &self.anchors, weights: &self.weights };
+        let background = self.background;
+        let stages = self.session.run(model, camera, |rec, stages, binned| {
+            let Stages { room, forward, own: Shares { picture, backward, ones } } = stages;
+            rasterize::forward(rec, room.method, forward.projected(), binned, background, picture);
             let gradient = PictureGradient { rgb: ones, depth: None, transmittance: None };
-            backward.record(&mut rec, method, forward.projected(), binned, picture, gradient);
-            rec.submit()?.wait()?;
-            if self.gpu.read(self.limits.overflow())?[0] == 0 {
-                break to_rgb8(camera.size, &self.gpu.read(&picture.rgb)?);
-            }
-            let counters = self.gpu.read(self.limits.counters())?;
-            self.capacity = self.capacity.fit(std::array::from_fn(|i| counters[i]));
-            self.stages = None;
-            let mut rec = self.gpu.recorder()?;
-            self.limits.lower(&mut rec);
-            rec.submit()?.wait()?;
-        };
+            backward.record(rec, room.method, forward.projected(), binned, picture, gradient);
+        })?;
+        let picture = to_rgb8(camera.size, &self.gpu.read(&stages.own.picture.rgb)?);
         self.take_down(camera)?;
         Ok(picture)
     }
 
-    fn furnish(&mut self, size: [u32; 2]) -> Result<(), Error> {
-        if self.stages.as_ref().is_some_and(|stages| stages.picture.size == size) {
-            return Ok(());
-        }
-        // Those of another size go before these are made.
-        self.stages = None;
-        let Self { gpu, capacity, config, .. } = self;
-        let offsets = self.anchors.offsets;
-        let method = Method::new(gpu, config)?;
-        let slots = (capacity.visible * offsets) as usize;
-        let pixels = size[0] as usize * size[1] as usize;
-        self.stages = Some(Stages {
-            forward: Forward::new(gpu, *capacity, offsets, method, size, config.cull)?,
-            picture: Picture::new(gpu, size, pixels, Outputs::Color)?,
-            backward: Backward::new(gpu, method, slots, capacity.pairs as usize, Outputs::Color)?,
-            ones: gpu.upload("ones", &vec![[1.0; 3]; pixels])?,
-        });
-        Ok(())
-    }
-
     fn take_down(&mut self, camera: &Camera) -> Result<(), Error> {
-        let Stages { forward, backward, .. } = self.stages.as_ref().expect("the pose was drawn");
+        let Stages { forward, own: Shares { backward, .. }, .. } = self.session.stages();
         let gpu = &self.gpu;
         let visible_count = gpu.read(&forward.visible.count)?[0] as usize;
         let offsets = self.anchors.offsets as usize;
@@ -170,7 +145,7 @@ impl Baker {
         let rotation = gpu.read_range(&forward.decode.rotation, slots)?;
         let tiles = gpu.read_range(forward.bin.tiles(), slots)?;
         let shares = gpu.read_range(&backward.grad_color, slots)?;
-        let (near, size) = (self.config.near, camera.size.map(f64::from));
+        let (near, size) = (self.near, camera.size.map(f64::from));
         let within = |position: [f64; 3]| {
             let ahead = camera.to_camera(position)[2] > near;
             ahead && camera.project(position).is_some_and(|at| (0..2).all(|i| (0.0..size[i]).contains(&at[i])))

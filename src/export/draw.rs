@@ -230,22 +230,19 @@ impl Drawer {
 
     /// Records and runs `work`, again with more room where the pairs did not fit.
     fn run(&mut self, camera: &Camera, work: impl Fn(&Self, &mut Recorder<'_>, &Stages, &Canvas)) -> Result<(), Error> {
-        loop {
+        let (gpu, limits) = (self.gpu.clone(), self.limits.share());
+        limits.until_all_fits(&gpu, |counted| {
+            if let Some(counted) = counted {
+                let wanted = counted[Counter::Pairs as usize];
+                self.pairs = wanted.saturating_add(wanted / 2);
+                self.stages = None;
+            }
             self.furnish(camera.size)?;
             let (stages, canvas) = self.stages.as_ref().zip(self.canvas.as_ref()).expect("just made");
-            let mut rec = self.gpu.recorder()?;
+            let mut rec = gpu.recorder()?;
             work(self, &mut rec, stages, canvas);
-            rec.submit()?.wait()?;
-            if self.gpu.read(self.limits.overflow())?[0] == 0 {
-                return Ok(());
-            }
-            let wanted = self.gpu.read(self.limits.counters())?[Counter::Pairs as usize];
-            self.pairs = wanted.saturating_add(wanted / 2);
-            self.stages = None;
-            let mut rec = self.gpu.recorder()?;
-            self.limits.lower(&mut rec);
-            rec.submit()?.wait()?;
-        }
+            rec.submit()?.wait().map(drop)
+        })
     }
 }
 

@@ -73,6 +73,33 @@ impl Limits {
         rec.copy_range(count, 0, &self.counters, counter as usize, 1);
     }
 
+    /// The same flag and counters.
+    #[must_use]
+    pub fn share(&self) -> Self {
+        Self { overflow: self.overflow.view(), counters: self.counters.view() }
+    }
+
+    /// Makes `attempt`, which runs on the device, until nothing overflows. From the second time on it is given what was
+    /// counted ([`Counter`]), to make room for it. Returns what the last attempt returned.
+    ///
+    /// # Errors
+    /// `attempt`'s own, and when the device is lost.
+    pub fn until_all_fits<T, E: From<Error>>(
+        &self,
+        gpu: &Gpu,
+        mut attempt: impl FnMut(Option<[u32; COUNTERS]>) -> Result<T, E>,
+    ) -> Result<T, E> {
+        let mut done = attempt(None)?;
+        while gpu.read(&self.overflow)?[0] & ((1 << COUNTERS) - 1) != 0 {
+            let counters = gpu.read(&self.counters)?;
+            let mut rec = gpu.recorder()?;
+            self.lower(&mut rec);
+            rec.submit()?.wait()?;
+            done = attempt(Some(std::array::from_fn(|i| counters[i])))?;
+        }
+        Ok(done)
+    }
+
     /// Lowers the flag, once the buffers have grown.
     pub fn lower(&self, rec: &mut Recorder<'_>) {
         rec.zero(&self.overflow);

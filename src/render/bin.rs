@@ -319,6 +319,11 @@ impl Bin {
         })
     }
 
+    /// Slots that touch a tile.
+    pub fn drawn(&self) -> &Slots {
+        &self.drawn
+    }
+
     /// Tiles touched by each slot's Gaussian, 0 also where there is none: for the growth statistics and the way back.
     pub fn tiles(&self) -> &Buffer<u32> {
         &self.tiles

@@ -4,9 +4,11 @@ pub mod bin;
 pub mod config;
 pub mod cull;
 pub mod decode;
+pub mod forward;
 pub mod method;
 pub mod project;
 pub mod rasterize;
+pub mod session;
 pub mod slots;
 pub mod view;
 pub mod visible;
@@ -14,3 +16,4 @@ pub mod widen;
 
 pub use config::Config;
 pub use method::Method;
+pub use session::Session;

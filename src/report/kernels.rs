@@ -310,7 +310,7 @@ pub(crate) struct Warm {
     pub(crate) tensors: Vec<[Vec<f32>; 3]>,
     /// Values by their buffers' names.
     pub(crate) values: BTreeMap<&'static str, Vec<f32>>,
-    pub(crate) capacity: crate::render::view::Capacity,
+    pub(crate) capacity: crate::render::forward::Capacity,
 }
 
 impl Warm {
@@ -400,23 +400,18 @@ impl Bench {
         recorder: impl Fn(&'g Gpu) -> Result<Recorder<'g>, gpu::Error>,
         take: impl Fn(Submission<'g>, [Instant; 3]) -> Result<T, gpu::Error>,
     ) -> Result<T, gpu::Error> {
-        loop {
+        self.step.limits.share().until_all_fits(gpu, |counted| {
+            if let Some(counted) = counted {
+                self.step.resize(self.step.capacity().fit(counted))?;
+            }
             self.restore(gpu)?;
             let begun = Instant::now();
             let mut rec = recorder(gpu)?;
             self.step.record(&mut rec, &self.photographs[view], self.number, self.rates);
             let recorded = Instant::now();
             let submission = rec.submit()?;
-            let taken = take(submission, [begun, recorded, Instant::now()])?;
-            if gpu.read(self.step.limits.overflow())?[0] == 0 {
-                return Ok(taken);
-            }
-            let counters = gpu.read(self.step.limits.counters())?;
-            self.step.resize(self.step.capacity().fit(std::array::from_fn(|i| counters[i])))?;
-            let mut rec = gpu.recorder()?;
-            self.step.limits.lower(&mut rec);
-            rec.submit()?.wait()?;
-        }
+            take(submission, [begun, recorded, Instant::now()])
+        })
     }
 
     /// The passes' times.

@@ -36,7 +36,7 @@ use crate::model::anchors::Anchors;
 use crate::model::arrays::ARRAYS;
 use crate::model::files;
 use crate::model::parameter::{Names, PROJECTIONS, WEIGHTS};
-use crate::render::view::Capacity;
+use crate::render::forward::Capacity;
 use crate::scene::{Camera, Prior, Scene};
 
 /// The checkpoints' folder within a run folder.

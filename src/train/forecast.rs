@@ -20,7 +20,7 @@ use crate::model::anchors::Anchors;
 use crate::model::init::{self, Initial};
 use crate::primitives::limit::{Counter, Limits};
 use crate::render::Method;
-use crate::render::view::{self, Capacity, Forward, Model};
+use crate::render::forward::{self, Capacity, Forward, Model};
 use crate::scene::{Camera, Notes, Prior, Reference, Scene, View};
 use crate::stage;
 
@@ -136,7 +136,7 @@ pub fn expected_anchors(gpu: &Gpu, plan: &Plan, settings: &Settings, initial: &I
 
 /// The most anchors that growing makes.
 fn most_anchors(gpu: &Gpu, settings: &Settings, count: u32) -> u32 {
-    let most = view::most_anchors(gpu, settings.model.offsets);
+    let most = forward::most_anchors(gpu, settings.model.offsets);
     let most = if settings.densify.max_anchors == 0 { most } else { most.min(settings.densify.max_anchors) };
     most.max(count)
 }
@@ -483,7 +483,7 @@ const GROWTH_SHARES: [f64; 6] = [1.0, 0.75, 0.5, 0.25, 0.1, 0.0];
 /// As [`forecast`].
 pub fn fitting(gpu: &Gpu, scene: &Scene, asked: &Settings, available: Option<u64>) -> Result<Fitting, Error> {
     let available = available.unwrap_or_else(|| gpu.available_bytes());
-    let most = view::most_anchors(gpu, asked.model.offsets) as usize;
+    let most = forward::most_anchors(gpu, asked.model.offsets) as usize;
     for coarser in COARSER {
         let mut settings = asked.clone();
         let model = &mut settings.model;

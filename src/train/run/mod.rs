@@ -12,7 +12,8 @@ use crate::losses::{Term, photometric};
 use crate::model::{files, init};
 use crate::primitives::finite::NOT_FINITE;
 use crate::primitives::limit::{COUNTERS, Counter};
-use crate::render::view::{Capacity, Rendered};
+use crate::render::forward::Capacity;
+use crate::render::view::Rendered;
 use crate::scene::Scene;
 use crate::train::checkpoint::{self, History, LastFigures, Model, Owner, State};
 use crate::train::order::Order;
@@ -274,22 +275,20 @@ impl<'a> Run<'a> {
     /// # Errors
     /// When the device has no room or is lost.
     pub fn run_one(&mut self, step: u32) -> Result<(), Error> {
-        loop {
-            let mut rec = self.gpu.recorder()?;
+        let (gpu, limits) = (self.gpu, self.step.limits.share());
+        limits.until_all_fits(gpu, |counted| -> Result<(), Error> {
+            self.make_room(counted)?;
+            let mut rec = gpu.recorder()?;
             self.record(&mut rec, step)?;
             rec.submit()?.wait()?;
-            let flag = self.gpu.read(self.step.limits.overflow())?[0];
-            if flag >> NOT_FINITE != 0 {
-                self.lower()?;
-                let view = self.photographs[self.order.view(step)].name.clone();
-                return Err(Error::NotFinite { step, view, found: None });
-            }
-            if flag == 0 {
-                return Ok(());
-            }
-            let counters = self.gpu.read(self.step.limits.counters())?;
-            self.grow(&counters)?;
+            Ok(())
+        })?;
+        if gpu.read(limits.overflow())?[0] >> NOT_FINITE != 0 {
+            self.lower()?;
+            let view = self.photographs[self.order.view(step)].name.clone();
+            return Err(Error::NotFinite { step, view, found: None });
         }
+        Ok(())
     }
 
     /// Grows and prunes anchors where the settings have a round behind this step. Nothing may be in flight.
@@ -687,18 +686,15 @@ impl<'a> Run<'a> {
         self.step.resize(Capacity { anchors: 1, visible: 1, pairs: 1 })?;
         let settings = self.settings.fitted(self.scene);
         self.step = before.model.restore(self.gpu, self.step.plan.clone(), &settings)?;
-        loop {
-            let mut rec = self.gpu.inspected()?;
+        let (gpu, limits) = (self.gpu, self.step.limits.share());
+        limits.until_all_fits(gpu, |counted| {
+            self.make_room(counted)?;
+            let mut rec = gpu.inspected()?;
             self.record(&mut rec, step)?;
             let found = rec.not_finite().cloned();
             rec.submit()?.wait()?;
-            let flag = self.gpu.read(self.step.limits.overflow())?[0];
-            if found.is_some() || flag == 0 || flag >> NOT_FINITE != 0 {
-                return Ok(found);
-            }
-            let counters = self.gpu.read(self.step.limits.counters())?;
-            self.grow(&counters)?;
-        }
+            Ok(found)
+        })
     }
 
     fn every(&self, interval: u32, step: u32) -> bool {
@@ -740,10 +736,14 @@ impl<'a> Run<'a> {
     }
 
     fn grow(&mut self, counters: &[u32]) -> Result<(), Error> {
-        let counters = std::array::from_fn(|i| counters[i]);
-        let capacity = self.step.capacity().fit(counters).within(self.gpu, counters);
-        self.step.resize(capacity)?;
+        self.make_room(Some(std::array::from_fn(|i| counters[i])))?;
         self.lower()
+    }
+
+    /// Room for what was counted in an attempt that did not fit.
+    fn make_room(&mut self, counted: Option<[u32; COUNTERS]>) -> Result<(), Error> {
+        let Some(counted) = counted else { return Ok(()) };
+        Ok(self.step.resize(self.step.capacity().fit(counted).within(self.gpu, counted))?)
     }
 
     fn lower(&self) -> Result<(), Error> {

@@ -3,7 +3,7 @@
 use super::Step;
 use crate::densify;
 use crate::gpu::Error;
-use crate::render::view;
+use crate::render::forward;
 use crate::stage;
 
 impl Step {
@@ -29,7 +29,7 @@ impl Step {
 
     fn grow_and_prune(&mut self, step: u32) -> Result<String, Error> {
         let Some(statistics) = &mut self.statistics else { return Ok(String::new()) };
-        let most = view::most_anchors(&self.gpu, self.anchors.offsets);
+        let most = forward::most_anchors(&self.gpu, self.anchors.offsets);
         let asked = self.config.densify.max_anchors;
         let max_anchors = if asked == 0 { most } else { asked.min(most) };
         let config = &densify::Config { max_anchors, ..self.config.densify.clone() };

@@ -4,8 +4,9 @@ use super::Step;
 use crate::gpu::Error;
 use crate::model::files;
 use crate::model::parameter::Parameter;
+use crate::render::forward::{Capacity, Model};
 use crate::render::rasterize::Picture;
-use crate::render::view::{Capacity, Model, Painter, Rendered};
+use crate::render::view::{Painter, Rendered};
 use crate::scene::Camera;
 use crate::stage;
 
