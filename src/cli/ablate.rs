@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use super::eval::JudgeArgs;
 use super::folders::{RECORD, Record};
 use super::report::last_part;
-use super::shared::{DeviceArgs, SYNTHETIC, SceneArgs, load_scene, with_gpu};
+use super::shared::{DeviceArgs, SYNTHETIC, SceneArgs, add_dense, load_scene, with_gpu};
 use super::train::{Manner, Trained, default_folder, is_begun, train};
 use super::{index, next, signals};
 use crate::config::{Settings, SettingsArgs};
@@ -469,7 +469,9 @@ fn of_scene(
         // The seed is that of the built-in scene, too.
         let alike = |other: &Settings| other.scene == settings.scene && other.train.seed == settings.train.seed;
         if !read.as_ref().is_some_and(|(other, _)| alike(other)) {
-            read = Some((settings.clone(), load_scene(path, &settings)?));
+            let mut scene = load_scene(path, &settings)?;
+            add_dense(gpu, &mut scene, &settings)?;
+            read = Some((settings.clone(), scene));
         }
         let Some((_, scene)) = &read else { unreachable!("it was just read") };
         if scene.test.is_empty() {

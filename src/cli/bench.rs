@@ -6,7 +6,7 @@ use anyhow::{Context as _, bail};
 
 use super::next;
 use super::report::{command_line, last_part};
-use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, load_scene, with_gpu};
+use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, add_dense, load_scene, with_gpu};
 use crate::bench::ceilings::Prober;
 use crate::bench::compare::{self, Subject};
 use crate::bench::{self, Device, Record, Trained, figures, loads, predict, tables, text};
@@ -95,7 +95,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             Ok::<_, anyhow::Error>((scene, facts))
         })
         .transpose()?;
-    let (scene, facts) = loaded.map_or((None, None), |(scene, facts)| (Some(scene), Some(facts)));
+    let (mut scene, facts) = loaded.map_or((None, None), |(scene, facts)| (Some(scene), Some(facts)));
     let json = serde_json::to_value(&settings).context("the settings as JSON")?;
     let MeasureArgs { warm_up, step, views, repetitions } = args.measure;
     let (views, repetitions) = (views as usize, repetitions as usize);
@@ -112,6 +112,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             .map(|(path, old)| compare::ensure_comparable(path, old, subject))
             .transpose()?
             .unwrap_or_default();
+        if let Some(scene) = &mut scene {
+            add_dense(gpu, scene, &settings)?;
+        }
         say("bench: ceilings of the device");
         let mut prober = Prober::new(gpu)?;
         if scene.is_none() {

@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 
 use super::next;
 use super::preset;
-use super::shared::{DeviceArgs, SceneArgs, with_gpu};
+use super::shared::{DeviceArgs, SceneArgs, add_dense, with_gpu};
 use crate::config::Settings;
 use crate::gpu::{self, Entry, Gpu, Options, Schedule, Timings};
 use crate::scene::Scene;
@@ -56,9 +56,10 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
-    let (scene, settings) = preset::load(&args.scene, &args.device)?;
+    let (mut scene, settings) = preset::load(&args.scene, &args.device)?;
     let options = Options { timestamps: args.measure.is_some(), ..args.device.options() };
     with_gpu(&options, |gpu| {
+        add_dense(gpu, &mut scene, &settings)?;
         let question =
             Question { anchors: args.anchors, available: args.memory.map(|mib| mib << 20), also: Some(args.step) };
         let verdict = forecast::forecast(gpu, &scene, &settings, question)?;

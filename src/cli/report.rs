@@ -5,10 +5,10 @@ use std::path::PathBuf;
 use anyhow::{Context as _, bail};
 
 use super::next;
-use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, load_scene, with_gpu};
+use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, add_dense, load_scene, with_gpu};
 use super::train::default_folder;
 use crate::config::Settings;
-use crate::gpu::Options;
+use crate::gpu::{Gpu, Options};
 use crate::report::page::{self, Drawings};
 use crate::report::training::Spacing;
 use crate::report::variants::{self, Variant};
@@ -72,7 +72,7 @@ const PAGE: &str = "report.html";
 const JSON: &str = "report.json";
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
-    let (scene, settings) = args.scene.load()?;
+    let (mut scene, settings) = args.scene.load()?;
     let name = args.scene.name();
     let out = args.out.clone().unwrap_or_else(|| {
         let mut folder = default_folder(&name).into_os_string();
@@ -106,6 +106,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         let options = Options { timestamps: true, ..args.device.options() };
         Some(with_gpu(&options, |gpu| {
             device = Some(gpu.info().clone());
+            add_dense(gpu, &mut scene, &settings)?;
             let options = kernels::Options {
                 warm_up: args.measure.warm_up,
                 step: args.measure.step,
@@ -121,8 +122,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         // Without timestamps, as `train` runs.
         Some(with_gpu(&args.device.options(), |gpu| {
             device = Some(gpu.info().clone());
+            add_dense(gpu, &mut scene, &settings)?;
             let options = training::Options { samples: args.samples, spacing: args.spacing, seeds: args.seeds };
-            let read = |settings: &Settings| read(args, settings);
+            let read = |settings: &Settings| read(gpu, args, settings);
             training::measure(gpu, &scene, runs, options, read, &mut say)
         })?)
     };
@@ -157,8 +159,10 @@ fn choices(args: &Args, settings: &Settings, table: &[variants::Choice]) -> anyh
 }
 
 /// Reads the scene again, at another size for instance.
-fn read(args: &Args, settings: &Settings) -> anyhow::Result<Scene> {
-    load_scene(&args.scene.scene, settings)
+fn read(gpu: &Gpu, args: &Args, settings: &Settings) -> anyhow::Result<Scene> {
+    let mut scene = load_scene(&args.scene.scene, settings)?;
+    add_dense(gpu, &mut scene, settings)?;
+    Ok(scene)
 }
 
 /// The folder's own name: where it lies is nobody's business who reads the page.

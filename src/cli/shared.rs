@@ -6,6 +6,7 @@ use anyhow::{Context as _, bail};
 
 use crate::config::{Settings, SettingsArgs};
 use crate::gpu::{Descriptors, Form, Gpu, Options};
+use crate::multiview;
 use crate::scene::{self, Scene, synthetic};
 
 /// The word that stands for the built-in scene where a folder is expected.
@@ -153,6 +154,21 @@ pub fn load_scene(scene: &Path, settings: &Settings) -> anyhow::Result<Scene> {
         eprintln!("scene: {note}");
     }
     Ok(scene)
+}
+
+/// Adds the points that the photographs add to the model's, where the settings ask for them: whatever makes or looks at the
+/// model before the first step needs them.
+///
+/// # Errors
+/// When the device has no room or is lost.
+pub fn add_dense(gpu: &Gpu, scene: &mut Scene, settings: &Settings) -> anyhow::Result<()> {
+    if settings.scene.dense && scene.dense.is_empty() {
+        let (points, note) = multiview::points(gpu, scene, settings.scene.object_point_share)?;
+        eprintln!("scene: {note}");
+        scene.dense = points;
+        scene.notes.push(note);
+    }
+    Ok(())
 }
 
 /// As [`load_scene`], in the lengths of the scene's files, which are those of a model on disk; what the settings say in

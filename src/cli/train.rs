@@ -10,7 +10,7 @@ use anyhow::{Context as _, bail, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::folders::{Asked, MODEL, RECORD, Record, SEEN, SETTINGS, TEST};
-use super::shared::{DeviceArgs, SceneArgs, load_scene, with_gpu};
+use super::shared::{DeviceArgs, SceneArgs, add_dense, load_scene, with_gpu};
 use super::{index, instruments, minutes, next, pictures, preset, signals};
 use crate::capture::doctor::{self, Severity};
 use crate::config::{Settings, SettingsArgs, Source};
@@ -126,7 +126,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let began = Instant::now();
     let given = |scene: &PathBuf| SceneArgs { scene: scene.clone(), settings: args.settings.clone() };
     let given = args.scene.as_ref().map(given);
-    let (scene, settings, name, folder, begun, _lock) = if let Some(folder) = &args.resume {
+    let (mut scene, settings, name, folder, begun, _lock) = if let Some(folder) = &args.resume {
         let read = || {
             Record::read(folder)
                 .with_context(|| format!("{}: holds no run to go on with: start one with --out", folder.display()))
@@ -164,6 +164,10 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     eprintln!("doctor: {}", looked.verdict());
     let options = Options { timestamps: args.profile, ..args.device.options() };
     with_gpu(&options, |gpu| {
+        // A checkpoint has the anchors.
+        if !begun || checkpoint::list(&folder).is_empty() {
+            add_dense(gpu, &mut scene, &settings)?;
+        }
         let (settings, clock) = match args.minutes {
             Some(time) => {
                 let (settings, clock) = minutes::fitted(gpu, &scene, &settings, time, began)?;

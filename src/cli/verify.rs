@@ -4,7 +4,7 @@ use anyhow::bail;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::next;
-use super::shared::{DeviceArgs, SceneArgs, with_gpu};
+use super::shared::{DeviceArgs, SceneArgs, add_dense, with_gpu};
 use crate::train::run::Run;
 
 /// Run every pass of a scene's step on the device and on the CPU reference path, and compare
@@ -30,8 +30,9 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
-    let (scene, settings) = args.scene.load()?;
+    let (mut scene, settings) = args.scene.load()?;
     with_gpu(&args.device.options(), |gpu| {
+        add_dense(gpu, &mut scene, &settings)?;
         let mut run = Run::new(gpu, &scene, &settings)?;
         let style = ProgressStyle::with_template("warm-up {wide_bar} {pos}/{len} steps, {eta} left")?;
         let bar = ProgressBar::new(args.warm_up.into()).with_style(style);

@@ -6,5 +6,6 @@ pub mod attention;
 pub mod camera;
 pub mod decoder;
 pub mod harmonics;
+pub mod hash;
 pub mod ssim;
 pub mod tiles;

@@ -38,6 +38,9 @@ pub struct Config {
     /// Add points behind the depth edges of the hole, where other train cameras see what neither the reference nor any
     /// photograph shows.
     pub seed_behind_edges: bool,
+    /// Add points where the photographs agree on a depth and the model has none, and on planes around what stays unknown:
+    /// floors, walls and what is far off get anchors, too (GScream: off).
+    pub dense: bool,
     /// Let the train masks grow by as many pixels as an inpainted picture was repainted beyond its own: the object's shadow
     /// goes with it, and what the photographs show there. A picture that is the photograph outside its mask changes nothing.
     pub grow_masks: bool,
@@ -115,6 +118,7 @@ impl Default for Config {
             guess_reference_prior: true,
             seed_hole: true,
             seed_behind_edges: true,
+            dense: false,
             grow_masks: false,
             rim: 1,
             judge_rim: true,

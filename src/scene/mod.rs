@@ -41,6 +41,7 @@ use rayon::prelude::*;
 
 pub use camera::{Camera, distort, undistort};
 pub use condition::{condition, footprint};
+pub(crate) use condition::{on_object, samples};
 pub use config::Config;
 use config::{NO_PRIOR, STEREO_PRIOR};
 pub use error::Error;
@@ -106,6 +107,9 @@ pub struct Scene {
     pub references: Vec<Reference>,
     /// Points of the sparse model; at least one.
     pub points: Vec<Point>,
+    /// Points that the photographs add to these, see [`multiview`](crate::multiview): anchors start there, too, and nothing
+    /// else looks at them.
+    pub dense: Vec<Point>,
     /// 1.1 x the largest distance of a train camera from the mean train camera, world units, where cameras much farther out
     /// than nine in ten do not count; 1 if that is zero.
     pub radius: f32,
@@ -295,7 +299,16 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     if radius.is_none() {
         notes.push("all train cameras stand at one place: the scene radius is taken as 1");
     }
-    Ok(Scene { train, test, references, points, radius: radius.unwrap_or(1.0), unit: 1.0, notes })
+    Ok(Scene {
+        train,
+        test,
+        references,
+        points,
+        dense: vec![],
+        radius: radius.unwrap_or(1.0),
+        unit: 1.0,
+        notes,
+    })
 }
 
 impl View {
@@ -309,6 +322,11 @@ impl Scene {
     /// The inpainted picture of this train view, if it has one.
     pub fn reference_of(&self, view: usize) -> Option<&Reference> {
         self.references.iter().find(|r| r.view == view)
+    }
+
+    /// The points that anchors start at.
+    pub fn starts(&self) -> Vec<Point> {
+        self.points.iter().chain(&self.dense).copied().collect()
     }
 
     /// Counts all lengths in the model's units again, those of the files, and returns how many of them one was.
@@ -327,7 +345,7 @@ impl Scene {
             view.camera.translation = view.camera.translation.map(|t| t / unit);
             view.depth.iter_mut().flatten().for_each(|z| *z = (f64::from(*z) / unit) as f32);
         }
-        for point in &mut self.points {
+        for point in self.points.iter_mut().chain(&mut self.dense) {
             point.position = point.position.map(|x| (f64::from(x) / unit) as f32);
         }
         self.radius = (f64::from(self.radius) / unit) as f32;

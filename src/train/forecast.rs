@@ -62,7 +62,7 @@ impl Survey {
 /// # Errors
 /// Points that make no anchor.
 pub fn initial(scene: &Scene, settings: &Settings) -> Result<Initial, init::Error> {
-    init::from_points(&scene.points, &settings.fitted(scene).model, settings.train.seed)
+    init::from_points(&scene.starts(), &settings.fitted(scene).model, settings.train.seed)
 }
 
 /// Most cameras that a survey looks through: it comes before the first step, and what they miss the margin of
@@ -389,6 +389,7 @@ fn resized(scene: &Scene, from: u32, to: u32) -> Scene {
         test: scene.test.iter().map(view).collect(),
         references: references.collect(),
         points: scene.points.clone(),
+        dense: scene.dense.clone(),
         radius: scene.radius,
         unit: scene.unit,
         notes: Notes::default(),

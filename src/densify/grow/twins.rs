@@ -4,19 +4,7 @@ use crate::gpu::kernels::densify::{
     grow_append, grow_candidates, grow_cells, grow_heads, grow_keys, grow_lots, grow_occupied, grow_reset, grow_words,
 };
 use crate::gpu::{Check, Reference};
-
-/// pcg4d: four words to four words (Jarzynski and Olano, Hash Functions for GPU Rendering, JCGT 2020).
-pub(super) fn pcg4d(words: [u32; 4]) -> [u32; 4] {
-    fn mix([x, y, z, w]: [u32; 4]) -> [u32; 4] {
-        let x = x.wrapping_add(y.wrapping_mul(w));
-        let y = y.wrapping_add(z.wrapping_mul(x));
-        let z = z.wrapping_add(x.wrapping_mul(y));
-        let w = w.wrapping_add(y.wrapping_mul(z));
-        [x, y, z, w]
-    }
-    let words = words.map(|word| word.wrapping_mul(1_664_525).wrapping_add(1_013_904_223));
-    mix(mix(words).map(|word| word ^ (word >> 16)))
-}
+pub(super) use crate::math::hash::pcg4d;
 
 /// Cells either way, see `cell.glsl`: further out float32 does not tell a cell's centre from its neighbour's.
 pub const CELL_LIMIT: f32 = 2e6;

@@ -24,6 +24,8 @@ mod unit;
 
 use super::{Config, STEREO_PRIOR, Scene};
 
+pub(crate) use points::on_object;
+pub(crate) use sparse::samples;
 pub use unit::footprint;
 
 /// Makes a scene that was read ready for training, and adds what was done to its notes.

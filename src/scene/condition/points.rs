@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::scene::{Camera, Point, Scene};
+use crate::scene::{Camera, Point, Scene, View};
 
 /// Fewest views that must have a point in the picture for it to be judged.
 const FEWEST_VIEWS: usize = 2;
@@ -24,14 +24,10 @@ pub(super) fn lift(camera: &Camera, pixel: usize, depth: f64) -> Option<[f64; 3]
     Some(std::array::from_fn(|i| center[i] + (0..3).map(|k| f64::from(camera.rotation[k][i]) * ray[k]).sum::<f64>()))
 }
 
-/// Leaves out the points that fall into the mask in more than this share of the views that have them in the picture: they
-/// stand on the object, and anchors there would have to fade against views that cannot see them fade. With 1 all stay.
-pub(super) fn drop_object(scene: &mut Scene, share: f64) {
-    if share >= 1.0 || scene.train.iter().all(|v| v.mask.is_none()) {
-        return;
-    }
-    let views: Vec<_> = scene.train.iter().filter_map(|v| Some((&v.camera, v.mask.as_ref()?))).collect();
-    let on_object = |point: &Point| {
+/// Whether a point falls into the mask in more than this share of the views that have it in the picture.
+pub(crate) fn on_object(views: &[View], share: f64) -> impl Fn(&Point) -> bool + Sync {
+    let views: Vec<_> = views.iter().filter_map(|v| Some((&v.camera, v.mask.as_ref()?))).collect();
+    move |point| {
         let position = point.position.map(f64::from);
         let (mut seen, mut inside) = (0, 0);
         for (camera, mask) in &views {
@@ -41,7 +37,16 @@ pub(super) fn drop_object(scene: &mut Scene, share: f64) {
             }
         }
         seen >= FEWEST_VIEWS && inside as f64 > share * seen as f64
-    };
+    }
+}
+
+/// Leaves out the points that fall into the mask in more than this share of the views that have them in the picture: they
+/// stand on the object, and anchors there would have to fade against views that cannot see them fade. With 1 all stay.
+pub(super) fn drop_object(scene: &mut Scene, share: f64) {
+    if share >= 1.0 || scene.train.iter().all(|v| v.mask.is_none()) {
+        return;
+    }
+    let on_object = on_object(&scene.train, share);
     let dropped: Vec<bool> = scene.points.par_iter().map(on_object).collect();
     let count = dropped.iter().filter(|d| **d).count();
     if count == 0 {

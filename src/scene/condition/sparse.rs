@@ -16,7 +16,7 @@ const FARTHEST: f64 = 2.0;
 
 /// A point seen by a view.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Sample {
+pub(crate) struct Sample {
     /// Row-major pixel.
     pub pixel: usize,
     /// Depth z of the point.
@@ -26,7 +26,7 @@ pub(super) struct Sample {
 /// The points that a view sees: of those that fall into one block of pixels the one of median depth. The nearest would lie
 /// before the surface: by 3 % of the depth on spin-1. Blocks are a 64th of the picture's width, at least 2 pixels wide. With
 /// `outside`, only those outside the mask.
-pub(super) fn samples(camera: &Camera, points: &[Point], outside: Option<&image::GrayImage>) -> Vec<Sample> {
+pub(crate) fn samples(camera: &Camera, points: &[Point], outside: Option<&image::GrayImage>) -> Vec<Sample> {
     let [w, h] = camera.size.map(|n| n as usize);
     let block = (w / 64).max(2);
     let columns = w.div_ceil(block);

@@ -149,7 +149,7 @@ fn fresh(gpu: &Gpu, scene: &Scene, settings: &Settings) -> Result<Step, Error> {
     let settings = &settings.fitted(scene);
     let plan = Plan::new(scene, settings);
     let offsets = settings.model.offsets as usize;
-    let initial = init::from_points(&scene.points, &settings.model, settings.train.seed)?;
+    let initial = init::from_points(&scene.starts(), &settings.model, settings.train.seed)?;
     let weights = init::weights(settings.train.seed, offsets, plan.attention, settings.model.opacity);
     Ok(Step::new(gpu, plan, settings, &initial.anchors, &weights, initial.voxel)?)
 }

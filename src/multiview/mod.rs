@@ -1,0 +1,229 @@
+//! Multi-view stereo: points where the sparse model has none.
+//!
+//! Anchors start at points and grow beside anchors, so that a bare floor, a wall or a far background without points stays
+//! without anchors. Here the photographs themselves say how deep they are.
+//!
+//! - [`picture`]: photographs without their lens, at a size of their own.
+//! - [`neighbors`]: which other views a view is compared with, by the points they share and the angle between them.
+//! - [`depth`]: a plane at every site of a view, a site being a square of [`STRIDE`] pixels: PatchMatch as compute passes,
+//!   [`propose`], [`score`] and [`choose`], begun at the sparse points' depths.
+//! - [`fuse`]: depths that other views confirm become points, one where several views see the same place.
+//! - [`fill`]: where nothing is confirmed (blank walls, sky) planes and shells through what lies around.
+//!
+//! Everything is a function of the scene: random planes are drawn by site and view.
+
+mod choose;
+mod depth;
+mod fill;
+mod fuse;
+mod neighbors;
+mod picture;
+mod propose;
+mod score;
+
+use crate::gpu::{Error, Gpu};
+use crate::scene::{Point, Scene};
+
+use picture::Picture;
+
+/// Pixels from site to site: anchors stand some three pixels apart.
+const STRIDE: u32 = 2;
+/// Planes tried at a site in a round, its own first.
+const CANDIDATES: u32 = 12;
+/// Pixels of all training pictures for every point that is added at most.
+const PIXELS_PER_POINT: usize = 40;
+
+/// The sites of a picture.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Sites {
+    columns: u32,
+    rows: u32,
+}
+
+impl Sites {
+    /// Sites that the numbering of one colour of the checkerboard has room for.
+    fn of_color(self) -> u32 {
+        self.columns.div_ceil(2) * self.rows
+    }
+
+    /// Number, column and row of the sites of a colour.
+    fn colored(self, color: u32) -> impl Iterator<Item = (u32, u32, u32)> {
+        let per_row = self.columns.div_ceil(2);
+        let place = move |i: u32| (i, 2 * (i % per_row) + ((i / per_row + color) & 1), i / per_row);
+        (0..self.of_color()).map(place).filter(move |(_, x, _)| *x < self.columns)
+    }
+
+    /// The site there, if there is one.
+    fn at(self, x: i32, y: i32) -> Option<usize> {
+        let inside = x >= 0 && y >= 0 && x < self.columns as i32 && y < self.rows as i32;
+        inside.then(|| y as usize * self.columns as usize + x as usize)
+    }
+
+    fn len(self) -> usize {
+        self.columns as usize * self.rows as usize
+    }
+
+    fn place(self, site: usize) -> [i32; 2] {
+        [(site % self.columns as usize) as i32, (site / self.columns as usize) as i32]
+    }
+}
+
+/// What the passes of one view know of it.
+#[derive(Clone, Copy, Debug)]
+struct Grid {
+    /// Of the picture.
+    size: [u32; 2],
+    sites: Sites,
+    /// Lowest and highest inverse depth.
+    range: [f32; 2],
+    /// Slope per inverse depth of a surface at 45 degrees.
+    tilt: f32,
+}
+
+/// One pass over one colour.
+#[derive(Clone, Copy, Debug)]
+struct Round {
+    color: u32,
+    /// Sites between a site and the farther neighbours whose planes it tries.
+    reach: u32,
+    /// Number of the draw.
+    draw: u32,
+    /// Largest change of the inverse depth, as a share of its range.
+    spread: f32,
+}
+
+/// Points that the scene's photographs add to those of its sparse model, and a line that says how many; none where no view
+/// has neighbours.
+///
+/// Masked pixels, which show the object, add none, and neither do places that most masks cover (`share` as
+/// [`Config::object_point_share`](crate::scene::Config::object_point_share)).
+///
+/// # Errors
+/// When the device has no room or is lost.
+pub fn points(gpu: &Gpu, scene: &Scene, share: f64) -> Result<(Vec<Point>, String), Error> {
+    use rayon::prelude::*;
+    let pictures: Vec<Picture> = scene.train.par_iter().map(Picture::new).collect();
+    let neighbors = neighbors::choose(&pictures, &scene.points);
+    let maps = depth::estimate(gpu, &pictures, &neighbors, &scene.points)?;
+    let surfaces = fuse::confirm(&pictures, &neighbors, &maps);
+    let mut cloud = fuse::Cloud::new(&pictures, &surfaces, &scene.points);
+    cloud.add_confirmed();
+    let confirmed = cloud.points.len();
+    cloud.add_filled(&fill::fill(&pictures, &surfaces));
+    let mut added = cloud.points;
+    let filled = added.len() - confirmed;
+    let on_object = crate::scene::on_object(&scene.train, share);
+    let all = added.len();
+    added.retain(|point| !on_object(point));
+    let dropped = all - added.len();
+    let pixels: usize = scene.train.iter().map(|v| v.image.as_raw().len() / 3).sum();
+    let most = (pixels / PIXELS_PER_POINT).max(1);
+    if added.len() > most {
+        added = (0..most).map(|i| added[i * added.len() / most]).collect();
+    }
+    let on_it = if dropped > 0 { format!(", {dropped} of them on the object and left out") } else { String::new() };
+    let note = format!(
+        "{} points are added to the {} of the model: {confirmed} where photographs agree on the depth, {filled} on planes and \
+         shells around what stays unknown{on_it} (scene.dense)",
+        added.len(),
+        scene.points.len(),
+    );
+    Ok((added, note))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::testing;
+    use crate::scene::{Config, load, synthetic};
+
+    fn built_in(options: &synthetic::Options) -> Scene {
+        let folder = tempfile::tempdir().expect("a folder");
+        let dir = folder.path().join("scene");
+        synthetic::write(&dir, options).expect("a scene");
+        load(&dir, &Config::default()).expect("it loads")
+    }
+
+    #[test]
+    fn sites_are_numbered_once() {
+        for (columns, rows) in [(1, 1), (4, 3), (5, 4)] {
+            let sites = Sites { columns, rows };
+            let mut seen = vec![0; sites.len()];
+            for (i, x, y) in (0..2).flat_map(|color| sites.colored(color)) {
+                assert!(i < sites.of_color());
+                seen[sites.at(x as i32, y as i32).expect("a site")] += 1;
+            }
+            assert!(seen.iter().all(|n| *n == 1), "{columns} x {rows}: {seen:?}");
+        }
+    }
+
+    /// The test views, whose depth is known, take part: the photographs of the others show an object that these do not.
+    #[test]
+    fn depths_are_those_of_the_built_in_scene() {
+        let gpu = testing::gpu();
+        let mut scene = built_in(&synthetic::Options { train_views: 16, test_views: 4, ..Default::default() });
+        scene.train.append(&mut scene.test);
+        let pictures: Vec<Picture> = scene.train.iter().map(Picture::new).collect();
+        let neighbors = neighbors::choose(&pictures, &scene.points);
+        let maps = depth::estimate(&gpu, &pictures, &neighbors, &scene.points).expect("a device");
+        let surfaces = fuse::confirm(&pictures, &neighbors, &maps);
+        let filled = fill::fill(&pictures, &surfaces);
+        let (mut all, mut confirmed, mut guessed) = (0, vec![], vec![]);
+        for (at, view) in scene.train.iter().enumerate() {
+            let Some(truth) = &view.depth else { continue };
+            let picture = &pictures[at];
+            let [w, h] = view.camera.size;
+            for site in 0..picture.sites.len() {
+                // The photograph's pixel, through its lens.
+                let [x, y] = view.camera.project(picture.lift(picture.pixel(site), 1.0)).expect("ahead");
+                if !(x >= 0.0 && y >= 0.0 && x < f64::from(w) && y < f64::from(h)) {
+                    continue;
+                }
+                all += 1;
+                let truth = f64::from(truth[y as usize * w as usize + x as usize]);
+                let error = |z: f64| (z / truth - 1.0).abs();
+                if surfaces[at][site].is_finite() {
+                    confirmed.push(error(surfaces[at][site]));
+                } else if filled[at][site].is_finite() {
+                    guessed.push(error(filled[at][site]));
+                }
+            }
+        }
+        confirmed.sort_by(f64::total_cmp);
+        guessed.sort_by(f64::total_cmp);
+        let at = |errors: &[f64], share: f64| errors[((errors.len() - 1) as f64 * share) as usize];
+        let found = [at(&confirmed, 0.5), at(&confirmed, 0.95), at(&guessed, 0.5)];
+        println!("{} of {all} confirmed, {} guessed, errors {found:?}", confirmed.len(), guessed.len());
+        // With 24 and 6 views 87 % are confirmed, with errors of 0.0019 and 0.014, and what is guessed is off by 0.0035. The
+        // bounds leave room for the fewer views of this test and for another device's rounding.
+        assert!(confirmed.len() * 4 > all * 3, "{} of {all}", confirmed.len());
+        assert!(found[0] < 0.004 && found[1] < 0.03 && found[2] < 0.01, "{found:?}");
+        assert_eq!(confirmed.len() + guessed.len(), all, "every site has a depth");
+    }
+
+    /// Points of a small scene: the same twice, none on the object, and no more than there is room for.
+    #[test]
+    fn points_repeat_and_leave_the_object_out() {
+        let gpu = testing::gpu();
+        let options = synthetic::Options {
+            width: 80,
+            height: 60,
+            train_views: 8,
+            test_views: 0,
+            points: 300,
+            ..Default::default()
+        };
+        let scene = built_in(&options);
+        let (points, note) = super::points(&gpu, &scene, 0.9).expect("a device");
+        assert!(points.len() > 200 && points.len() <= 8 * 80 * 60 / PIXELS_PER_POINT, "{note}");
+        assert!(note.contains("(scene.dense)"), "{note}");
+        let on_object = crate::scene::on_object(&scene.train, 0.9);
+        assert!(!points.iter().any(on_object));
+        assert_eq!(super::points(&gpu, &scene, 0.9).expect("a device").0, points);
+        // One view has no neighbours, and nothing is found without any points to begin with.
+        let alone = Scene { train: scene.train[..1].to_vec(), references: vec![], ..scene.clone() };
+        assert_eq!(super::points(&gpu, &alone, 0.9).expect("a device").0, []);
+        let blind = Scene { points: vec![], ..scene };
+        assert_eq!(super::points(&gpu, &blind, 0.9).expect("a device").0, []);
+    }
+}
