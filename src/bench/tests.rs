@@ -9,8 +9,8 @@ use super::step::{Bound, HostFigures, PassFigures, StepFigures, floor};
 use super::{Device, Record};
 use crate::report::statistics::Spread;
 
-/// Kernels that are no part of a step: growing and pruning, and what measures.
-const NO_STEP: [&str; 4] = ["densify/grow", "densify/prune", "export/", "bench/"];
+/// Kernels that are no part of a step: growing and pruning, what comes before training or after it, and what measures.
+const NO_STEP: [&str; 5] = ["densify/grow", "densify/prune", "multiview/", "export/", "bench/"];
 
 /// Every kernel with its variants, from the sources.
 fn kernels() -> BTreeSet<String> {
