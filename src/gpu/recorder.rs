@@ -436,7 +436,8 @@ impl<'g> Recorder<'g> {
             _ => self.workgroups(kernel, threads),
         };
         if !workgroups.contains(&0) {
-            let case = Case::new(kernel, (constants, push), workgroups, self.download(slots)?, twin);
+            let (size, before) = (self.gpu.info().subgroup_size, self.download(slots)?);
+            let case = Case::new(kernel, (constants, push), workgroups, size, before, twin);
             lock(&self.gpu.inner().cases).push(case);
         }
         Ok(())

@@ -18,6 +18,8 @@ pub struct Case {
     pub push: Vec<u32>,
     /// Workgroups in x, y and z.
     pub workgroups: [u32; 3],
+    /// Threads of a subgroup where it was met.
+    pub subgroup_size: u32,
     /// The words of each binding before.
     pub before: Vec<Vec<u32>>,
     /// The words of each binding behind the twin.
@@ -37,6 +39,7 @@ impl Case {
         kernel: &Interface,
         (constants, push): (&[u8], &[u8]),
         workgroups: [u32; 3],
+        subgroup_size: u32,
         before: Vec<Vec<u32>>,
         twin: Twin<'_>,
     ) -> Self {
@@ -50,6 +53,7 @@ impl Case {
             constants: kernel.constants.iter().map(|&(id, _)| id).zip(constants).collect(),
             push: bytemuck::pod_collect_to_vec(push),
             workgroups,
+            subgroup_size,
             before,
             wanted,
             check: twin.check,
