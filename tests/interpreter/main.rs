@@ -154,7 +154,7 @@ fn kernels_do_on_any_device_what_their_twins_do() {
 }
 
 /// Kernels that no such training runs. Their own tests hold them against their twins on a device.
-const ELSEWHERE: [&str; 11] = [
+const ELSEWHERE: [&str; 14] = [
     // They measure a device, and nothing reads what they write.
     "bench/ceilings_copy",
     "bench/ceilings_empty",
@@ -164,6 +164,10 @@ const ELSEWHERE: [&str; 11] = [
     "export/activate",
     "export/activate_backward",
     "render/widen",
+    // Depths of several views, before a training.
+    "multiview/choose",
+    "multiview/propose",
+    "multiview/score",
     // More candidates than a round may take, and anchors that are pruned.
     "densify/grow_lots",
     "densify/grow_words",
