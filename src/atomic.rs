@@ -1,7 +1,7 @@
 //! Files that appear whole or not at all.
 //!
 //! A file is written under another name in the same folder, flushed to the disk and renamed. The other name is `.NAME.` and
-//! six letters, by which `train::checkpoint::sweep` knows whose it was where a writer was killed. A NAME that leaves no
+//! six letters, by which `folder::sweep` knows whose it was where a writer was killed. A NAME that leaves no
 //! room for these eight bytes is shortened there, so that every name that a file system takes can be written.
 
 use std::ffi::{OsStr, OsString};
@@ -108,7 +108,7 @@ impl Write for AtomicWriteFile {
 
 /// A name of which [`LONGEST_NAME`] leaves room for two dots and the letters. A name that is too long keeps its beginning
 /// and its extension, and gets a part of its hash between them.
-fn shortened(name: &OsStr) -> OsString {
+pub fn shortened(name: &OsStr) -> OsString {
     let room = LONGEST_NAME - 2 - LETTERS;
     if name.len() <= room {
         return name.to_owned();

@@ -4,11 +4,12 @@
 //! user's and is never written over. A step whose inputs hash to the same value as last time is skipped.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ffi::{OsStr, OsString};
 use std::fs::File;
 use std::io::{self, Cursor, Write as _};
 use std::path::{Component, Path, PathBuf};
 
-use crate::atomic::AtomicWriteFile;
+use crate::atomic::{AtomicWriteFile, shortened};
 use image::{GrayImage, ImageFormat, RgbImage};
 use serde::{Deserialize, Serialize};
 use tempfile::TempDir;
@@ -216,14 +217,14 @@ impl Folder {
         let recorded = self.record.steps.values().flat_map(|step| step.files.keys()).chain(self.record.pending.keys());
         // A record may be somebody else's: nothing outside the scene is looked at.
         let normal = |path: &&Path| path.components().all(|part| matches!(part, Component::Normal(_)));
-        let mut own: BTreeMap<PathBuf, BTreeSet<&str>> = BTreeMap::new();
+        let mut own: BTreeMap<PathBuf, BTreeSet<OsString>> = BTreeMap::new();
         for path in recorded.map(Path::new).filter(normal).chain([Path::new(RECORD)]) {
-            if let (Some(folder), Some(name)) = (path.parent(), path.file_name().and_then(|name| name.to_str())) {
-                own.entry(self.root.join(folder)).or_default().insert(name);
+            if let (Some(folder), Some(name)) = (path.parent(), path.file_name()) {
+                own.entry(self.root.join(folder)).or_default().insert(shortened(name));
             }
         }
         for (folder, names) in own {
-            folder::sweep(&folder, |name| names.contains(name));
+            folder::sweep(&folder, |name| names.contains(OsStr::new(name)));
         }
     }
 
@@ -468,14 +469,13 @@ mod tests {
         folder.write("masks", "1".into(), batch(&[("masks/a.png", "one")])).unwrap();
         folder.record.pending.insert("depth/b.npy".into(), String::new());
         folder.record.pending.insert("../c".into(), String::new());
-        folder.save().unwrap();
         let left = ["scene/masks/.a.png.a1B2c3", "scene/depth/.b.npy.ABCDEF", "scene/.prepare.json.123456"];
         let others = ["scene/masks/.z.png.a1B2c3", "scene/masks/.a.png.swp", ".c.a1B2c3"];
         std::fs::create_dir(dir.path().join("scene/depth")).unwrap();
         for path in left.iter().chain(&others) {
             std::fs::write(dir.path().join(path), "").unwrap();
         }
-        Folder::open(&dir.path().join("scene")).unwrap().sweep();
+        folder.sweep();
         assert!(left.iter().all(|path| !dir.path().join(path).exists()), "left by a killed step");
         assert!(others.iter().all(|path| dir.path().join(path).exists()), "nobody's, or outside the scene");
         assert!(dir.path().join("scene/masks/a.png").exists());

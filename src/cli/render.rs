@@ -6,6 +6,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::folders::Origin;
 use super::shared::{self, DeviceArgs};
 use super::{next, pictures};
+use crate::atomic::shortened;
 use crate::config::Source;
 use crate::folder::{self, Lock};
 use crate::model;
@@ -122,6 +123,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     for (name, _) in &cameras {
         for path in [PICTURE, MAPS].map(|extension| pictures::path(&out, name, extension)) {
             if let (Some(folder), Some(own)) = (path.parent(), path.file_name()) {
+                let own = shortened(own);
                 folder::sweep(folder, |name| own == name);
             }
         }

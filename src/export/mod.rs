@@ -19,7 +19,6 @@ use crate::atomic::AtomicWriteFile;
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::config::Settings;
-use crate::folder;
 use crate::gpu::Gpu;
 use crate::math::harmonics::coefficients;
 use crate::model::files;
@@ -153,13 +152,7 @@ pub fn write(files: &[(PathBuf, &[u8])]) -> Result<(), Error> {
         whole.push(write().map_err(|source| failed(path, source))?);
     }
     for (file, (path, _)) in whole.into_iter().zip(files) {
-        file.commit().map_err(|source| {
-            // What cannot be renamed stays under its other name.
-            if let (Some(folder), Some(name)) = (path.parent(), path.file_name()) {
-                folder::sweep(folder, |left| name == left);
-            }
-            failed(path, source)
-        })?;
+        file.commit().map_err(|source| failed(path, source))?;
     }
     Ok(())
 }
