@@ -100,7 +100,7 @@ fn odd_names_go_the_whole_way() {
     }
     let scene = at.join("a scene");
     let mut request = Request::new(&photos, &scene);
-    (request.fit_steps, request.fit_side, request.reference) = (4, 48, Some(odd[1].clone()));
+    (request.fit_steps, request.fit_side, request.reference) = (30, 48, Some(odd[1].clone()));
     capture::prepare(&testing::gpu(), &request, &mut Silent).expect("a scene");
 
     // In a scene names may be as long as files' names can be.
