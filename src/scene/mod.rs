@@ -299,16 +299,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     if radius.is_none() {
         notes.push("all train cameras stand at one place: the scene radius is taken as 1");
     }
-    Ok(Scene {
-        train,
-        test,
-        references,
-        points,
-        dense: vec![],
-        radius: radius.unwrap_or(1.0),
-        unit: 1.0,
-        notes,
-    })
+    Ok(Scene { train, test, references, points, dense: vec![], radius: radius.unwrap_or(1.0), unit: 1.0, notes })
 }
 
 impl View {
