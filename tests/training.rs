@@ -538,7 +538,8 @@ fn corrections_are_repeated_to_the_byte() {
     assert_eq!(summary.steps, 12);
     assert!(files(live.path()) == files(repeated.path()));
 
-    for stop in [2, 5, 9, 11] {
+    // Behind the last step but one the last is in flight already.
+    for stop in [2, 5, 9, 10] {
         let folder = tempfile::tempdir().expect("a folder");
         let mut watch = StopsBehind(stop);
         Run::new(&gpu, &scene, &written).expect("room").train(folder.path(), &mut watch).expect_err("stopped");

@@ -167,11 +167,11 @@ fn moments(gpu: &Gpu) {
         let parameters = step.anchors.parameters().iter().chain([&step.weights]);
         parameters.map(|p| p.tensors().map(Buffer::view)).collect()
     };
-    // Room for anchors to come holds whatever it holds.
+    // Room for anchors to come, and what fills a buffer up to whole vectors, holds whatever it holds.
     let read = |run: &Run<'_>| -> Vec<Vec<u32>> {
         let step = run.step();
         let of_anchors = step.anchors.parameters().iter().map(|p| (step.anchors.count * p.width) as usize);
-        let lengths = of_anchors.chain([step.weights.value.len()]);
+        let lengths = of_anchors.chain([step.weights.width as usize]);
         let words = |(tensors, n): ([Buffer<f32>; 3], usize)| {
             tensors.map(|buffer| bits(&gpu.read_range(&buffer, n).expect("read")))
         };
