@@ -234,7 +234,7 @@ fn visitors_change_no_byte() {
         other.contains(&format!("error: {address}: another program serves there; --view=127.0.0.1:0 takes a free one"))
     );
     assert!(!place.path().join("other").exists());
-    let get = |path: &str| format!("GET {path} HTTP/1.1\r\nHost: here\r\n\r\n").into_bytes();
+    let get = |path: &str| format!("GET {path} HTTP/1.1\r\nHost: {address}\r\n\r\n").into_bytes();
     let page = text(&ask(&address, &get("/")));
     assert!(
         page.starts_with("HTTP/1.1 200") && !page.contains("src=\"http") && !page.contains("href=\"http"),
