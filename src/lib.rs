@@ -51,6 +51,7 @@ pub mod primitives;
 pub mod render;
 pub mod report;
 pub mod scene;
+mod sentence;
 #[cfg(test)]
 #[path = "../tests/common/skip.rs"]
 mod skip;

@@ -23,6 +23,7 @@ use image::GrayImage;
 
 use crate::gpu::{self, Gpu};
 use crate::scene::{self, PriorKind, Scene, resample};
+use crate::sentence::one_line;
 use crate::train::checkpoint::Fingerprint;
 use crate::train::run::Signal;
 
@@ -44,7 +45,7 @@ pub enum Error {
         source: std::io::Error,
     },
     /// A file or folder that contradicts itself or the others.
-    #[error("{}: {what}", path.display())]
+    #[error("{}: {}", path.display(), one_line(what))]
     File {
         /// The file.
         path: PathBuf,
@@ -704,7 +705,8 @@ impl Preparation<'_> {
     /// Whether the scene has depth priors that are not of the step depth: the user's, or those that came with the cameras.
     fn has_priors(&self) -> Result<bool, Error> {
         let root = self.folder.root();
-        let ours = self.folder.record().steps.get(Step::Depth.name()).map(|step| &step.files);
+        let record = self.folder.record();
+        let made = record.steps.get(Step::Depth.name()).map(|step| &step.files);
         for name in PRIORS {
             let folder = root.join(name);
             if !folder.is_dir() {
@@ -712,7 +714,11 @@ impl Preparation<'_> {
             }
             for path in scene::depth_maps(&folder)?.values() {
                 let below = path.strip_prefix(root).ok().and_then(record::key);
-                if !ours.zip(below).is_some_and(|(ours, below)| ours.contains_key(&below)) {
+                // A step that was cut short has written some of its files, and its record does not have them yet.
+                let is_ours = |below: String| {
+                    made.is_some_and(|made| made.contains_key(&below)) || record.pending.contains_key(&below)
+                };
+                if !below.is_some_and(is_ours) {
                     return Ok(true);
                 }
             }

@@ -19,6 +19,7 @@ use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
 use crate::atomic::AtomicWriteFile;
+use crate::sentence::one_line;
 use ply_rs_bw::parser::{Parser, Reader};
 use ply_rs_bw::ply::{
     ElementDef, Encoding, Header, Property, PropertyAccess, PropertyAccessResult, PropertyDef, PropertyType, ScalarType,
@@ -184,7 +185,7 @@ pub enum Error {
         source: io::Error,
     },
     /// A file that is not what its name says, or is cut off.
-    #[error("{}: {reason}", path.display())]
+    #[error("{}: {}", path.display(), one_line(reason))]
     Format {
         /// The file.
         path: PathBuf,

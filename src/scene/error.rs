@@ -1,6 +1,7 @@
 use std::path::PathBuf;
 
 use super::colmap;
+use crate::sentence::one_line;
 
 /// Why a scene cannot be read. Each message is one sentence that names the file, what is wrong and what to do.
 #[derive(Debug, thiserror::Error)]
@@ -12,19 +13,20 @@ pub enum Error {
     #[error("{0}")]
     Setting(String),
     /// A file or folder that contradicts itself or the others.
-    #[error("{}: {what}", path.display())]
+    #[error("{}: {}", path.display(), one_line(what))]
     File { path: PathBuf, what: String },
     /// A line of a text file.
-    #[error("{}:{line}: {what}", path.display())]
+    #[error("{}:{line}: {}", path.display(), one_line(what))]
     Text { path: PathBuf, line: usize, what: String },
     /// A binary file that ends too early.
     #[error(
-        "{}: the file ends at byte {length}, within {record} (the value at byte {offset} is cut off); copy or export the model again",
-        path.display()
+        "{}: the file ends at byte {length}, within {} (the value at byte {offset} is cut off); copy or export the model again",
+        path.display(),
+        one_line(record)
     )]
     Truncated { path: PathBuf, length: u64, offset: u64, record: String },
     /// A camera model that is not projected with.
-    #[error("{}: camera {id} uses {model}; {}", path.display(), colmap::unsupported_hint())]
+    #[error("{}: camera {id} uses {}; {}", path.display(), one_line(model), colmap::unsupported_hint())]
     CameraModel { path: PathBuf, id: u32, model: String },
     /// No sparse model.
     #[error("{0}: no COLMAP model; sparse/0/ (or sparse/) must hold cameras and images, both .bin or both .txt; gscream-vk prepare {0}/images --out SCENE makes one, where colmap is installed", scene.display())]
