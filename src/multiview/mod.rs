@@ -3,12 +3,12 @@
 //! Anchors start at points and grow beside anchors, so that a bare floor, a wall or a far background without points stays
 //! without anchors. Here the photographs themselves say how deep they are.
 //!
-//! - [`picture`]: photographs without their lens, at a size of their own.
-//! - [`neighbors`]: which other views a view is compared with, by the points they share and the angle between them.
-//! - [`depth`]: a plane at every site of a view, a site being a square of [`STRIDE`] pixels: PatchMatch as compute passes,
-//!   [`propose`], [`score`] and [`choose`], begun at the sparse points' depths.
-//! - [`fuse`]: depths that other views confirm become points, one where several views see the same place.
-//! - [`fill`]: where nothing is confirmed (blank walls, sky) planes and shells through what lies around.
+//! - `picture`: photographs without their lens, at a size of their own.
+//! - `neighbors`: which other views a view is compared with, by the points they share and the angle between them.
+//! - `depth`: a plane at every site of a view, a site being a square of `STRIDE` pixels: PatchMatch as compute passes,
+//!   `propose`, `score` and `choose`, begun at the sparse points' depths.
+//! - `fuse`: depths that other views confirm become points, one where several views see the same place.
+//! - `fill`: where nothing is confirmed (blank walls, sky) planes and shells through what lies around.
 //!
 //! Everything is a function of the scene: random planes are drawn by site and view.
 

@@ -104,7 +104,7 @@ pub struct Limits {
     pub answer: Duration,
     /// Bytes of an answer per second that a client takes at least.
     pub rate: f64,
-    /// Time between two connections, on average over [`BURST`] of them; others wait for their turn.
+    /// Time between two connections, on average over `BURST` of them; others wait for their turn.
     pub pace: Duration,
 }
 
