@@ -415,14 +415,14 @@ impl Kernel {
         Ok(all.into_values().collect())
     }
 
-    /// Of each variant a bit for every binding that it has.
+    /// A bit mask per variant: the bindings that it has.
     fn bound(&self, bindings: &[Binding]) -> Vec<u32> {
         let has = |v: &Variant, b: &Binding| v.interface.bindings.iter().any(|own| own.name == b.name);
         let bits = |v| bindings.iter().enumerate().map(|(i, b)| u32::from(has(v, b)) << i).sum();
         self.variants.iter().map(bits).collect()
     }
 
-    /// What `Kernel` says of each variant.
+    /// The `Kernel` value that selects each variant.
     fn choices(&self, bound: &[u32]) -> Result<Vec<String>> {
         let base = if self.variants.iter().any(|v| v.cpu) { "Gpu" } else { "Plain" };
         let mut choices: Vec<String> = vec![];
@@ -579,7 +579,7 @@ impl Kernel {
 }
 
 impl Variant {
-    /// Its `Interface`, as Rust.
+    /// The `Interface` as Rust source.
     fn print(&self, all: &[Binding], constants: &[Constant], bound: u32, choice: usize) -> String {
         let Interface { group, bindings, subgroups, constants: own, .. } = &self.interface;
         let binding = |b: &Binding| {

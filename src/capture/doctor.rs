@@ -29,7 +29,7 @@ pub enum Severity {
 pub struct Finding {
     /// How bad it is.
     pub severity: Severity,
-    /// What was looked at: "masks", "names", "poses", "depth", "reference", "exposure", "scene".
+    /// Subject of the finding: "masks", "names", "poses", "depth", "reference", "exposure", "scene".
     pub check: &'static str,
     /// The view, where it is about one.
     #[serde(skip_serializing_if = "Option::is_none")]

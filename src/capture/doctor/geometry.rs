@@ -8,8 +8,8 @@ use crate::scene::{Camera, Scene};
 
 /// Points that are looked at, at most.
 const POINTS: usize = 20_000;
-/// Of the points that two pictures have to show (one, of a capture with one picture); in real captures all do but those of
-/// photographs that are not there.
+/// Least share of the points that two pictures have to show, or one in a capture of one picture. Real captures show all but
+/// those of photographs that are not there.
 const LEAST_SEEN: f64 = 0.2;
 /// A picture with a smaller share of the points is worth a look: its camera may be registered wrongly.
 const FEW_POINTS: f64 = 0.01;
