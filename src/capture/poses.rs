@@ -104,6 +104,8 @@ struct Lens {
 /// A camera of OPENCV's model and a pose, as COLMAP writes them.
 #[derive(Clone, Debug, PartialEq)]
 struct Shot {
+    /// The id of the photograph that a sparse model's tracks know, where there is one.
+    id: Option<u32>,
     name: String,
     size: [u32; 2],
     /// fx fy cx cy k1 k2 p1 p2.
@@ -325,6 +327,7 @@ impl Capture {
             let lens = lens::scaled(&lens, size);
             let axes = DMat3::from_cols_array_2d(&image.rotation).transpose();
             let mut shot = Shot {
+                id: Some(image.id),
                 name: name.to_owned(),
                 size,
                 parameters: [0.0; 8],
@@ -693,7 +696,8 @@ fn shot(frame: &Frame, name: &str, lens: &colmap::Lens, pinhole: Option<&Pinhole
         return Err("transform_matrix does not hold a rotation".into());
     }
     let rotation = DQuat::from_mat3(&axes).normalize().inverse();
-    Ok(Shot { name: name.to_owned(), size: lens.size, parameters, rotation, translation: -(rotation * column(3)) })
+    let translation = -(rotation * column(3));
+    Ok(Shot { id: None, name: name.to_owned(), size: lens.size, parameters, rotation, translation })
 }
 
 /// `cameras.bin` and `images.bin`, a camera for each photograph: unlike lines of text they hold any name.
@@ -701,13 +705,13 @@ fn model_files_of(shots: &[Shot]) -> [(&'static str, Vec<u8>); 2] {
     let count = (shots.len() as u64).to_le_bytes().to_vec();
     let (mut cameras, mut images) = (count.clone(), count);
     for (id, shot) in (1u32..).zip(shots) {
-        let Shot { name, size, parameters, rotation: q, translation: t } = shot;
+        let Shot { id: known, name, size, parameters, rotation: q, translation: t } = shot;
         let straight = parameters[4..].iter().all(|v| *v == 0.0);
         let (model, used) = if straight { (PINHOLE, 4) } else { (OPENCV, 8) };
         [id, model].iter().for_each(|v| cameras.extend(v.to_le_bytes()));
         size.iter().for_each(|v| cameras.extend(u64::from(*v).to_le_bytes()));
         parameters[..used].iter().for_each(|v| cameras.extend(v.to_le_bytes()));
-        images.extend(id.to_le_bytes());
+        images.extend(known.unwrap_or(id).to_le_bytes());
         [q.w, q.x, q.y, q.z, t.x, t.y, t.z].iter().for_each(|v| images.extend(v.to_le_bytes()));
         images.extend(id.to_le_bytes());
         images.extend(name.bytes());

@@ -1,6 +1,6 @@
 //! COLMAP's sparse models, binary and text: cameras, poses and points.
 //!
-//! The format is the one documented in COLMAP's manual ("Output Format"). The 2D observations and the tracks are skipped.
+//! The format is the one documented in COLMAP's manual ("Output Format"). The 2D observations are skipped.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -45,6 +45,8 @@ pub type Lenses = BTreeMap<u32, Lens>;
 /// A registered photograph.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Image {
+    /// The id that tracks name it by.
+    pub id: u32,
     /// The file name as the model has it, extension and folders included.
     pub name: String,
     /// World to camera rotation, row-major.
@@ -62,6 +64,38 @@ impl Image {
     }
 }
 
+/// The photographs that each point was found in.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Tracks {
+    /// `[point]` one past its last photograph in `images`.
+    ends: Vec<usize>,
+    images: Vec<u32>,
+}
+
+impl Tracks {
+    /// Adds the next point's, by the ids of its photographs.
+    pub fn push(&mut self, images: impl IntoIterator<Item = u32>) {
+        self.images.extend(images);
+        self.ends.push(self.images.len());
+    }
+
+    /// The ids of the photographs of a point, one of them several times where it was found there several times.
+    pub fn of(&self, point: usize) -> &[u32] {
+        let first = point.checked_sub(1).map_or(0, |before| self.ends[before]);
+        &self.images[first..self.ends[point]]
+    }
+
+    /// Number of points.
+    pub fn len(&self) -> usize {
+        self.ends.len()
+    }
+
+    /// True where no point has a photograph: another program's model, say, or points from a PLY file.
+    pub fn is_empty(&self) -> bool {
+        self.images.is_empty()
+    }
+}
+
 /// A sparse model.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Model {
@@ -71,7 +105,12 @@ pub struct Model {
     pub images: Vec<Image>,
     /// Sparse points in the file's order.
     pub points: Vec<Point>,
+    /// Where each of them was found.
+    pub tracks: Tracks,
 }
+
+/// Points and their tracks.
+type Points = (Vec<Point>, Tracks);
 
 const SUPPORTED: &str = "SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL and OPENCV";
 
@@ -159,15 +198,15 @@ fn rotation(q: [f64; 4]) -> Option<[[f64; 3]; 3]> {
 pub fn read(scene: &Path) -> Result<Model, Error> {
     let (folder, cameras, images) = cameras_and_images(scene, PROJECTED)?;
     let cameras = cameras.into_iter().filter_map(|(id, lens)| Some((id, lens.projected()?))).collect();
-    let mut model = Model { cameras, images, points: vec![] };
+    let mut model = Model { cameras, images, ..Model::default() };
     for (name, read) in [
-        ("points3D.bin", binary_points as fn(&Path) -> Result<Vec<Point>, Error>),
+        ("points3D.bin", binary_points as fn(&Path) -> Result<Points, Error>),
         ("points3D.txt", text_points),
         ("points3D.ply", ply_points),
     ] {
         let path = folder.join(name);
         if path.is_file() {
-            model.points = read(&path)?;
+            (model.points, model.tracks) = read(&path)?;
             if !model.points.is_empty() {
                 return Ok(model);
             }
@@ -344,7 +383,7 @@ fn binary_images(path: &Path) -> Result<Vec<Image>, Error> {
         let named = || format!("{} ({name})", record());
         let observations = file.u64(&named)?;
         file.skip(observations, 24, &named)?;
-        let image = pose(name.clone(), quaternion, translation, camera);
+        let image = pose(id, name.clone(), quaternion, translation, camera);
         images.push(
             image.ok_or_else(|| file.invalid(format!("the pose of image {name} is not a rotation and a shift")))?,
         );
@@ -353,29 +392,34 @@ fn binary_images(path: &Path) -> Result<Vec<Image>, Error> {
     Ok(images)
 }
 
-fn pose(name: String, quaternion: [f64; 4], translation: [f64; 3], camera: u32) -> Option<Image> {
+fn pose(id: u32, name: String, quaternion: [f64; 4], translation: [f64; 3], camera: u32) -> Option<Image> {
     let finite = translation.iter().all(|v| is_finite(*v));
-    rotation(quaternion).filter(|_| finite).map(|rotation| Image { name, rotation, translation, camera })
+    rotation(quaternion).filter(|_| finite).map(|rotation| Image { id, name, rotation, translation, camera })
 }
 
-fn binary_points(path: &Path) -> Result<Vec<Point>, Error> {
+fn binary_points(path: &Path) -> Result<Points, Error> {
     let mut file = Binary::open(path)?;
     let count = file.u64(&|| "the number of points".into())?;
-    let mut points = Vec::new();
+    let (mut points, mut tracks) = Points::default();
+    let mut track = vec![];
     for i in 0..count {
         let record = || format!("point {} of {count}", i + 1);
         let id = file.u64(&record)?;
         let position: [f64; 3] = file.f64s(&record)?;
         let color = file.bytes(&record)?;
         let _reprojection_error: [f64; 1] = file.f64s(&record)?;
-        let track = file.u64(&record)?;
-        file.skip(track, 8, &record)?;
+        track.clear();
+        for _ in 0..file.u64(&record)? {
+            track.push(file.u32(&record)?);
+            let _place_in_the_photograph = file.u32(&record)?;
+        }
+        tracks.push(track.iter().copied());
         points.push(
             point(position, color).ok_or_else(|| file.invalid(format!("point {id} is not at a finite position")))?,
         );
     }
     file.finish()?;
-    Ok(points)
+    Ok((points, tracks))
 }
 
 fn point(position: [f64; 3], color: [u8; 3]) -> Option<Point> {
@@ -466,7 +510,7 @@ fn text_images(path: &Path) -> Result<Vec<Image>, Error> {
             continue;
         }
         let mut fields = Fields { path, line, rest };
-        let _id: u32 = fields.next("the image id")?;
+        let id = fields.next("the image id")?;
         let quaternion = fields.array(["QW", "QX", "QY", "QZ"])?;
         let translation = fields.array(["TX", "TY", "TZ"])?;
         let camera = fields.next("the camera id")?;
@@ -474,7 +518,7 @@ fn text_images(path: &Path) -> Result<Vec<Image>, Error> {
         if name.is_empty() {
             return Err(fields.invalid("the line ends before the image name".into()));
         }
-        let image = pose(name, quaternion, translation, camera);
+        let image = pose(id, name, quaternion, translation, camera);
         images.push(image.ok_or_else(|| fields.invalid("the pose is not a rotation and a shift".into()))?);
         // The second line of an image lists its 2D points, three numbers each; it may be empty but not left out.
         if let Some((line, observations)) = all.next()
@@ -487,17 +531,21 @@ fn text_images(path: &Path) -> Result<Vec<Image>, Error> {
     Ok(images)
 }
 
-fn text_points(path: &Path) -> Result<Vec<Point>, Error> {
+fn text_points(path: &Path) -> Result<Points, Error> {
     let text = read_text(path)?;
-    lines(&text, false)
-        .map(|(line, rest)| {
-            let mut fields = Fields { path, line, rest };
-            let _id: u64 = fields.next("the point id")?;
-            let position = fields.array(["X", "Y", "Z"])?;
-            let color = [fields.next("R")?, fields.next("G")?, fields.next("B")?];
-            point(position, color).ok_or_else(|| fields.invalid("the point is not at a finite position".into()))
-        })
-        .collect()
+    let (mut points, mut tracks) = Points::default();
+    for (line, rest) in lines(&text, false) {
+        let mut fields = Fields { path, line, rest };
+        let _id: u64 = fields.next("the point id")?;
+        let position = fields.array(["X", "Y", "Z"])?;
+        let color = [fields.next("R")?, fields.next("G")?, fields.next("B")?];
+        let point = point(position, color);
+        points.push(point.ok_or_else(|| fields.invalid("the point is not at a finite position".into()))?);
+        // Behind the error pairs of a photograph and a place in it. Other programs leave out what they do not have.
+        let track = fields.rest.split_whitespace().skip(1).step_by(2);
+        tracks.push(track.map_while(|id| id.parse().ok()));
+    }
+    Ok((points, tracks))
 }
 
 // ---------------------------------------------------------------- ply
@@ -542,7 +590,7 @@ impl ply_rs_bw::ply::PropertyAccess for Vertex {
     }
 }
 
-fn ply_points(path: &Path) -> Result<Vec<Point>, Error> {
+fn ply_points(path: &Path) -> Result<Points, Error> {
     let invalid = |what: String| Error::File { path: path.to_path_buf(), what };
     // The parser's messages go on with the line's text and cause.
     let unreadable = |e: ply_rs_bw::parser::ParseError| {
@@ -566,7 +614,7 @@ fn ply_points(path: &Path) -> Result<Vec<Point>, Error> {
         return Err(invalid("the vertices lack x, y or z as float or double".into()));
     }
     let vertices = parser.read_payload_for_element(&mut reader, element, &header).map_err(unreadable)?;
-    vertices
+    let points: Result<_, Error> = vertices
         .into_iter()
         .enumerate()
         .map(|(i, v)| match v.position {
@@ -575,7 +623,8 @@ fn ply_points(path: &Path) -> Result<Vec<Point>, Error> {
             }
             _ => Err(invalid("the vertices lack x, y or z as float or double".into())),
         })
-        .collect()
+        .collect();
+    Ok((points?, Tracks::default()))
 }
 
 /// What to do about a camera model that is not projected with.

@@ -31,6 +31,7 @@ pub mod path;
 mod picture;
 mod priors;
 pub(crate) mod resample;
+mod strays;
 pub mod synthetic;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -140,6 +141,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     let mut layout = layout::find(dir)?;
     let mut model = colmap::read(dir)?;
     let mut points = std::mem::take(&mut model.points);
+    let tracks = std::mem::take(&mut model.tracks);
     let mut notes = Notes::from_iter([layout.found.clone()]);
     notes.append(&mut layout.notes);
 
@@ -220,7 +222,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     };
     let mut train = posed(layout.train, "train");
     let mut test = posed(layout.test, "test");
-    let strays = leave_strays(&poses, [&mut train, &mut test], &mut points, &mut notes);
+    let strays = strays::leave(&model, &poses, [&mut train, &mut test], (&mut points, &tracks), &mut notes);
     if let Some(files) = references.iter().find(|files| !train.iter().any(|e| e.name == files.name)) {
         let what =
             "the model has no pose for the view of this inpainted picture, or none that is near the others'".into();
@@ -441,45 +443,6 @@ fn take_truth(dir: &Path, config: &Config, layout: &mut layout::Layout, notes: &
     Ok(name)
 }
 
-/// Takes out the views whose cameras stand where no capture has any, and the points that lie beyond what any camera can
-/// measure. Returns how many views.
-fn leave_strays(
-    poses: &Poses,
-    views: [&mut Vec<layout::Entry>; 2],
-    points: &mut Vec<Point>,
-    notes: &mut Notes,
-) -> usize {
-    let pose = |entry: &layout::Entry| poses.find(&entry.name).expect("views without a pose were left out").0;
-    let centers: Vec<[f64; 3]> = views.iter().flat_map(|v| v.iter()).map(|e| pose(e).center()).collect();
-    let bounds = bounds::Bounds::of(&centers, points);
-    let mut at = bounds.stray.iter();
-    let mut names = vec![];
-    for views in views {
-        views.retain(|entry| {
-            let stray = at.next().is_some_and(|stray| *stray);
-            names.extend(stray.then(|| entry.name.clone()));
-            !stray
-        });
-    }
-    if let Some(first) = names.first() {
-        let more = if names.len() > 1 { format!(" and {} more", names.len() - 1) } else { String::new() };
-        notes.push(Note::Stray(format!(
-            "{first}{more} of {} views: the model has the camera where no capture has any, far from all others, so that the \
-             photograph is left out",
-            centers.len()
-        )));
-    }
-    let all = points.len();
-    points.retain(|point| !bounds.is_beyond(point));
-    if points.len() < all {
-        notes.push(format!(
-            "{} of {all} points lie far beyond what the cameras can measure, and are left out",
-            all - points.len()
-        ));
-    }
-    names.len()
-}
-
 /// 1.1 x the largest distance of a camera from the mean camera, but for the farthest of few; `None` if they all coincide.
 fn radius(train: &[View]) -> Option<f32> {
     let centers: Vec<[f64; 3]> = train.iter().map(|v| v.camera.center()).collect();
@@ -586,11 +549,16 @@ impl<'a> Poses<'a> {
         Poses { model, by_name, by_file }
     }
 
-    fn find(&self, name: &str) -> Option<(&'a colmap::Image, &'a colmap::Intrinsics)> {
+    /// The place of the photograph in the model's list.
+    fn place(&self, name: &str) -> Option<usize> {
         // The file's name alone will do where one side has no folders; in another folder it is another photograph.
         let bare = |at: usize| !name.contains('/') || !self.model.images[at].name.contains('/');
         let by_file = || self.by_file.get(file_part(name)).copied().flatten().filter(|at| bare(*at));
-        let image = &self.model.images[self.by_name.get(name).copied().or_else(by_file)?];
+        self.by_name.get(name).copied().or_else(by_file)
+    }
+
+    fn find(&self, name: &str) -> Option<(&'a colmap::Image, &'a colmap::Intrinsics)> {
+        let image = &self.model.images[self.place(name)?];
         Some((image, &self.model.cameras[&image.camera]))
     }
 }
