@@ -1142,6 +1142,77 @@ fn add_strays(scene: &Path, name: &str, translation: [f64; 3], points: &[[f64; 3
     }
 }
 
+/// Gives the points of a binary model without tracks those photographs, by id.
+fn add_tracks(scene: &Path, of: impl Fn(usize) -> Vec<u32>) {
+    let path = scene.join("sparse/0/points3D.bin");
+    let old = fs::read(&path).unwrap();
+    let mut new = old[..8].to_vec();
+    for (i, record) in old[8..].chunks(51).enumerate() {
+        let track = of(i);
+        new.extend(&record[..43]);
+        new.extend((track.len() as u64).to_le_bytes());
+        track.iter().for_each(|id| new.extend([id.to_le_bytes(), [0; 4]].concat()));
+    }
+    fs::write(path, new).unwrap();
+}
+
+/// A tail of two photographs that hang on the others by five points: they and the points that only they show are left out.
+#[test]
+fn photographs_that_hang_on_a_few_points_are_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let options = synthetic::Options { seed: 3, width: 48, height: 36, train_views: 8, test_views: 0, points: 200 };
+    let dir = folder.path().join("scene");
+    synthetic::write(&dir, &options).unwrap();
+    fs::remove_dir_all(dir.join("reference")).unwrap();
+    let plain = scene::load(&dir, &Config::default()).unwrap();
+    add_tracks(&dir, |i| match i {
+        0..5 => (1..=8).collect(),
+        5..25 => vec![7, 8],
+        _ => (1..=6).collect(),
+    });
+    let with = scene::load(&dir, &Config::default()).unwrap();
+    assert_eq!(with.train.len(), 6);
+    assert_eq!(with.points.len(), 180);
+    let lost = &plain.train[6].name;
+    assert_note!(with, "and 1 more of 8 views: the model holds the camera to the others by a handful of points");
+    assert_note!(with, "20 of 200 points are seen by such views alone, and are left out");
+    assert!(!with.train.iter().any(|view| view.name == *lost), "{lost}");
+    // All of them by all: nothing is said.
+    add_tracks_again(&dir);
+    assert_eq!(scene::load(&dir, &Config::default()).unwrap().train.len(), 8);
+}
+
+/// A model in which every photograph shows every point.
+fn add_tracks_again(dir: &Path) {
+    let options = synthetic::Options { seed: 3, width: 48, height: 36, train_views: 8, test_views: 0, points: 200 };
+    let other = dir.with_file_name("other");
+    synthetic::write(&other, &options).unwrap();
+    add_tracks(&other, |_| (1..=8).collect());
+    fs::copy(other.join("sparse/0/points3D.bin"), dir.join("sparse/0/points3D.bin")).unwrap();
+}
+
+#[test]
+fn views_are_left_out_by_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let options = synthetic::Options { seed: 3, width: 48, height: 36, train_views: 6, test_views: 2, points: 200 };
+    let dir = folder.path().join("scene");
+    synthetic::write(&dir, &options).unwrap();
+    let all = scene::load(&dir, &Config::default()).unwrap();
+    let other =
+        all.train.iter().position(|v| !all.references.iter().any(|r| all.train[r.view].name == v.name)).unwrap();
+    let names = vec![all.train[other].name.clone(), all.test[1].name.clone()];
+    let without = scene::load(&dir, &Config { leave_out: names.clone(), ..Config::default() }).unwrap();
+    assert_eq!((without.train.len(), without.test.len()), (5, 1));
+    assert!(!without.train.iter().chain(&without.test).any(|v| names.contains(&v.name)));
+    assert_note!(without, "2 of 8 views are left out, as configured");
+    let refused = |name: &str| {
+        let config = Config { leave_out: vec![name.into()], ..Config::default() };
+        scene::load(&dir, &config).expect_err("it must stay").to_string()
+    };
+    assert!(refused("nobody").contains("scene.leave_out names nobody: no view of this scene"));
+    assert!(refused(&all.train[all.references[0].view].name).contains("the view of the inpainted picture"));
+}
+
 /// One camera 9e9 away and points as far, as COLMAP leaves them in one capture of two: the scene is what it is without.
 #[test]
 fn strays_change_nothing_but_a_line() {

@@ -454,9 +454,9 @@ fn of_scene(
 ) -> anyhow::Result<Vec<Row>> {
     let mut rows = vec![];
     // Read once for all variants that read it alike.
-    let mut read: Option<(Settings, Scene)> = None;
+    let mut read: Option<(Settings, Vec<String>, Scene)> = None;
     for variant in variants {
-        let settings = variant.settings(base, path, seed);
+        let mut settings = variant.settings(base, path, seed);
         let folder = folder(args, out, label, &variant.name, seed);
         let begun = args.resume && is_begun(&folder, name, &settings)?;
         let complete = begun && Record::read(&folder)?.complete.is_some();
@@ -468,12 +468,14 @@ fn of_scene(
         }
         // The seed is that of the built-in scene, too.
         let alike = |other: &Settings| other.scene == settings.scene && other.train.seed == settings.train.seed;
-        if !read.as_ref().is_some_and(|(other, _)| alike(other)) {
+        if !read.as_ref().is_some_and(|(other, _, _)| alike(other)) {
             let mut scene = load_scene(path, &settings)?;
-            add_dense(gpu, &mut scene, &settings)?;
-            read = Some((settings.clone(), scene));
+            let mut without = settings.clone();
+            add_dense(gpu, path, &mut scene, &mut without)?;
+            read = Some((settings.clone(), without.scene.leave_out, scene));
         }
-        let Some((_, scene)) = &read else { unreachable!("it was just read") };
+        let Some((_, leave_out, scene)) = &read else { unreachable!("it was just read") };
+        settings.scene.leave_out.clone_from(leave_out);
         if scene.test.is_empty() {
             bail!(
                 "{}: the scene has no test views to compare on: set scene.test_every to hold some out",

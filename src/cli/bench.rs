@@ -112,8 +112,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             .map(|(path, old)| compare::ensure_comparable(path, old, subject))
             .transpose()?
             .unwrap_or_default();
-        if let Some(scene) = &mut scene {
-            add_dense(gpu, scene, &settings)?;
+        let mut settings = settings.clone();
+        if let (Some(scene), Some(path)) = (&mut scene, &args.scene) {
+            add_dense(gpu, path, scene, &mut settings)?;
         }
         say("bench: ceilings of the device");
         let mut prober = Prober::new(gpu)?;

@@ -49,11 +49,11 @@ struct Kernels<'a> {
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let given = SceneArgs { scene: args.scene.clone(), settings: args.settings.clone() };
-    let (mut scene, settings) = preset::load(&given, &args.device)?;
+    let (mut scene, mut settings) = preset::load(&given, &args.device)?;
     // From the cache a kernel would have no compile time, and some drivers no figures.
     let options = Options { statistics: true, subgroup_size: args.subgroup, cache: None, ..args.device.options() };
     with_gpu(&options, |gpu| {
-        add_dense(gpu, &mut scene, &settings)?;
+        add_dense(gpu, &given.scene, &mut scene, &mut settings)?;
         // What does not fit into the device's memory is rehearsed all the same.
         let question = Question { available: Some(u64::MAX), ..Question::default() };
         forecast::forecast(gpu, &scene, &settings, question)?;

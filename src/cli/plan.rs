@@ -56,10 +56,10 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
-    let (mut scene, settings) = preset::load(&args.scene, &args.device)?;
+    let (mut scene, mut settings) = preset::load(&args.scene, &args.device)?;
     let options = Options { timestamps: args.measure.is_some(), ..args.device.options() };
     with_gpu(&options, |gpu| {
-        add_dense(gpu, &mut scene, &settings)?;
+        add_dense(gpu, &args.scene.scene, &mut scene, &mut settings)?;
         let question =
             Question { anchors: args.anchors, available: args.memory.map(|mib| mib << 20), also: Some(args.step) };
         let verdict = forecast::forecast(gpu, &scene, &settings, question)?;

@@ -72,7 +72,7 @@ const PAGE: &str = "report.html";
 const JSON: &str = "report.json";
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
-    let (mut scene, settings) = args.scene.load()?;
+    let (mut scene, mut settings) = args.scene.load()?;
     let name = args.scene.name();
     let out = args.out.clone().unwrap_or_else(|| {
         let mut folder = default_folder(&name).into_os_string();
@@ -106,7 +106,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         let options = Options { timestamps: true, ..args.device.options() };
         Some(with_gpu(&options, |gpu| {
             device = Some(gpu.info().clone());
-            add_dense(gpu, &mut scene, &settings)?;
+            add_dense(gpu, &args.scene.scene, &mut scene, &mut settings)?;
             let options = kernels::Options {
                 warm_up: args.measure.warm_up,
                 step: args.measure.step,
@@ -122,7 +122,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         // Without timestamps, as `train` runs.
         Some(with_gpu(&args.device.options(), |gpu| {
             device = Some(gpu.info().clone());
-            add_dense(gpu, &mut scene, &settings)?;
+            add_dense(gpu, &args.scene.scene, &mut scene, &mut settings)?;
             let options = training::Options { samples: args.samples, spacing: args.spacing, seeds: args.seeds };
             let read = |settings: &Settings| read(gpu, args, settings);
             training::measure(gpu, &scene, runs, options, read, &mut say)
@@ -161,7 +161,7 @@ fn choices(args: &Args, settings: &Settings, table: &[variants::Choice]) -> anyh
 /// Reads the scene again, at another size for instance.
 fn read(gpu: &Gpu, args: &Args, settings: &Settings) -> anyhow::Result<Scene> {
     let mut scene = load_scene(&args.scene.scene, settings)?;
-    add_dense(gpu, &mut scene, settings)?;
+    add_dense(gpu, &args.scene.scene, &mut scene, &mut settings.clone())?;
     Ok(scene)
 }
 

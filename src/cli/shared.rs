@@ -157,19 +157,37 @@ pub fn load_scene(scene: &Path, settings: &Settings) -> anyhow::Result<Scene> {
 }
 
 /// Adds the points that the photographs add to the model's, where the settings ask for them: whatever makes or looks at the
-/// model before the first step needs them.
+/// model before the first step needs them. Views that contradict the others are noted in the settings, and the scene is read
+/// from `path` again without them.
 ///
 /// # Errors
-/// When the device has no room or is lost.
-pub fn add_dense(gpu: &Gpu, scene: &mut Scene, settings: &Settings) -> anyhow::Result<()> {
-    if settings.scene.dense && scene.dense.is_empty() {
-        let (points, note) = multiview::points(gpu, scene, settings.scene.object_point_share)?;
-        eprintln!("scene: {note}");
-        scene.dense = points;
-        scene.notes.push(note);
+/// When the device has no room or is lost; as [`load_scene`].
+pub fn add_dense(gpu: &Gpu, path: &Path, scene: &mut Scene, settings: &mut Settings) -> anyhow::Result<()> {
+    if !settings.scene.dense || !scene.dense.is_empty() {
+        return Ok(());
     }
-    Ok(())
+    loop {
+        let found = multiview::look(gpu, scene, settings.scene.object_point_share)?;
+        let views = scene.train.len() + scene.test.len();
+        if found.wrong.is_empty() || views - found.wrong.len() < FEWEST_VIEWS {
+            eprintln!("scene: {}", found.note);
+            scene.dense = found.points;
+            scene.notes.push(found.note);
+            return Ok(());
+        }
+        eprintln!(
+            "scene: the photographs of {} of {views} views agree with the others' next to nowhere, so that the model has \
+             their cameras in a wrong place, and they are left out (scene.leave_out): {}",
+            found.wrong.len(),
+            found.wrong.join(", ")
+        );
+        settings.scene.leave_out.extend(found.wrong);
+        *scene = load_scene(path, settings)?;
+    }
 }
+
+/// Views that are never gone below.
+const FEWEST_VIEWS: usize = 3;
 
 /// As [`load_scene`], in the lengths of the scene's files, which are those of a model on disk; what the settings say in
 /// training units is brought to them.

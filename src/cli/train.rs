@@ -126,7 +126,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let began = Instant::now();
     let given = |scene: &PathBuf| SceneArgs { scene: scene.clone(), settings: args.settings.clone() };
     let given = args.scene.as_ref().map(given);
-    let (mut scene, settings, name, folder, begun, _lock) = if let Some(folder) = &args.resume {
+    let (mut scene, mut settings, name, path, folder, begun, _lock) = if let Some(folder) = &args.resume {
         let read = || {
             Record::read(folder)
                 .with_context(|| format!("{}: holds no run to go on with: start one with --out", folder.display()))
@@ -140,25 +140,26 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         let settings = Settings::resolve(&[Source::File(folder.join(SETTINGS))])?;
         let path = args.scene.clone().unwrap_or_else(|| PathBuf::from(&record.scene));
         let name = given.map_or(record.scene, |given| given.name());
-        (load_scene(&path, &settings)?, settings, name, folder.clone(), true, lock)
+        (load_scene(&path, &settings)?, settings, name, path, folder.clone(), true, lock)
     } else {
         let given = given.expect("clap asks for a scene where there is nothing to resume");
         let name = given.name();
         let folder = args.out.clone().unwrap_or_else(|| default_folder(&name));
         let lock = held(&folder, args.resume_or_start)?;
-        let (scene, settings) = preset::load(&given, &args.device)?;
+        let (mut scene, mut settings) = preset::load(&given, &args.device)?;
         let begun = args.resume_or_start && is_begun(&folder, &name, &settings)?;
         if begun {
             if is_complete(&folder, &Record::read(&folder)?, lock.is_some())? {
                 return Ok(());
             }
+            go_on_without(&folder, &given.scene, &mut scene, &mut settings)?;
         } else if folder.join(RECORD).exists() && !args.overwrite {
             bail!(
                 "{}: holds a run already: choose another --out, go on with it by --resume, or replace it by --overwrite",
                 folder.display()
             );
         }
-        (scene, settings, name, folder, begun, lock)
+        (scene, settings, name, given.scene, folder, begun, lock)
     };
     let looked = doctor::look(&scene);
     eprintln!("doctor: {}", looked.verdict());
@@ -166,7 +167,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     with_gpu(&options, |gpu| {
         // A checkpoint has the anchors.
         if !begun || checkpoint::list(&folder).is_empty() {
-            add_dense(gpu, &mut scene, &settings)?;
+            add_dense(gpu, &path, &mut scene, &mut settings)?;
         }
         let (settings, clock) = match args.minutes {
             Some(time) => {
@@ -248,6 +249,21 @@ fn same_run(folder: &Path, record: &Record, name: &str, settings: &Settings) -> 
     }
     if let Some(difference) = checkpoint::setting_difference(&theirs.to_toml(), &settings.to_toml()) {
         bail!("{}: holds a run with other settings, {difference}: {or}", folder.display());
+    }
+    Ok(())
+}
+
+/// Reads the scene at `path` again without the views that the run in `folder` left out when it began.
+pub(super) fn go_on_without(
+    folder: &Path,
+    path: &Path,
+    scene: &mut Scene,
+    settings: &mut Settings,
+) -> anyhow::Result<()> {
+    let theirs = Settings::resolve(&[Source::File(folder.join(SETTINGS))])?.scene.leave_out;
+    if theirs != settings.scene.leave_out {
+        settings.scene.leave_out = theirs;
+        *scene = load_scene(path, settings)?;
     }
     Ok(())
 }

@@ -30,9 +30,9 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
-    let (mut scene, settings) = args.scene.load()?;
+    let (mut scene, mut settings) = args.scene.load()?;
     with_gpu(&args.device.options(), |gpu| {
-        add_dense(gpu, &mut scene, &settings)?;
+        add_dense(gpu, &args.scene.scene, &mut scene, &mut settings)?;
         let mut run = Run::new(gpu, &scene, &settings)?;
         let style = ProgressStyle::with_template("warm-up {wide_bar} {pos}/{len} steps, {eta} left")?;
         let bar = ProgressBar::new(args.warm_up.into()).with_style(style);

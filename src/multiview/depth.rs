@@ -174,7 +174,7 @@ mod tests {
         synthetic::write(&dir, &options).expect("a scene");
         let scene = load(&dir, &Config::default()).expect("it loads");
         let pictures: Vec<Picture> = scene.train.iter().map(Picture::new).collect();
-        let near = &neighbors::choose(&pictures, &scene.points)[2];
+        let near = &neighbors::choose(&pictures, 5, &scene.points).of[2];
         assert_eq!(near.len(), 4);
         let gpu = testing::gpu();
         let upload = |at: &usize| gpu.upload("picture", &elements(&pictures[*at].grey, [64, 48])).expect("upload");

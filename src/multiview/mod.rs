@@ -7,11 +7,13 @@
 //! - `neighbors`: which other views a view is compared with, by the points they share and the angle between them.
 //! - `depth`: a plane at every site of a view, a site being a square of `STRIDE` pixels: PatchMatch as compute passes,
 //!   `propose`, `score` and `choose`, begun at the sparse points' depths.
+//! - `agree`: views in which next to no depth is confirmed stand in a wrong place.
 //! - `fuse`: depths that other views confirm become points, one where several views see the same place.
 //! - `fill`: where nothing is confirmed (blank walls, sky) planes and shells through what lies around.
 //!
 //! Everything is a function of the scene: random planes are drawn by site and view.
 
+mod agree;
 mod choose;
 mod depth;
 mod fill;
@@ -22,7 +24,7 @@ mod propose;
 mod score;
 
 use crate::gpu::{Error, Gpu};
-use crate::scene::{Point, Scene};
+use crate::scene::{Point, Scene, View};
 
 use picture::Picture;
 
@@ -92,43 +94,63 @@ struct Round {
     spread: f32,
 }
 
-/// Points that the scene's photographs add to those of its sparse model, and a line that says how many; none where no view
-/// has neighbours.
+/// What multi-view stereo found.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Stereo {
+    /// Points that the photographs add to those of the sparse model; none where no view has neighbours.
+    pub points: Vec<Point>,
+    /// Names of train and test views whose photographs agree with the others' next to nowhere: the sparse model has their
+    /// cameras in a wrong place. The points are not to be used then: other views were compared with these.
+    pub wrong: Vec<String>,
+    /// How many points there are, in a line.
+    pub note: String,
+}
+
+/// Points that the scene's photographs add to those of its sparse model, and the views that contradict the others.
 ///
 /// Masked pixels, which show the object, add none, and neither do places that most masks cover (`share` as
 /// [`Config::object_point_share`](crate::scene::Config::object_point_share)).
 ///
 /// # Errors
 /// When the device has no room or is lost.
-pub fn points(gpu: &Gpu, scene: &Scene, share: f64) -> Result<(Vec<Point>, String), Error> {
+pub fn look(gpu: &Gpu, scene: &Scene, share: f64) -> Result<Stereo, Error> {
     use rayon::prelude::*;
-    let pictures: Vec<Picture> = scene.train.par_iter().map(Picture::new).collect();
-    let neighbors = neighbors::choose(&pictures, &scene.points);
-    let maps = depth::estimate(gpu, &pictures, &neighbors, &scene.points)?;
-    let surfaces = fuse::confirm(&pictures, &neighbors, &maps);
-    let mut cloud = fuse::Cloud::new(&pictures, &surfaces, &scene.points);
+    // Test views are asked for their place alone: no other view is compared with them.
+    let views: Vec<&View> = scene.train.iter().chain(&scene.test).collect();
+    let train = scene.train.len();
+    let pictures: Vec<Picture> = views.par_iter().map(|view| Picture::new(view)).collect();
+    let neighbors = neighbors::choose(&pictures, train, &scene.points);
+    let maps = depth::estimate(gpu, &pictures, &neighbors.of, &scene.points)?;
+    let surfaces = fuse::confirm(&pictures, &neighbors.of, &maps);
+    let wrong = agree::wrong(&agree::shares(&pictures, &neighbors, &surfaces));
+    let wrong: Vec<String> = (views.iter().zip(wrong).enumerate())
+        .filter(|(at, (_, wrong))| *wrong && scene.reference_of(*at).is_none())
+        .map(|(_, (view, _))| view.name.clone())
+        .collect();
+    let (pictures, surfaces) = (&pictures[..train], &surfaces[..train]);
+    let mut cloud = fuse::Cloud::new(pictures, surfaces, &scene.points);
     cloud.add_confirmed();
     let confirmed = cloud.points.len();
-    cloud.add_filled(&fill::fill(&pictures, &surfaces));
-    let mut added = cloud.points;
-    let filled = added.len() - confirmed;
+    cloud.add_filled(&fill::fill(pictures, surfaces));
+    let mut points = cloud.points;
+    let filled = points.len() - confirmed;
     let on_object = crate::scene::on_object(&scene.train, share);
-    let all = added.len();
-    added.retain(|point| !on_object(point));
-    let dropped = all - added.len();
+    let all = points.len();
+    points.retain(|point| !on_object(point));
+    let dropped = all - points.len();
     let pixels: usize = scene.train.iter().map(|v| v.image.as_raw().len() / 3).sum();
     let most = (pixels / PIXELS_PER_POINT).max(1);
-    if added.len() > most {
-        added = (0..most).map(|i| added[i * added.len() / most]).collect();
+    if points.len() > most {
+        points = (0..most).map(|i| points[i * points.len() / most]).collect();
     }
     let on_it = if dropped > 0 { format!(", {dropped} of them on the object and left out") } else { String::new() };
     let note = format!(
         "{} points are added to the {} of the model: {confirmed} where photographs agree on the depth, {filled} on planes and \
          shells around what stays unknown{on_it} (scene.dense)",
-        added.len(),
+        points.len(),
         scene.points.len(),
     );
-    Ok((added, note))
+    Ok(Stereo { points, wrong, note })
 }
 
 #[cfg(test)]
@@ -164,9 +186,9 @@ mod tests {
         let mut scene = built_in(&synthetic::Options { train_views: 16, test_views: 4, ..Default::default() });
         scene.train.append(&mut scene.test);
         let pictures: Vec<Picture> = scene.train.iter().map(Picture::new).collect();
-        let neighbors = neighbors::choose(&pictures, &scene.points);
-        let maps = depth::estimate(&gpu, &pictures, &neighbors, &scene.points).expect("a device");
-        let surfaces = fuse::confirm(&pictures, &neighbors, &maps);
+        let neighbors = neighbors::choose(&pictures, pictures.len(), &scene.points);
+        let maps = depth::estimate(&gpu, &pictures, &neighbors.of, &scene.points).expect("a device");
+        let surfaces = fuse::confirm(&pictures, &neighbors.of, &maps);
         let filled = fill::fill(&pictures, &surfaces);
         let (mut all, mut confirmed, mut guessed) = (0, vec![], vec![]);
         for (at, view) in scene.train.iter().enumerate() {
@@ -214,16 +236,39 @@ mod tests {
             ..Default::default()
         };
         let scene = built_in(&options);
-        let (points, note) = super::points(&gpu, &scene, 0.9).expect("a device");
+        let found = look(&gpu, &scene, 0.9).expect("a device");
+        let Stereo { points, note, .. } = &found;
         assert!(points.len() > 50 && points.len() <= 8 * 80 * 60 / PIXELS_PER_POINT, "{note}");
         assert!(note.contains("(scene.dense)"), "{note}");
         let on_object = crate::scene::on_object(&scene.train, 0.9);
         assert!(!points.iter().any(on_object));
-        assert_eq!(super::points(&gpu, &scene, 0.9).expect("a device").0, points);
+        assert_eq!(look(&gpu, &scene, 0.9).expect("a device"), found);
         // One view has no neighbours, and nothing is found without any points to begin with.
         let alone = Scene { train: scene.train[..1].to_vec(), references: vec![], ..scene.clone() };
-        assert_eq!(super::points(&gpu, &alone, 0.9).expect("a device").0, []);
+        assert_eq!(look(&gpu, &alone, 0.9).expect("a device").points, []);
         let blind = Scene { points: vec![], ..scene };
-        assert_eq!(super::points(&gpu, &blind, 0.9).expect("a device").0, []);
+        assert_eq!(look(&gpu, &blind, 0.9).expect("a device").points, []);
+    }
+
+    /// A camera turned away by some degrees sees what no other view confirms; all the others stay, and so does it in its place.
+    #[test]
+    fn a_camera_in_a_wrong_place_is_found() {
+        let gpu = testing::gpu();
+        let options = synthetic::Options { train_views: 16, test_views: 4, ..Default::default() };
+        let mut scene = built_in(&options);
+        assert_eq!(look(&gpu, &scene, 0.9).expect("a device").wrong, [""; 0]);
+        let turn = |view: &mut View| {
+            let (sin, cos) = 0.12_f32.sin_cos();
+            let [x, y, z] = view.camera.rotation;
+            let mix = |a: [f32; 3], b: [f32; 3], p: f32, q: f32| std::array::from_fn(|i| p * a[i] + q * b[i]);
+            let center = view.camera.center();
+            view.camera.rotation = [mix(x, z, cos, sin), y, mix(x, z, -sin, cos)];
+            view.camera.translation = crate::scene::Camera::translation_to(&view.camera.rotation, center);
+        };
+        let at = (0..16).find(|at| scene.reference_of(*at).is_none()).expect("one is the reference");
+        turn(&mut scene.train[at]);
+        turn(&mut scene.test[2]);
+        let names = [scene.train[at].name.clone(), scene.test[2].name.clone()];
+        assert_eq!(look(&gpu, &scene, 0.9).expect("a device").wrong, names);
     }
 }

@@ -10,15 +10,23 @@ const MOST: usize = 8;
 /// Points that are looked at.
 const POINTS: usize = 3000;
 /// Fewest points that two views share.
-const FEWEST: usize = 8;
+const FEWEST: u32 = 8;
 /// Degrees between two views of a point: the best, how fast smaller and larger ones are worth less, and the most.
 const BEST: f64 = 8.0;
 const SMALLER: f64 = 4.0;
 const LARGER: f64 = 12.0;
 const WIDEST: f64 = 45.0;
 
-/// Of each view the others that see most of its points from the best angles and distances, the best first.
-pub(super) fn choose(pictures: &[Picture], points: &[Point]) -> Vec<Vec<usize>> {
+/// The neighbours of all views.
+pub(super) struct Neighbors {
+    /// \[view\] their numbers, the best first.
+    pub of: Vec<Vec<usize>>,
+    /// \[view\] how well each of them sees what the view sees: 1 from the best angle and the same distance.
+    pub worth: Vec<Vec<f64>>,
+}
+
+/// The views among the first `most` that see most of a view's points from the best angles and distances.
+pub(super) fn choose(pictures: &[Picture], most: usize, points: &[Point]) -> Neighbors {
     let every = points.len().div_ceil(POINTS).max(1);
     let positions: Vec<[f64; 3]> = points.iter().step_by(every).map(|p| p.position.map(f64::from)).collect();
     // Of each view the points that it sees: number, direction from the point, distance.
@@ -33,7 +41,7 @@ pub(super) fn choose(pictures: &[Picture], points: &[Point]) -> Vec<Vec<usize>> 
     };
     let seen: Vec<_> = pictures.par_iter().map(seen).collect();
     let score = |a: &[(usize, [f64; 3], f64)], b: &[(usize, [f64; 3], f64)]| {
-        let (mut sum, mut shared, mut at) = (0.0, 0, 0);
+        let (mut sum, mut shared, mut at) = (0.0, 0u32, 0);
         for (k, to, distance) in a {
             while at < b.len() && b[at].0 < *k {
                 at += 1;
@@ -49,16 +57,17 @@ pub(super) fn choose(pictures: &[Picture], points: &[Point]) -> Vec<Vec<usize>> 
             let nearer = (distance / far).min(far / distance);
             sum += nearer * (-0.5 * ((angle - BEST) / spread).powi(2)).exp();
         }
-        if shared >= FEWEST { sum } else { 0.0 }
+        if shared >= FEWEST { (sum, sum / f64::from(shared)) } else { (0.0, 0.0) }
     };
-    (0..pictures.len())
+    let (of, worth) = (0..pictures.len())
         .into_par_iter()
         .map(|at| {
-            let others = (0..pictures.len()).filter(|other| *other != at);
-            let mut scored: Vec<(f64, usize)> =
-                others.map(|other| (score(&seen[at], &seen[other]), other)).filter(|(s, _)| *s > 0.0).collect();
-            scored.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-            scored.into_iter().take(MOST).map(|(_, other)| other).collect()
+            let others = (0..most).filter(|other| *other != at);
+            let scored = others.map(|other| (score(&seen[at], &seen[other]), other));
+            let mut scored: Vec<((f64, f64), usize)> = scored.filter(|((sum, _), _)| *sum > 0.0).collect();
+            scored.sort_by(|a, b| b.0.0.total_cmp(&a.0.0).then(a.1.cmp(&b.1)));
+            scored.into_iter().take(MOST).map(|((_, worth), other)| (other, worth)).unzip()
         })
-        .collect()
+        .unzip();
+    Neighbors { of, worth }
 }

@@ -16,6 +16,9 @@ pub struct Config {
     /// Where the layout has no test views, hold out the first of every `test_every` views; 0 holds out none. Held-out
     /// views show the object, so they judge the scene around it.
     pub test_every: u32,
+    /// Names of views that are neither trained on nor tested. Views whose photographs agree with the others' nowhere, for
+    /// the model has their cameras in a wrong place, are added by `dense`.
+    pub leave_out: Vec<String>,
     /// Use the train masks; `false` trains on every pixel, the object included. Without masks there is no reference either.
     pub masks: bool,
     /// Use the depth priors.
@@ -39,7 +42,8 @@ pub struct Config {
     /// photograph shows.
     pub seed_behind_edges: bool,
     /// Add points where the photographs agree on a depth and the model has none, and on planes around what stays unknown:
-    /// floors, walls and what is far off get anchors, too (GScream: off).
+    /// floors, walls and what is far off get anchors, too. A view in which hardly anything agrees with the others is left
+    /// out (GScream: off).
     pub dense: bool,
     /// Let the train masks grow by as many pixels as an inpainted picture was repainted beyond its own: the object's shadow
     /// goes with it, and what the photographs show there. A picture that is the photograph outside its mask changes nothing.
@@ -109,6 +113,7 @@ impl Default for Config {
             invert_masks: false,
             dilate_masks: 0,
             test_every: 0,
+            leave_out: vec![],
             masks: true,
             priors: true,
             reference: true,
@@ -118,7 +123,7 @@ impl Default for Config {
             guess_reference_prior: true,
             seed_hole: true,
             seed_behind_edges: true,
-            dense: false,
+            dense: true,
             grow_masks: false,
             rim: 1,
             judge_rim: true,

@@ -197,6 +197,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
         }
     }
 
+    leave_out(config, [&mut layout.train, &mut layout.test], &references, &mut notes)?;
     let poses = Poses::new(&model);
     if !layout.train.iter().chain(&layout.test).any(|e| poses.find(&e.name).is_some()) {
         return Err(Error::NoOverlap {
@@ -243,7 +244,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
         let what = "no view is left to train on; check images/ against the model, and test_every".into();
         return Err(Error::File { path: dir.to_path_buf(), what });
     }
-    let unused = model.images.len().saturating_sub(train.len() + test.len() + strays);
+    let unused = model.images.len().saturating_sub(train.len() + test.len() + strays + config.leave_out.len());
     if unused > 0 {
         notes.push(format!("{unused} of {} images of the model have no picture here", model.images.len()));
     }
@@ -441,6 +442,32 @@ fn take_truth(dir: &Path, config: &Config, layout: &mut layout::Layout, notes: &
     layout.train.push(entry);
     layout.train.sort_by(|a, b| a.name.cmp(&b.name));
     Ok(name)
+}
+
+/// Takes out the views of [`Config::leave_out`].
+fn leave_out(
+    config: &Config,
+    mut views: [&mut Vec<layout::Entry>; 2],
+    references: &[layout::ReferenceFiles],
+    notes: &mut Notes,
+) -> Result<(), Error> {
+    for name in &config.leave_out {
+        let what = if references.iter().any(|files| files.name == *name) {
+            "the view of the inpainted picture, which has to stay; take the picture out of reference/ first"
+        } else if !views.iter().any(|views| views.iter().any(|entry| entry.name == *name)) {
+            "no view of this scene; views are named after their photographs, without extension"
+        } else {
+            continue;
+        };
+        return Err(Error::Setting(format!("scene.leave_out names {name}: {what}")));
+    }
+    let before: usize = views.iter().map(|views| views.len()).sum();
+    views.iter_mut().for_each(|views| views.retain(|entry| !config.leave_out.contains(&entry.name)));
+    let after: usize = views.iter().map(|views| views.len()).sum();
+    if after < before {
+        notes.push(format!("{} of {before} views are left out, as configured (scene.leave_out)", before - after));
+    }
+    Ok(())
 }
 
 /// 1.1 x the largest distance of a camera from the mean camera, but for the farthest of few; `None` if they all coincide.

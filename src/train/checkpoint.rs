@@ -438,8 +438,9 @@ pub(crate) fn setting_difference(theirs: &str, ours: &str) -> Option<String> {
         all
     };
     let (theirs, ours) = (parse(theirs), parse(ours));
-    // Those are made while a run goes on.
-    let fixed = theirs.keys().chain(ours.keys()).filter(|key| *key != "train.corrections");
+    // Those are made while a run begins and goes on.
+    let made = ["scene.leave_out", "train.corrections"];
+    let fixed = theirs.keys().chain(ours.keys()).filter(|key| !made.contains(&key.as_str()));
     let key = fixed.into_iter().find(|key| theirs.get(*key) != ours.get(*key))?;
     let value = |of: &BTreeMap<String, String>, key| of.get(key).cloned().unwrap_or_else(|| "not set".to_owned());
     Some(format!("{key} was {} and is {}", value(&theirs, key), value(&ours, key)))
