@@ -9,6 +9,7 @@
 //!   `propose`, `score` and `choose`, begun at the sparse points' depths.
 //! - `fuse`: depths that other views confirm become points, one where several views see the same place.
 //! - `fill`: where nothing is confirmed (blank walls, sky) planes and shells through what lies around.
+//! - `grid`: the same depths by view, for whoever asks how deep a photograph's pixel is.
 //!
 //! Everything is a function of the scene: random planes are drawn by site and view.
 
@@ -16,6 +17,7 @@ mod choose;
 mod depth;
 mod fill;
 mod fuse;
+mod grid;
 mod neighbors;
 mod picture;
 mod propose;
@@ -24,6 +26,7 @@ mod score;
 use crate::gpu::{Error, Gpu};
 use crate::scene::{Point, Scene};
 
+pub use grid::{DepthGrid, depths, lift};
 use picture::Picture;
 
 /// Pixels from site to site: anchors stand some three pixels apart.

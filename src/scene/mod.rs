@@ -31,6 +31,7 @@ pub mod path;
 mod picture;
 mod priors;
 pub(crate) mod resample;
+pub mod room360;
 pub mod synthetic;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -690,6 +691,11 @@ pub(crate) fn pictures(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Error
     let found = layout::index(folder, &PICTURES, &mut passed_over)?;
     passed_over.iter().for_each(|line| log::warn!("{line}"));
     Ok(found)
+}
+
+/// The photographs of a scene's train views, by name.
+pub(crate) fn train_files(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Error> {
+    Ok(layout::find(folder)?.train.into_iter().map(|entry| (entry.name, entry.image)).collect())
 }
 
 /// Longer side of the first picture of a scene, pixels; `None` where there is none that can be read.
