@@ -64,6 +64,13 @@ impl Placed {
         self.axes.transpose() * (rows[0] * x + rows[1] * y + rows[2]) / self.stand.height
     }
 
+    /// Where a camera's pixel meets it, and at which depth z; whatever stands before it.
+    pub fn meet(&self, camera: &Camera, pixel: [f64; 2]) -> Option<(DVec3, f64)> {
+        let eye = self.local(DVec3::from(camera.center()));
+        let hit = self.object.hit(eye, self.ray(camera, camera.unproject(pixel)?))?;
+        Some((self.world(hit.position), hit.at))
+    }
+
     /// Heights above the ground, in those of the object, up to which the scene is taken for ground.
     fn ground(&self) -> f64 {
         (GROUND + ROUGHNESS * self.stand.roughness / self.stand.height).min(MOST_GROUND)

@@ -199,7 +199,7 @@ mod tests {
         let scene = written(&options());
         let on = |p: &&crate::scene::Point| {
             let [x, y, z] = p.position;
-            x.abs() > 3.98 || y.abs() > 3.98 || z < 0.02 || z > 2.78
+            x.abs() > 3.98 || y.abs() > 3.98 || !(0.02..=2.78).contains(&z)
         };
         let bare = scene.points.iter().filter(on).count();
         assert!(bare > 0 && bare < 100, "{bare} of 300");
