@@ -175,7 +175,7 @@ fn in_scene(args: &Args, into: &std::path::Path, (view, pixel): &(String, [f64; 
         }
         Ok(composed?)
     })?;
-    let compose::Outcome { train, test, seen, covered, stand, seconds: [measured, drawn] } = outcome;
+    let compose::Outcome { train, test, seen, covered, agreed, stand, seconds: [measured, drawn] } = outcome;
     let shadow = if args.shadow { " and its shadow" } else { "" };
     println!(
         "{}: {train} train views with a {}{shadow} and {test} test views without; {seen} photographs show it, on {:.1} % of \
@@ -184,7 +184,7 @@ fn in_scene(args: &Args, into: &std::path::Path, (view, pixel): &(String, [f64; 
         args.object.name(),
         100.0 * covered
     );
-    eprintln!("depth: {measured:.1} s; drawing: {drawn:.1} s");
+    eprintln!("depth: {measured:.1} s, photographs agree on {:.0} % of it; drawing: {drawn:.1} s", 100.0 * agreed);
     if stand.steep {
         eprintln!("the surface there is steep: it stands upright as the cameras are");
     }

@@ -158,6 +158,8 @@ pub struct Outcome {
     pub seen: usize,
     /// Mean share of these that it covers, 0 to 1.
     pub covered: f64,
+    /// Share of all pixels on whose depth photographs agree, 0 to 1; elsewhere it is taken from around.
+    pub agreed: f64,
     /// Where it stands.
     pub stand: Stand,
     /// Seconds for depth, and for drawing and writing.
@@ -261,12 +263,14 @@ pub fn compose(gpu: &Gpu, request: &Request, go_on: &(dyn Fn() -> bool + Sync)) 
     folder.text(RECORD, &record(request, &placed))?;
     folder.keep()?;
     let seen = shares.iter().filter(|share| **share > 0.0).count();
+    let known = grids.iter().flat_map(|grid| &grid.confirmed).filter(|known| **known).count();
     let tests = held_out.iter().filter(|out| **out).count();
     Ok(Outcome {
         train: shares.len() - tests,
         test: if request.test_every == 0 { shares.len() } else { tests },
         seen,
         covered: shares.iter().sum::<f64>() / seen.max(1) as f64,
+        agreed: known as f64 / grids.iter().map(|grid| grid.confirmed.len()).sum::<usize>().max(1) as f64,
         stand,
         seconds: [measured, began.elapsed().as_secs_f64() - measured],
     })

@@ -7,8 +7,8 @@ use rand_pcg::Pcg64;
 use crate::multiview::{DepthGrid, lift};
 use crate::scene::Camera;
 
-/// The surface at a pixel is looked for within this share of the picture's longer side.
-const AROUND: f64 = 0.02;
+/// The surface at a pixel is looked for within these shares of the picture's longer side, the nearest first.
+const AROUND: [f64; 3] = [0.015, 0.03, 0.05];
 /// Fewest sites there whose depth other views confirm.
 const FEWEST: usize = 5;
 /// Surface within so many heights of the object tells the plane.
@@ -52,12 +52,14 @@ pub fn find(
     let grid = &grids[view];
     let ray = camera.unproject(pixel)?;
     let [column, row] = grid.place(ray).map(|p| p.floor() as i64);
-    let reach = (AROUND * f64::from(grid.columns.max(grid.rows))).ceil().max(2.0) as i64;
+    let longer = f64::from(grid.columns.max(grid.rows));
     let mut near: Vec<(i64, f64)> = vec![];
-    for (dx, dy) in (-reach..=reach).flat_map(|dy| (-reach..=reach).map(move |dx| (dx, dy))) {
-        let Some(site) = grid.site(column + dx, row + dy) else { continue };
-        if grid.confirmed[site] {
-            near.push((dx * dx + dy * dy, grid.depth[site]));
+    for reach in AROUND.map(|share| (share * longer).ceil().max(2.0) as i64) {
+        let around = (-reach..=reach).flat_map(|dy| (-reach..=reach).map(move |dx| (dx, dy)));
+        let sites = around.filter_map(|(dx, dy)| Some((dx * dx + dy * dy, grid.site(column + dx, row + dy)?)));
+        near = sites.filter(|(_, site)| grid.confirmed[*site]).map(|(far, site)| (far, grid.depth[site])).collect();
+        if near.len() >= FEWEST {
+            break;
         }
     }
     if near.len() < FEWEST {

@@ -9,6 +9,8 @@ use crate::scene::{Camera, Scene};
 
 /// Depths within this share of one another are of one surface.
 const SAME: f64 = 0.02;
+/// A view sees through a point if what it shows there is farther by more than this share.
+const THROUGH: f64 = 0.05;
 /// Of the nine sites around a site, itself included, so many must be of its surface; else it is taken for noise.
 const LEAST: usize = 3;
 
@@ -99,7 +101,7 @@ pub fn depths(gpu: &Gpu, scene: &Scene) -> Result<Vec<DepthGrid>, Error> {
     let pictures: Vec<Picture> = scene.train.par_iter().map(Picture::new).collect();
     let neighbors = neighbors::choose(&pictures, &scene.points);
     let maps = depth::estimate(gpu, &pictures, &neighbors, &scene.points)?;
-    let surfaces = fuse::confirm(&pictures, &neighbors, &maps);
+    let surfaces = seen_by_most(&pictures, fuse::confirm(&pictures, &neighbors, &maps));
     let filled = fill::fill(&pictures, &surfaces);
     let all = pictures.into_par_iter().zip(surfaces).zip(filled);
     let grids = all.map(|((picture, surface), filled)| {
@@ -113,6 +115,33 @@ pub fn depths(gpu: &Gpu, scene: &Scene) -> Result<Vec<DepthGrid>, Error> {
         grid
     });
     Ok(grids.collect())
+}
+
+/// The depths that more views confirm than see through: a weave that repeats itself matches at a wrong depth in neighbours,
+/// and other views look past it.
+fn seen_by_most(pictures: &[Picture], surfaces: Vec<fuse::Surface>) -> Vec<fuse::Surface> {
+    use rayon::prelude::*;
+    let kept = |at: usize| -> fuse::Surface {
+        let own = &pictures[at];
+        let one = |site: usize| {
+            let depth = surfaces[at][site];
+            if depth.is_nan() {
+                return depth;
+            }
+            let point = own.lift(own.pixel(site), depth);
+            let (mut agree, mut through) = (0, 0);
+            for (other, surface) in pictures.iter().zip(&surfaces) {
+                let Some((pixel, z)) = other.see(point) else { continue };
+                let Some(there) = other.site(pixel).map(|site| surface[site]) else { continue };
+                agree += usize::from((there / z - 1.0).abs() <= SAME);
+                through += usize::from(there > (1.0 + THROUGH) * z);
+            }
+            // Its own view agrees with itself.
+            if through < agree { depth } else { f64::NAN }
+        };
+        (0..own.sites.len()).map(one).collect()
+    };
+    (0..pictures.len()).into_par_iter().map(kept).collect()
 }
 
 #[cfg(test)]

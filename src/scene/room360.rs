@@ -102,6 +102,11 @@ fn room(seed: u64) -> Room {
         let x = -0.9 + 0.3 * f64::from(i);
         shapes.push((rod([x, 1.1, 0.0], [x, 1.1, 0.62]), material([0.2, 0.2, 0.22], Pattern::Plain)));
     }
+    // Its ends are closed.
+    for x in [-0.9, 0.9] {
+        let knob = Shape::Sphere { center: dvec3(x, 1.1, 0.62), radius: 0.018 };
+        shapes.push((knob, material([0.2, 0.2, 0.22], Pattern::Plain)));
+    }
     let object = shapes.len();
     shapes.extend([
         (block([-0.2, -0.15, 0.0], [0.2, 0.15, 0.5]), material([0.80, 0.62, 0.30], Pattern::Plain)),
