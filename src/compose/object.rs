@@ -310,7 +310,7 @@ fn hsv(hue: f64, saturation: f64, value: f64) -> DVec3 {
     value * DVec3::ONE.lerp(full, saturation)
 }
 
-/// A trunk that divides four times, one unit high.
+/// A trunk that divides again and again, one unit high.
 fn branches(rng: &mut Pcg64) -> Vec<Part> {
     struct Tip {
         at: DVec3,
@@ -319,9 +319,9 @@ fn branches(rng: &mut Pcg64) -> Vec<Part> {
         radius: f64,
     }
     let lean = dvec3(rng.random_range(-0.12..0.12), rng.random_range(-0.12..0.12), 1.0).normalize();
-    let mut tips = vec![Tip { at: DVec3::ZERO, toward: lean, length: 0.34, radius: 0.032 }];
+    let mut tips = vec![Tip { at: DVec3::ZERO, toward: lean, length: 0.34, radius: 0.026 }];
     let mut tubes: Vec<(DVec3, DVec3, f64)> = vec![];
-    for level in 0..4 {
+    for level in 0..5 {
         let mut next = vec![];
         for tip in tips {
             let to = tip.at + tip.toward * tip.length;
@@ -336,7 +336,7 @@ fn branches(rng: &mut Pcg64) -> Vec<Part> {
                 // Twigs bend upwards.
                 let toward = (tilt.cos() * tip.toward + tilt.sin() * side + 0.15 * DVec3::Z).normalize();
                 let length = tip.length * rng.random_range(0.68..0.86);
-                next.push(Tip { at: to, toward, length, radius: tip.radius * 0.66 });
+                next.push(Tip { at: to, toward, length, radius: tip.radius * 0.68 });
             }
         }
         tips = next;
