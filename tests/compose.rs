@@ -186,6 +186,37 @@ fn views_agree_on_where_the_shadow_is() {
     assert!(places > 300 && dark > 30, "{places} places, {dark} of them dark");
 }
 
+/// With depth that was measured between the photographs, what is shown of the object is what the true depth shows.
+#[test]
+fn measured_depth_hides_what_true_depth_hides() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let mut scene = built_in(&folder, &synthetic::Options { train_views: 16, test_views: 6, ..Default::default() });
+    // The test views, whose depth is known, take part.
+    let first = scene.train.len();
+    scene.train.append(&mut scene.test);
+    scene.train.iter_mut().for_each(|view| view.mask = None);
+    let grids = gscream_vk::multiview::depths(&testing::gpu(), &scene).expect("a device");
+    for kind in [Kind::Box, Kind::Sphere, Kind::Branch] {
+        let placed = behind_the_bench(kind);
+        let (mut both, mut either, mut whole) = (0, 0, 0);
+        for (view, grid) in scene.train.iter().zip(&grids).skip(first) {
+            let truth = drawn(&placed, view, false).mask;
+            let found = compose::draw(&placed, &view.camera, grid, &view.image, 1.0, false).mask;
+            both += truth.as_raw().iter().zip(found.as_raw()).filter(|(a, b)| **a != 0 && **b != 0).count();
+            either += truth.as_raw().iter().zip(found.as_raw()).filter(|(a, b)| **a != 0 || **b != 0).count();
+            let far = view.depth.as_ref().expect("a test view").iter().map(|z| f64::from(*z) + 100.0).collect();
+            let open = DepthGrid { depth: far, ..true_grid(view) };
+            let open = compose::draw(&placed, &view.camera, &open, &view.image, 1.0, false).mask;
+            whole += open.as_raw().iter().filter(|v| **v != 0).count();
+        }
+        let iou = both as f64 / either as f64;
+        println!("{kind:?}: IoU {iou:.3} over {either} pixels, of {whole} without what is before it");
+        // A border of three quarters of a pixel on either side of about a fifth of the outline.
+        assert!(iou > 0.9, "{kind:?}: {iou}");
+        assert!(either * 20 < whole * 19, "{kind:?}: something stands before it, {either} of {whole}");
+    }
+}
+
 // ---------------------------------------------------------------- whole scenes
 
 /// `photos/`: the photographs and the model of a small built-in scene.
