@@ -75,8 +75,8 @@ pub enum Error {
     },
     /// No view agrees with another on the depth there.
     #[error(
-        "--stand {view}={x},{y}: no surface is known there, because no two photographs agree on its depth; name a pixel with \
-         some texture that several photographs show"
+        "--stand {view}={x},{y}: no surface is known there, because no photographs agree on its depth and the model has no \
+         points; name a pixel with some texture that several photographs show"
     )]
     NoSurface {
         /// The view.
@@ -158,7 +158,7 @@ pub struct Outcome {
     pub seen: usize,
     /// Mean share of these that it covers, 0 to 1.
     pub covered: f64,
-    /// Share of all pixels on whose depth photographs agree, 0 to 1; elsewhere it is taken from around.
+    /// Share of all pixels whose depth photographs agree on, 0 to 1; elsewhere it is taken from around.
     pub agreed: f64,
     /// Where it stands.
     pub stand: Stand,

@@ -9,7 +9,7 @@ use crate::scene::Camera;
 
 /// The surface at a pixel is looked for within these shares of the picture's longer side, the nearest first.
 const AROUND: [f64; 3] = [0.015, 0.03, 0.05];
-/// Fewest sites there whose depth other views confirm.
+/// Fewest sites there whose depth is known.
 const FEWEST: usize = 5;
 /// Surface within so many heights of the object tells the plane.
 const REACH: f64 = 0.8;

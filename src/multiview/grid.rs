@@ -5,12 +5,16 @@ use glam::DVec3;
 use super::picture::Picture;
 use super::{STRIDE, Sites, depth, fill, fuse, neighbors};
 use crate::gpu::{Error, Gpu};
-use crate::scene::{Camera, Scene};
+use crate::scene::{Camera, Point, Scene};
 
 /// Depths within this share of one another are of one surface.
 const SAME: f64 = 0.02;
 /// A view sees through a point if what it shows there is farther by more than this share.
 const THROUGH: f64 = 0.05;
+/// A point of the sparse model counts where no other point and no depth within so many sites is nearer by more than this
+/// share: what is before it would hide it.
+const FRONT_SITES: i32 = 5;
+const FRONT: f64 = 0.04;
 /// Of the nine sites around a site, itself included, so many must be of its surface; else it is taken for noise.
 const LEAST: usize = 3;
 
@@ -27,7 +31,8 @@ pub struct DepthGrid {
     pub rows: u32,
     /// Depth z \[row-major site\], scene units; NaN where nothing tells.
     pub depth: Vec<f64>,
-    /// Whether other views confirm the depth of a \[site\]; elsewhere it is taken from around.
+    /// Whether other views confirm the depth of a \[site\], or a point of the sparse model is there; elsewhere it is taken
+    /// from around.
     pub confirmed: Vec<bool>,
     /// 8-bit RGB of a \[site\].
     pub colors: Vec<[u8; 3]>,
@@ -89,7 +94,8 @@ pub fn lift(camera: &Camera, ray: [f64; 2], z: f64) -> DVec3 {
     DVec3::from(camera.center()) + DVec3::from(turned)
 }
 
-/// The depth of every train view, by PatchMatch where other views confirm it and from around elsewhere. All pixels count:
+/// The depth of every train view, by PatchMatch where other views confirm it, of the sparse model's points, and from around
+/// elsewhere. All pixels count:
 /// masks are not looked at where a scene was read without them.
 ///
 /// A site without any depth in its view, or a view without neighbours, has NaN.
@@ -101,7 +107,8 @@ pub fn depths(gpu: &Gpu, scene: &Scene) -> Result<Vec<DepthGrid>, Error> {
     let pictures: Vec<Picture> = scene.train.par_iter().map(Picture::new).collect();
     let neighbors = neighbors::choose(&pictures, &scene.points);
     let maps = depth::estimate(gpu, &pictures, &neighbors, &scene.points)?;
-    let surfaces = seen_by_most(&pictures, fuse::confirm(&pictures, &neighbors, &maps));
+    let mut surfaces = seen_by_most(&pictures, fuse::confirm(&pictures, &neighbors, &maps));
+    pictures.par_iter().zip(&mut surfaces).for_each(|(picture, surface)| add_points(picture, surface, &scene.points));
     let filled = fill::fill(&pictures, &surfaces);
     let all = pictures.into_par_iter().zip(surfaces).zip(filled);
     let grids = all.map(|((picture, surface), filled)| {
@@ -142,6 +149,30 @@ fn seen_by_most(pictures: &[Picture], surfaces: Vec<fuse::Surface>) -> Vec<fuse:
         (0..own.sites.len()).map(one).collect()
     };
     (0..pictures.len()).into_par_iter().map(kept).collect()
+}
+
+/// Depths of the sparse model's points at the sites that have none, where nothing around can hide the point.
+fn add_points(picture: &Picture, surface: &mut fuse::Surface, points: &[Point]) {
+    let mut nearest = vec![f64::INFINITY; surface.len()];
+    let mut seen = vec![];
+    for point in points {
+        let Some((pixel, z)) = picture.see(point.position.map(f64::from)) else { continue };
+        let Some(site) = picture.site(pixel) else { continue };
+        nearest[site] = nearest[site].min(z);
+        seen.push(site);
+    }
+    seen.sort_unstable();
+    seen.dedup();
+    let known = surface.clone();
+    for site in seen.into_iter().filter(|site| known[*site].is_nan()) {
+        let [x, y] = picture.sites.place(site);
+        let reach = || -FRONT_SITES..=FRONT_SITES;
+        let mut around = reach().flat_map(|dy| reach().filter_map(move |dx| picture.sites.at(x + dx, y + dy)));
+        let before = |at: usize| nearest[at].min(known[at]) < (1.0 - FRONT) * nearest[site];
+        if !around.any(before) {
+            surface[site] = nearest[site];
+        }
+    }
 }
 
 #[cfg(test)]

@@ -1,8 +1,8 @@
 //! What was captured: cameras, photographs, masks, depth priors, points.
 //!
 //! [`load`] finds out how a folder is laid out, reads its COLMAP model and its pictures, checks that they belong
-//! together and brings everything to the training resolution. [`synthetic`] writes a scene of its own making in the plain
-//! layout, which is
+//! together and brings everything to the training resolution. [`synthetic`] and [`room360`] write scenes of their own making
+//! in the plain layout, which is
 //!
 //! ```text
 //! SCENE/images/NAME.jpg|png                 photographs with the object
