@@ -175,7 +175,7 @@ fn in_scene(args: &Args, into: &std::path::Path, (view, pixel): &(String, [f64; 
         }
         Ok(composed?)
     })?;
-    let compose::Outcome { train, test, seen, covered, agreed, stand, seconds: [measured, drawn] } = outcome;
+    let compose::Outcome { train, test, seen, covered, agreed, standing, stand, seconds: [measured, drawn] } = outcome;
     let shadow = if args.shadow { " and its shadow" } else { "" };
     println!(
         "{}: {train} train views with a {}{shadow} and {test} test views without; {seen} photographs show it, on {:.1} % of \
@@ -185,6 +185,13 @@ fn in_scene(args: &Args, into: &std::path::Path, (view, pixel): &(String, [f64; 
         100.0 * covered
     );
     eprintln!("depth: {measured:.1} s, photographs agree on {:.0} % of it; drawing: {drawn:.1} s", 100.0 * agreed);
+    let [there, past] = standing;
+    if 4 * past > there {
+        eprintln!(
+            "{past} photographs look past the place where {there} show a surface: in these it floats; the poses do not fit \
+             together, or the pixel shows something thin"
+        );
+    }
     if stand.steep {
         eprintln!("the surface there is steep: it stands upright as the cameras are");
     }

@@ -160,6 +160,8 @@ pub struct Outcome {
     pub covered: f64,
     /// Share of all pixels whose depth photographs agree on, 0 to 1; elsewhere it is taken from around.
     pub agreed: f64,
+    /// Photographs that show a surface where it stands, and photographs that look past that place.
+    pub standing: [usize; 2],
     /// Where it stands.
     pub stand: Stand,
     /// Seconds for depth, and for drawing and writing.
@@ -271,6 +273,7 @@ pub fn compose(gpu: &Gpu, request: &Request, go_on: &(dyn Fn() -> bool + Sync)) 
         seen,
         covered: shares.iter().sum::<f64>() / seen.max(1) as f64,
         agreed: known as f64 / grids.iter().map(|grid| grid.confirmed.len()).sum::<usize>().max(1) as f64,
+        standing: standing(&grids, stand.foot),
         stand,
         seconds: [measured, began.elapsed().as_secs_f64() - measured],
     })
@@ -336,6 +339,29 @@ fn gains(grids: &[DepthGrid], at: usize, stand: &Stand) -> Vec<f64> {
         if ratios.len() < 20 { 1.0 } else { ratios[ratios.len() / 2].clamp(0.6, 1.6) }
     };
     grids.iter().map(|grid| gain * ratio(grid)).collect()
+}
+
+/// A view shows a surface at a place if a depth there is within this share, and looks past it if all are farther by more
+/// than that.
+const AT: f64 = 0.04;
+const PAST: f64 = 0.08;
+
+/// How many views show a surface at a place, and how many look past it. Where poses fit together hardly any does.
+fn standing(grids: &[DepthGrid], place: DVec3) -> [usize; 2] {
+    let mut count = [0; 2];
+    for grid in grids {
+        let [x, y, z] = grid.camera.to_camera(place.to_array());
+        let [column, row] = grid.place([x / z, y / z]).map(|p| p.floor() as i64);
+        let around = (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (dx, dy)));
+        let sites = around.filter_map(|(dx, dy)| grid.site(column + dx, row + dy)).filter(|site| grid.confirmed[*site]);
+        let depths: Vec<f64> = sites.map(|site| grid.depth[site] / z - 1.0).collect();
+        if z <= 0.0 || depths.len() < 3 {
+            continue;
+        }
+        count[0] += usize::from(depths.iter().any(|d| d.abs() <= AT));
+        count[1] += usize::from(depths.iter().all(|d| *d > PAST));
+    }
+    count
 }
 
 fn record(request: &Request, placed: &Placed) -> String {
