@@ -17,6 +17,8 @@ const SITES: f64 = 1.1;
 const LEVELS: f64 = 22.0;
 /// Say of a site of any other colour.
 const OTHER: f64 = 0.01;
+/// Say of a site whose depth is only taken from around.
+const GUESSED: f64 = 0.3;
 /// The scene hides the object where it is nearer by this share of the depth, or of the object's height ...
 const NEARER: f64 = 0.012;
 const NEARER_HEIGHT: f64 = 0.06;
@@ -211,7 +213,8 @@ impl View<'_> {
             let color: f64 =
                 (0..3).map(|c| (f64::from(own[c]) - f64::from(self.grid.colors[site][c])).powi(2)).sum::<f64>() / 3.0;
             let alike = (-0.5 * color / (LEVELS * LEVELS)).exp().max(OTHER);
-            votes.push(Vote { site, weight: (-0.5 * apart / (SITES * SITES)).exp() * alike });
+            let known = if self.grid.confirmed[site] { 1.0 } else { GUESSED };
+            votes.push(Vote { site, weight: (-0.5 * apart / (SITES * SITES)).exp() * alike * known });
         }
         Some((ray, votes))
     }
