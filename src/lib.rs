@@ -4,9 +4,10 @@
 //! this scene needs, and then repeats one straight line of compute passes: [`render`] the anchors of the [`model`],
 //! compare with the photograph in [`losses`], walk back, and let the [`optimizer`] and [`densify`] change the model.
 //! [`multiview`] finds points where the capture has none, [`evaluate`] measures the result, [`export`] bakes it into
-//! static Gaussians for any viewer, [`view`] shows them in the browser. Kernels live in `glsl/`, mirrored by path and
-//! stem in `src/`; each has a CPU twin in float64 beside the code that dispatches it. [`gpu`] is the only place that
-//! knows Vulkan; [`primitives`] are sorts, scans and sums that know nothing of splats. [`cli`] has one file per command.
+//! static Gaussians for any viewer, [`view`] shows them in the browser, [`compose`] makes scenes whose truth is known.
+//! Kernels live in `glsl/`, mirrored by path and stem in `src/`; each has a CPU twin in float64 beside the code that
+//! dispatches it. [`gpu`] is the only place that knows Vulkan; [`primitives`] are sorts, scans and sums that know nothing of
+//! splats. [`cli`] has one file per command.
 //!
 //! # Words
 //!
@@ -35,6 +36,7 @@ pub mod atomic;
 pub mod bench;
 pub mod capture;
 pub mod cli;
+pub mod compose;
 pub mod config;
 pub mod cost;
 pub mod densify;

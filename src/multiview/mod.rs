@@ -10,6 +10,7 @@
 //! - `agree`: views in which next to no depth is confirmed stand in a wrong place.
 //! - `fuse`: depths that other views confirm become points, one where several views see the same place.
 //! - `fill`: where nothing is confirmed (blank walls, sky) planes and shells through what lies around.
+//! - `grid`: the same depths by view, for whoever asks how deep a photograph's pixel is.
 //!
 //! Everything is a function of the scene: random planes are drawn by site and view.
 
@@ -18,6 +19,7 @@ mod choose;
 mod depth;
 mod fill;
 mod fuse;
+mod grid;
 mod neighbors;
 mod picture;
 mod propose;
@@ -26,6 +28,7 @@ mod score;
 use crate::gpu::{Error, Gpu};
 use crate::scene::{Point, Scene, View};
 
+pub use grid::{DepthGrid, depths, lift};
 use picture::Picture;
 
 /// Pixels from site to site: anchors stand some three pixels apart.

@@ -223,16 +223,25 @@ pub fn lenses(scene: &Path) -> Result<(Lenses, Vec<Image>), Error> {
     cameras_and_images(scene, READ).map(|(_, cameras, images)| (cameras, images))
 }
 
-/// The model's folder, its cameras, which must be of the first `models`, and its photographs.
-fn cameras_and_images(scene: &Path, models: usize) -> Result<(PathBuf, Lenses, Vec<Image>), Error> {
+/// The model's folder under `scene` and the extension of its cameras and images.
+///
+/// # Errors
+/// No model.
+pub(crate) fn folder(scene: &Path) -> Result<(PathBuf, &'static str), Error> {
     let folders = [scene.join("sparse/0"), scene.join("sparse")];
     let has = |folder: &Path, extension: &str| {
         ["cameras", "images"].iter().all(|stem| folder.join(stem).with_extension(extension).is_file())
     };
-    let (folder, extension) = folders
-        .iter()
-        .find_map(|folder| ["bin", "txt"].into_iter().find(|e| has(folder, e)).map(|e| (folder, e)))
-        .ok_or_else(|| Error::NoModel { scene: scene.to_path_buf() })?;
+    let found = folders.into_iter().find_map(|folder| {
+        let extension = ["bin", "txt"].into_iter().find(|e| has(&folder, e))?;
+        Some((folder, extension))
+    });
+    found.ok_or_else(|| Error::NoModel { scene: scene.to_path_buf() })
+}
+
+/// The model's folder, its cameras, which must be of the first `models`, and its photographs.
+fn cameras_and_images(scene: &Path, models: usize) -> Result<(PathBuf, Lenses, Vec<Image>), Error> {
+    let (folder, extension) = folder(scene)?;
     let (cameras, images) =
         (folder.join("cameras").with_extension(extension), folder.join("images").with_extension(extension));
     let (lenses, photographs) = if extension == "bin" {
@@ -246,7 +255,7 @@ fn cameras_and_images(scene: &Path, models: usize) -> Result<(PathBuf, Lenses, V
             return Err(Error::File { path: images, what });
         }
     }
-    Ok((folder.clone(), lenses, photographs))
+    Ok((folder, lenses, photographs))
 }
 
 // ---------------------------------------------------------------- binary

@@ -1,8 +1,8 @@
 //! What was captured: cameras, photographs, masks, depth priors, points.
 //!
 //! [`load`] finds out how a folder is laid out, reads its COLMAP model and its pictures, checks that they belong
-//! together and brings everything to the training resolution. [`synthetic`] writes a scene of its own making in the plain
-//! layout, which is
+//! together and brings everything to the training resolution. [`synthetic`] and [`room360`] write scenes of their own making
+//! in the plain layout, which is
 //!
 //! ```text
 //! SCENE/images/NAME.jpg|png                 photographs with the object
@@ -31,6 +31,7 @@ pub mod path;
 mod picture;
 mod priors;
 pub(crate) mod resample;
+pub mod room360;
 mod strays;
 pub mod synthetic;
 
@@ -685,6 +686,11 @@ pub(crate) fn pictures(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Error
     let found = layout::index(folder, &PICTURES, &mut passed_over)?;
     passed_over.iter().for_each(|line| log::warn!("{line}"));
     Ok(found)
+}
+
+/// The photographs of a scene's train views, by name.
+pub(crate) fn train_files(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Error> {
+    Ok(layout::find(folder)?.train.into_iter().map(|entry| (entry.name, entry.image)).collect())
 }
 
 /// Longer side of the first picture of a scene, pixels; `None` where there is none that can be read.

@@ -63,7 +63,16 @@ const PRIORS: u64 = 4;
 /// # Errors
 /// Options out of range, a folder that is not empty, a file that cannot be written.
 pub fn write(dir: &Path, options: &Options) -> Result<(), Error> {
-    let Options { seed, width, height, train_views, test_views, points } = *options;
+    let Options { seed, width, height, train_views, points, .. } = *options;
+    checked([width, height], train_views, points)?;
+    let (train, test) = Shot::all(options);
+    let room = Room::new(seed);
+    let cloud = room.points(&train, points, &mut Pcg64::new(seed.into(), POINTS.into()));
+    write_room(dir, seed, &room, [&train, &test], &[], &cloud)
+}
+
+/// Refuses what no room can be drawn with.
+pub(super) fn checked([width, height]: [u32; 2], train_views: u32, points: u32) -> Result<(), Error> {
     if !(16..=16384).contains(&width) || !(16..=16384).contains(&height) {
         return Err(Error::Setting(format!(
             "synthetic pictures cannot be {width}x{height}; both sides must be 16 to 16384"
@@ -72,27 +81,41 @@ pub fn write(dir: &Path, options: &Options) -> Result<(), Error> {
     if train_views == 0 || points == 0 {
         return Err(Error::Setting("a synthetic scene needs at least one train view and one point".into()));
     }
+    Ok(())
+}
+
+/// Writes a room seen by train and test views. `exposures` multiply the train views' colours; none leave them.
+pub(super) fn write_room(
+    dir: &Path,
+    seed: u64,
+    room: &Room,
+    [train, test]: [&[Shot]; 2],
+    exposures: &[f64],
+    cloud: &[(DVec3, Rgb<u8>)],
+) -> Result<(), Error> {
+    let exposed = |i: usize, picture: RgbImage| match exposures.get(i) {
+        Some(exposure) => brightened(picture, *exposure),
+        None => picture,
+    };
     if dir.read_dir().is_ok_and(|mut entries| entries.next().is_some()) {
         return Err(Error::File { path: dir.to_path_buf(), what: "the folder is not empty; name a new one".into() });
     }
     let folders = ["images", "masks", "depth", "reference", "sparse/0"];
     let test_folders = ["test_images", "test_masks", "test_depth"];
-    for folder in folders.iter().chain(test_folders.iter().filter(|_| test_views > 0)) {
+    for folder in folders.iter().chain(test_folders.iter().filter(|_| !test.is_empty())) {
         let path = dir.join(folder);
         std::fs::create_dir_all(&path).map_err(|source| Error::Io { path, source })?;
     }
-    let room = Room::new(seed);
-    let (train, test) = Shot::all(options);
     let reference = train.len() / 2;
     (0..train.len()).into_par_iter().try_for_each(|i| {
         let shot = &train[i];
         let name = format!("{}.png", shot.name);
-        save(dir.join("images").join(&name), |path| room.photograph(shot, true).save(path))?;
+        save(dir.join("images").join(&name), |path| exposed(i, room.photograph(shot, true)).save(path))?;
         save(dir.join("masks").join(&name), |path| room.mask(shot).save(path))?;
         let mut rng = Pcg64::new(seed.into(), (PRIORS + 2 * i as u64).into());
         save_prior(&dir.join("depth").join(format!("{}.npy", shot.name)), &room.depth(shot, true), shot, &mut rng)?;
         if i == reference {
-            save(dir.join("reference").join(&name), |path| room.photograph(shot, false).save(path))?;
+            save(dir.join("reference").join(&name), |path| exposed(i, room.photograph(shot, false)).save(path))?;
             let mut rng = Pcg64::new(seed.into(), (PRIORS + 2 * i as u64 + 1).into());
             let path = dir.join("reference").join(format!("{}_depth.npy", shot.name));
             save_prior(&path, &room.depth(shot, false), shot, &mut rng)?;
@@ -108,8 +131,12 @@ pub fn write(dir: &Path, options: &Options) -> Result<(), Error> {
         let depth = Array2::from_shape_fn((h, w), |(y, x)| depth[y * w + x] as f32);
         write_npy(&dir.join("test_depth").join(format!("{}.npy", shot.name)), &depth)
     })?;
-    let cloud = room.points(&train, points, &mut Pcg64::new(seed.into(), POINTS.into()));
-    write_model(&dir.join("sparse/0"), &train, &test, &cloud)
+    write_model(&dir.join("sparse/0"), train, test, cloud)
+}
+
+fn brightened(mut picture: RgbImage, by: f64) -> RgbImage {
+    picture.pixels_mut().for_each(|pixel| pixel.0 = pixel.0.map(|v| (f64::from(v) * by).round().min(255.0) as u8));
+    picture
 }
 
 fn save(path: std::path::PathBuf, write: impl FnOnce(&Path) -> image::ImageResult<()>) -> Result<(), Error> {
@@ -147,14 +174,14 @@ fn write_npy(path: &Path, values: &Array2<f32>) -> Result<(), Error> {
 // ---------------------------------------------------------------- cameras
 
 /// A camera position and lens. Conventions are [`super::Camera`]'s, in float64.
-struct Shot {
-    name: String,
+pub(super) struct Shot {
+    pub name: String,
     /// World to camera.
     rotation: DQuat,
-    eye: DVec3,
+    pub eye: DVec3,
     focal: f64,
     principal: [f64; 2],
-    size: [u32; 2],
+    pub size: [u32; 2],
 }
 
 impl Shot {
@@ -180,7 +207,7 @@ impl Shot {
         (arc(options.train_views, "train", 0.0), arc(options.test_views, "test", 0.3))
     }
 
-    fn look(name: String, eye: DVec3, target: DVec3, roll: f64, size: [u32; 2]) -> Shot {
+    pub fn look(name: String, eye: DVec3, target: DVec3, roll: f64, size: [u32; 2]) -> Shot {
         let forward = (target - eye).normalize();
         let right = forward.cross(DVec3::Z).normalize();
         let upright = DMat3::from_cols(right, forward.cross(right), forward).transpose();
@@ -191,7 +218,7 @@ impl Shot {
     }
 
     /// The ray through a pixel position, scaled so that its parameter is the depth z.
-    fn ray(&self, x: f64, y: f64) -> DVec3 {
+    pub fn ray(&self, x: f64, y: f64) -> DVec3 {
         let normalised = [(x - self.principal[0]) / self.focal, (y - self.principal[1]) / self.focal];
         let [u, v] = undistort(normalised, [RADIAL, 0.0, 0.0, 0.0])
             .expect("a radial distortion that only grows outwards has an inverse everywhere");
@@ -202,7 +229,7 @@ impl Shot {
 // ---------------------------------------------------------------- the room
 
 #[derive(Clone, Copy)]
-enum Shape {
+pub(super) enum Shape {
     /// Seen from inside.
     Walls {
         low: DVec3,
@@ -217,11 +244,17 @@ enum Shape {
         center: DVec3,
         radius: f64,
     },
+    /// An upright or level rod without ends.
+    Rod {
+        from: DVec3,
+        to: DVec3,
+        radius: f64,
+    },
 }
 
 impl Shape {
     /// Ray parameter and outward normal of the first hit in front of the eye.
-    fn hit(&self, eye: DVec3, ray: DVec3) -> Option<(f64, DVec3)> {
+    pub fn hit(&self, eye: DVec3, ray: DVec3) -> Option<(f64, DVec3)> {
         match *self {
             Shape::Sphere { center, radius } => {
                 let to = eye - center;
@@ -229,6 +262,16 @@ impl Shape {
                 let t = (-b - (b * b - a * c).sqrt()) / a;
                 // NaN (no hit) fails the comparison as well.
                 (t > 0.0).then(|| (t, (to + ray * t) / radius))
+            }
+            Shape::Rod { from, to, radius } => {
+                let (axis, out) = (to - from, eye - from);
+                let (length, along, offset) = (axis.length_squared(), axis.dot(ray), axis.dot(out));
+                let a = length * ray.length_squared() - along * along;
+                let b = length * out.dot(ray) - offset * along;
+                let c = length * (out.length_squared() - radius * radius) - offset * offset;
+                let t = (-b - (b * b - a * c).sqrt()) / a;
+                let s = (offset + t * along) / length;
+                (t > 0.0 && (0.0..=1.0).contains(&s)).then(|| (t, (out + ray * t - axis * s) / radius))
             }
             Shape::Walls { low, high } | Shape::Block { low, high } => {
                 // A ray along an axis divides by zero: the infinities compare as they should.
@@ -251,7 +294,7 @@ impl Shape {
 
 /// Structure with soft edges drawn over a material's waves.
 #[derive(Clone, Copy)]
-enum Pattern {
+pub(super) enum Pattern {
     Plain,
     /// Rows of this width and height, every other row shifted by half.
     Bricks(f64, f64),
@@ -262,16 +305,16 @@ enum Pattern {
 }
 
 /// One plane wave of a solid texture.
-struct Wave {
+pub(super) struct Wave {
     direction: DVec3,
     phase: f64,
-    amplitude: DVec3,
+    pub amplitude: DVec3,
 }
 
-struct Material {
-    base: DVec3,
-    waves: Vec<Wave>,
-    pattern: Pattern,
+pub(super) struct Material {
+    pub base: DVec3,
+    pub waves: Vec<Wave>,
+    pub pattern: Pattern,
 }
 
 /// Periodic soft line: 1 on multiples of `pitch`, falling off within about `width`.
@@ -282,7 +325,7 @@ fn line(at: f64, pitch: f64, width: f64) -> f64 {
 
 impl Material {
     /// Waves of many directions and of wavelengths from 1.2 down to 0.12: several pixels even in small pictures.
-    fn new(base: [f64; 3], pattern: Pattern, rng: &mut Pcg64) -> Material {
+    pub fn new(base: [f64; 3], pattern: Pattern, rng: &mut Pcg64) -> Material {
         let waves = (0..14)
             .map(|i| {
                 let wavelength = 1.2 * 0.1f64.powf(f64::from(i) / 13.0);
@@ -334,19 +377,19 @@ fn shade([a, b]: [f64; 2]) -> f64 {
 }
 
 /// Shapes with their materials; the object's come last.
-struct Room {
-    shapes: Vec<(Shape, Material)>,
+pub(super) struct Room {
+    pub shapes: Vec<(Shape, Material)>,
     /// Index of the first shape of the object.
-    object: usize,
+    pub object: usize,
 }
 
 /// The first surface along a ray.
-struct Hit {
-    depth: f64,
-    normal: DVec3,
-    position: DVec3,
+pub(super) struct Hit {
+    pub depth: f64,
+    pub normal: DVec3,
+    pub position: DVec3,
     /// Index into [`Room::shapes`].
-    shape: usize,
+    pub shape: usize,
 }
 
 impl Room {
@@ -369,7 +412,7 @@ impl Room {
         Room { shapes, object: 4 }
     }
 
-    fn cast(&self, eye: DVec3, ray: DVec3, with_object: bool) -> Hit {
+    pub fn cast(&self, eye: DVec3, ray: DVec3, with_object: bool) -> Hit {
         let count = if with_object { self.shapes.len() } else { self.object };
         let (index, (depth, normal)) = self.shapes[..count]
             .iter()
@@ -380,7 +423,7 @@ impl Room {
         Hit { depth, normal, position: eye + ray * depth, shape: index }
     }
 
-    fn color(&self, hit: &Hit) -> DVec3 {
+    pub fn color(&self, hit: &Hit) -> DVec3 {
         self.shapes[hit.shape].1.color(hit.position, hit.normal)
     }
 
@@ -394,7 +437,7 @@ impl Room {
     }
 
     /// The anti-aliased picture.
-    fn photograph(&self, shot: &Shot, with_object: bool) -> RgbImage {
+    pub fn photograph(&self, shot: &Shot, with_object: bool) -> RgbImage {
         RgbImage::from_fn(shot.size[0], shot.size[1], |x, y| {
             let sum: DVec3 = self.hits(shot, x, y, with_object).map(|hit| self.color(&hit)).sum();
             to_rgb8(sum / f64::from(SAMPLES * SAMPLES))
@@ -402,7 +445,7 @@ impl Room {
     }
 
     /// The pixels of which some ray meets the object.
-    fn mask(&self, shot: &Shot) -> GrayImage {
+    pub fn mask(&self, shot: &Shot) -> GrayImage {
         GrayImage::from_fn(shot.size[0], shot.size[1], |x, y| {
             let object = self.hits(shot, x, y, true).any(|hit| hit.shape >= self.object);
             Luma([if object { 255 } else { 0 }])
@@ -410,7 +453,7 @@ impl Room {
     }
 
     /// Exact depth z at the pixel centres, row-major.
-    fn depth(&self, shot: &Shot, with_object: bool) -> Vec<f64> {
+    pub fn depth(&self, shot: &Shot, with_object: bool) -> Vec<f64> {
         let [w, h] = shot.size;
         let pixels = (0..h).flat_map(|y| (0..w).map(move |x| (f64::from(x) + 0.5, f64::from(y) + 0.5)));
         pixels.map(|(x, y)| self.cast(shot.eye, shot.ray(x, y), with_object).depth).collect()
@@ -431,7 +474,7 @@ impl Room {
     }
 }
 
-fn to_rgb8(color: DVec3) -> Rgb<u8> {
+pub(super) fn to_rgb8(color: DVec3) -> Rgb<u8> {
     Rgb(color.to_array().map(|v| (255.0 * v).round() as u8))
 }
 
