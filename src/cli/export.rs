@@ -112,7 +112,7 @@ impl Format {
 
     fn decode(self, bytes: &[u8]) -> Result<Cloud, export::Error> {
         match self {
-            Self::Ply => ply::decode(bytes),
+            Self::Ply => ply::decode(bytes).map_err(export::Error::Format),
             Self::Spz => spz::decode(bytes),
             Self::Glb => gltf::decode(bytes),
         }

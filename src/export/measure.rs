@@ -5,11 +5,11 @@ use std::fmt::Write as _;
 use image::{GrayImage, RgbImage};
 use serde::Serialize;
 
-use super::activate::Static;
 use super::draw::Drawer;
 use super::{Cloud, Error, low_pass};
 use crate::evaluate::{self, Mean, Report, ViewMetrics};
 use crate::gpu::Gpu;
+use crate::model::gaussians::Static;
 use crate::render::Config;
 use crate::render::view::{Renderer, to_rgb8};
 use crate::scene::{Camera, Scene};

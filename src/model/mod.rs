@@ -5,7 +5,9 @@ pub mod arrays;
 pub mod attention;
 pub mod config;
 pub mod files;
+pub mod gaussians;
 pub mod init;
 pub mod parameter;
+pub mod ply;
 
 pub use config::Config;

@@ -4,7 +4,7 @@
 //! then green, then blue, those beyond the cloud's degree 0; opacity as logit, scales as natural logarithms, the unit
 //! quaternion as w x y z.
 
-use super::{Cloud, Error};
+use super::gaussians::Cloud;
 use crate::math::harmonics::coefficients;
 
 /// Floats of a Gaussian.
@@ -57,8 +57,8 @@ pub fn encode(cloud: &Cloud) -> Vec<u8> {
 ///
 /// # Errors
 /// Any other file, or one that is cut off.
-pub fn decode(bytes: &[u8]) -> Result<Cloud, Error> {
-    let broken = |what: &str| Error::Format(format!("not a PLY file as `gscream-vk export` writes it: {what}"));
+pub fn decode(bytes: &[u8]) -> Result<Cloud, String> {
+    let broken = |what: &str| format!("not a PLY file as `gscream-vk export` writes it: {what}");
     let end = b"end_header\n";
     let at = bytes.windows(end.len()).position(|w| w == end).ok_or_else(|| broken("it has no header"))?;
     let (head, body) = bytes.split_at(at + end.len());

@@ -1,18 +1,15 @@
-//! Static Gaussians on the device, and from what is learnt of them to what is drawn and back.
+//! From what is learnt of static Gaussians to what is drawn, and back.
 
-use super::Cloud;
-use crate::gpu::kernels::export::{activate, activate_backward};
+use super::project::Gaussians;
+use crate::gpu::kernels::render::{activate, activate_backward};
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::math::camera::{from_center, split};
 use crate::math::harmonics::{coefficients, harmonics};
-use crate::model::parameter::{Parameter, names};
-use crate::render::project::Gaussians;
+use crate::model::gaussians::{NORM_EPSILON, Static};
+use crate::model::parameter::Parameter;
 
 /// The kernel's: e^88 is the last power of e below the largest float32.
 const LARGEST_EXPONENT: f64 = 88.0;
-/// Shortest quaternion that is normalised to length one.
-const NORM_EPSILON: f64 = 1e-12;
-
 fn wide<const C: usize>(v: [f32; C]) -> [f64; C] {
     v.map(f64::from)
 }
@@ -79,73 +76,6 @@ impl Reference for activate_backward::Kernel {
     /// Ten roundings; `g - q (q . g)` and a harmonic's polynomial cancel: relative to the largest.
     fn check(_: &'static str) -> Check {
         Check { relative: 1e-6, absolute: 2e-6, band: 0.0 }
-    }
-}
-
-/// What is learnt of static Gaussians, with Adam's moments.
-#[derive(Debug)]
-pub struct Static {
-    /// Gaussians.
-    pub count: u32,
-    /// Highest degree of the harmonics.
-    pub degree: u32,
-    /// 3 per Gaussian, world.
-    pub position: Parameter,
-    /// 3 per Gaussian, natural logarithms of scene units.
-    pub log_scale: Parameter,
-    /// 4 per Gaussian, w x y z.
-    pub quaternion: Parameter,
-    /// 1 per Gaussian, logit of the opacity.
-    pub logit: Parameter,
-    /// 3 per coefficient, `(degree + 1)^2` coefficients per Gaussian.
-    pub harmonics: Parameter,
-}
-
-impl Static {
-    /// These Gaussians on the device, moments zero.
-    ///
-    /// # Errors
-    /// As [`Gpu::buffer`].
-    pub fn upload(gpu: &Gpu, cloud: &Cloud) -> Result<Self, Error> {
-        let count = cloud.len() as u32;
-        let each = coefficients(cloud.degree) as u32;
-        let rows = count.max(1);
-        let parameter = |names, width, data: &[f32]| Parameter::upload(gpu, names, width, rows, data);
-        Ok(Self {
-            count,
-            degree: cloud.degree,
-            position: parameter(names!("position"), 3, cloud.position.as_flattened())?,
-            log_scale: parameter(names!("log_scale"), 3, cloud.log_scale.as_flattened())?,
-            quaternion: parameter(names!("quaternion"), 4, cloud.rotation.as_flattened())?,
-            logit: parameter(names!("logit"), 1, &cloud.logit)?,
-            harmonics: parameter(names!("harmonics"), 3 * each, cloud.harmonics.as_flattened())?,
-        })
-    }
-
-    /// Position, log-scale, quaternion, logit, harmonics.
-    pub fn parameters(&self) -> [&Parameter; 5] {
-        [&self.position, &self.log_scale, &self.quaternion, &self.logit, &self.harmonics]
-    }
-
-    /// The Gaussians as they are now, quaternions normalised.
-    ///
-    /// # Errors
-    /// Whatever the copies meet.
-    pub fn read(&self, gpu: &Gpu) -> Result<Cloud, Error> {
-        let read = |parameter: &Parameter| parameter.read(gpu, self.count);
-        let triples = |flat: Vec<f32>| -> Vec<[f32; 3]> { flat.as_chunks().0.to_vec() };
-        let unit = |q: &[f32; 4]| {
-            let norm = wide(*q).iter().map(|v| v * v).sum::<f64>().sqrt().max(NORM_EPSILON);
-            q.map(|v| (f64::from(v) / norm) as f32)
-        };
-        Ok(Cloud {
-            position: triples(read(&self.position)?),
-            log_scale: triples(read(&self.log_scale)?),
-            rotation: read(&self.quaternion)?.as_chunks().0.iter().map(unit).collect(),
-            logit: read(&self.logit)?,
-            degree: self.degree,
-            harmonics: triples(read(&self.harmonics)?),
-        })
     }
 }
 
@@ -222,60 +152,36 @@ pub struct DrawnGradients<'a> {
     pub color: &'a Buffer<[f32; 3]>,
 }
 
-/// The backward stage: the gradients of what is learnt, laid out as the parameters are.
-#[derive(Debug)]
-pub struct ActivateBackward {
-    position: Buffer<f32>,
-    log_scale: Buffer<f32>,
-    quaternion: Buffer<f32>,
-    logit: Buffer<f32>,
-    harmonics: Buffer<f32>,
+/// The gradient's buffer of a parameter.
+fn gradient(parameter: &Parameter) -> &Buffer<f32> {
+    parameter.gradient.as_ref().expect("made before the way back is recorded")
 }
 
-impl ActivateBackward {
-    /// Buffers for the gradients of these Gaussians.
-    ///
-    /// # Errors
-    /// As [`Gpu::buffer`].
-    pub fn new(gpu: &Gpu, of: &Static) -> Result<Self, Error> {
-        let like = |parameter: &Parameter| gpu.buffer(parameter.names.gradient, parameter.value.len());
-        Ok(Self {
-            position: like(&of.position)?,
-            log_scale: like(&of.log_scale)?,
-            quaternion: like(&of.quaternion)?,
-            logit: like(&of.logit)?,
-            harmonics: like(&of.harmonics)?,
-        })
-    }
-
-    /// In the order of [`Static::parameters`].
-    pub fn gradients(&self) -> [&Buffer<f32>; 5] {
-        [&self.position, &self.log_scale, &self.quaternion, &self.logit, &self.harmonics]
-    }
-
-    /// Records the gradients, after [`Activate::record`] of the same Gaussians.
-    pub fn record(&self, rec: &mut Recorder<'_>, of: &Static, forward: &Activate, grad: DrawnGradients<'_>) {
-        let buffers = activate_backward::Buffers {
-            drawn: grad.drawn,
-            seen: &forward.seen,
-            scale: &forward.scale,
-            quaternion: &of.quaternion.value.view(),
-            opacity: &forward.opacity,
-            color: &forward.color,
-            grad_seen: grad.seen,
-            grad_scale: grad.scale,
-            grad_rotation: grad.rotation,
-            grad_opacity: grad.opacity,
-            grad_color: grad.color,
-            grad_position: &self.position.view(),
-            grad_log_scale: &self.log_scale.view(),
-            grad_quaternion: &self.quaternion.view(),
-            grad_logit: &self.logit,
-            grad_harmonics: &self.harmonics.view(),
-        };
-        let push = activate_backward::Push { count: of.count, coefficients: coefficients(of.degree) as u32 };
-        rec.run(activate_backward::Kernel, buffers, push, of.count);
-    }
+/// Records the gradients of what is learnt, after [`Activate::record`] of the same Gaussians.
+///
+/// # Panics
+/// When a parameter has no buffer for its gradient.
+pub fn backward(rec: &mut Recorder<'_>, of: &Static, forward: &Activate, grad: DrawnGradients<'_>) {
+    let buffers = activate_backward::Buffers {
+        drawn: grad.drawn,
+        seen: &forward.seen,
+        scale: &forward.scale,
+        quaternion: &of.quaternion.value.view(),
+        opacity: &forward.opacity,
+        color: &forward.color,
+        grad_seen: grad.seen,
+        grad_scale: grad.scale,
+        grad_rotation: grad.rotation,
+        grad_opacity: grad.opacity,
+        grad_color: grad.color,
+        grad_position: &gradient(&of.position).view(),
+        grad_log_scale: &gradient(&of.log_scale).view(),
+        grad_quaternion: &gradient(&of.quaternion).view(),
+        grad_logit: gradient(&of.logit),
+        grad_harmonics: &gradient(&of.harmonics).view(),
+    };
+    let push = activate_backward::Push { count: of.count, coefficients: coefficients(of.degree) as u32 };
+    rec.run(activate_backward::Kernel, buffers, push, of.count);
 }
 
 #[cfg(test)]
