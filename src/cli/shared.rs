@@ -6,6 +6,7 @@ use anyhow::{Context as _, bail};
 
 use crate::config::{Settings, SettingsArgs};
 use crate::gpu::{Descriptors, Form, Gpu, Options};
+use crate::model::config;
 use crate::multiview;
 use crate::scene::{self, Scene, synthetic};
 
@@ -167,6 +168,17 @@ pub fn add_dense(gpu: &Gpu, scene: &mut Scene, settings: &Settings) -> anyhow::R
         eprintln!("scene: {note}");
         scene.dense = points;
         scene.notes.push(note);
+    }
+    Ok(())
+}
+
+/// Refuses plain Gaussians for a command that knows anchors alone.
+///
+/// # Errors
+/// One sentence.
+pub fn only_anchors(settings: &Settings, command: &str) -> anyhow::Result<()> {
+    if settings.model.form == config::Form::Gaussians {
+        bail!("{command} measures models of anchors alone: leave out model.form=\"gaussians\"");
     }
     Ok(())
 }

@@ -23,6 +23,7 @@ use crate::model::files;
 use crate::model::gaussians::Static;
 pub use crate::model::gaussians::{Cloud, logit, sigmoid};
 pub use crate::model::ply;
+use crate::model::stored::Stored;
 use crate::render::view::Renderer;
 use crate::scene::{Camera, Scene};
 
@@ -137,6 +138,46 @@ pub struct Export {
     pub larger: f64,
 }
 
+/// Plain Gaussians as they are, in the cloud's axes: nothing is baked, refined or pruned. Those thinner than the pixels of
+/// the training are widened for larger pictures, see [`low_pass`].
+///
+/// # Errors
+/// When the device has no room, or is lost.
+pub fn of_gaussians(
+    gpu: &Gpu,
+    cloud: &Cloud,
+    scene: &Scene,
+    settings: &Settings,
+    options: &Options,
+    observer: &mut dyn Observer,
+) -> Result<Export, Error> {
+    let background = settings.train.background.map(|channel| channel as f32);
+    let train: Vec<Camera> = scene.train.iter().map(|view| view.camera).collect();
+    let turn = if options.upright { up::upright(&train) } else { DMat3::IDENTITY };
+    let turned = |camera: &Camera| up::turn_camera(camera, turn);
+    let held_out = poses::virtual_views(&train, HELD_OUT, !options.seed);
+    let tests = if scene.test.is_empty() { held_out.len() } else { scene.test.len() };
+    observer.begin("drawing the Gaussians to compare with", tests as u64);
+    let model = Stored::Gaussians(cloud.clone());
+    let mut renderer = Renderer::of(gpu, &model, &settings.render, background)?;
+    let yardstick = measure::Yardstick::new(&mut renderer, scene, &held_out, turned, || observer.turn(""))?;
+    let losses = vec![("Gaussians".to_owned(), yardstick.of_anchors()?)];
+    let mut cloud = cloud.clone();
+    if options.upright {
+        cloud.turn(turn);
+    }
+    let larger = larger(options, &train);
+    low_pass::widen(&mut cloud, &train.iter().map(turned).collect::<Vec<_>>(), larger);
+    let gaussians = [cloud.len(); 2];
+    Ok(Export { cloud, turn, yardstick, losses, poses: [0, 0], gaussians, larger })
+}
+
+/// How many times larger than the training's pictures the scene will be looked at.
+fn larger(options: &Options, train: &[Camera]) -> f64 {
+    let longest = train.iter().flat_map(|camera| camera.size).max().unwrap_or(1);
+    (f64::from(options.screen) / f64::from(longest)).max(1.0)
+}
+
 /// Bakes, refines and prunes.
 ///
 /// # Errors
@@ -197,8 +238,7 @@ pub fn make(
     }
     cloud = drawer.gaussians.read(gpu)?;
     cloud.retain(&shares.iter().map(|share| *share > SEEN).collect::<Vec<_>>());
-    let longest = train.iter().flat_map(|camera| camera.size).max().unwrap_or(1);
-    let larger = (f64::from(options.screen) / f64::from(longest)).max(1.0);
+    let larger = larger(options, &train);
     low_pass::widen(&mut cloud, &train.iter().map(turned).collect::<Vec<_>>(), larger);
     Ok(Export { cloud, turn, yardstick, losses, poses: [looked.len(), between.len()], gaussians, larger })
 }

@@ -2,9 +2,10 @@
 
 use glam::{DMat3, DQuat, DVec3};
 
-use super::parameter::{Parameter, names};
+use super::parameter::{Names, Parameter, names};
 use crate::gpu::{Error, Gpu};
-use crate::math::harmonics::coefficients;
+use crate::math::harmonics::{coefficients, turned};
+use crate::optimizer::Group;
 
 /// Shortest quaternion that is normalised to length one.
 pub(crate) const NORM_EPSILON: f64 = 1e-12;
@@ -57,12 +58,43 @@ impl Cloud {
         kept(&mut self.harmonics, keep, each);
     }
 
+    /// Counts lengths in units of which `unit` make one of those they are counted in now.
+    pub fn rescale(&mut self, unit: f64) {
+        if unit != 1.0 {
+            let log = unit.ln();
+            self.position.iter_mut().for_each(|p| *p = p.map(|x| (f64::from(x) * unit) as f32));
+            self.log_scale.iter_mut().for_each(|s| *s = s.map(|x| (f64::from(x) + log) as f32));
+        }
+    }
+
+    /// The first value that is not finite: the PLY attribute's name without its number, the Gaussian, the value.
+    pub fn first_not_finite(&self) -> Option<(&'static str, usize, f32)> {
+        let each = coefficients(self.degree);
+        let arrays: [(&str, &[f32], usize); 5] = [
+            ("xyz", self.position.as_flattened(), 3),
+            ("scale", self.log_scale.as_flattened(), 3),
+            ("rot", self.rotation.as_flattened(), 4),
+            ("opacity", &self.logit, 1),
+            ("f_dc or f_rest", self.harmonics.as_flattened(), 3 * each),
+        ];
+        arrays.into_iter().find_map(|(name, values, width)| {
+            let at = values.iter().position(|v| !v.is_finite())?;
+            Some((name, at / width, values[at]))
+        })
+    }
+
     /// The same Gaussians in axes turned by a rotation matrix.
-    ///
-    /// # Panics
-    /// With harmonics beyond degree 0, which are to be fitted in the axes they are written in.
     pub fn turn(&mut self, by: DMat3) {
-        assert_eq!(self.degree, 0, "harmonics are not turned");
+        let each = coefficients(self.degree);
+        if each > 1 {
+            let matrix = turned(|d| (by * DVec3::from_array(d)).to_array());
+            for of in self.harmonics.chunks_exact_mut(each) {
+                let before: Vec<[f64; 3]> = of.iter().map(|rgb| rgb.map(f64::from)).collect();
+                for (k, rgb) in of.iter_mut().enumerate().skip(1) {
+                    *rgb = std::array::from_fn(|c| (0..each).map(|j| matrix[k][j] * before[j][c]).sum::<f64>() as f32);
+                }
+            }
+        }
         let turn = DQuat::from_mat3(&by);
         for position in &mut self.position {
             *position = (by * DVec3::from_array(position.map(f64::from))).to_array().map(|v| v as f32);
@@ -86,11 +118,25 @@ pub fn logit(opacity: f64) -> f32 {
     (o / (1.0 - o)).ln() as f32
 }
 
+/// Multiplies the coefficients beyond the first of each Gaussian.
+fn scale_higher(harmonics: &mut [[f32; 3]], each: usize, by: f64) {
+    if by != 1.0 {
+        let higher = harmonics.iter_mut().enumerate().filter(|(k, _)| k % each > 0);
+        higher.for_each(|(_, rgb)| *rgb = rgb.map(|v| (f64::from(v) * by) as f32));
+    }
+}
+
+/// Names of what is learnt, in the order of [`Static::parameters`].
+pub(crate) const NAMES: [Names; 5] =
+    [names!("position"), names!("log_scale"), names!("quaternion"), names!("logit"), names!("harmonics")];
+
 /// What is learnt of static Gaussians, with Adam's moments.
 #[derive(Debug)]
 pub struct Static {
-    /// Gaussians.
+    /// Gaussians in use.
     pub count: u32,
+    /// Gaussians there is room for.
+    pub capacity: u32,
     /// Highest degree of the harmonics.
     pub degree: u32,
     /// 3 per Gaussian, world.
@@ -101,29 +147,54 @@ pub struct Static {
     pub quaternion: Parameter,
     /// 1 per Gaussian, logit of the opacity.
     pub logit: Parameter,
-    /// 3 per coefficient, `(degree + 1)^2` coefficients per Gaussian.
+    /// 3 per coefficient, `(degree + 1)^2` coefficients per Gaussian; those beyond the first divided by `higher`.
     pub harmonics: Parameter,
+    /// What a coefficient beyond the first is of what is learnt of it. A step of Adam has a length of its own whatever the
+    /// gradient's: it moves these coefficients by so much less.
+    pub higher: f32,
 }
 
 impl Static {
-    /// These Gaussians on the device, moments zero.
+    /// These Gaussians on the device, moments zero, every coefficient learnt at the same rate.
     ///
     /// # Errors
     /// As [`Gpu::buffer`].
     pub fn upload(gpu: &Gpu, cloud: &Cloud) -> Result<Self, Error> {
+        Self::with_room(gpu, cloud, 0, 1.0)
+    }
+
+    /// These Gaussians on the device, moments zero, with room for at least `capacity`; coefficients beyond the first are
+    /// learnt at `higher` times the rate of the first.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub fn with_room(gpu: &Gpu, cloud: &Cloud, capacity: u32, higher: f32) -> Result<Self, Error> {
         let count = cloud.len() as u32;
-        let each = coefficients(cloud.degree) as u32;
-        let rows = count.max(1);
-        let parameter = |names, width, data: &[f32]| Parameter::upload(gpu, names, width, rows, data);
+        let each = coefficients(cloud.degree);
+        let capacity = capacity.max(count).max(1);
+        let parameter = |group, names, width, data: &[f32]| {
+            Ok::<_, Error>(Parameter::upload(gpu, names, width, capacity, data)?.in_group(group))
+        };
+        let mut harmonics = cloud.harmonics.clone();
+        scale_higher(&mut harmonics, each, 1.0 / f64::from(higher));
         Ok(Self {
             count,
+            capacity,
             degree: cloud.degree,
-            position: parameter(names!("position"), 3, cloud.position.as_flattened())?,
-            log_scale: parameter(names!("log_scale"), 3, cloud.log_scale.as_flattened())?,
-            quaternion: parameter(names!("quaternion"), 4, cloud.rotation.as_flattened())?,
-            logit: parameter(names!("logit"), 1, &cloud.logit)?,
-            harmonics: parameter(names!("harmonics"), 3 * each, cloud.harmonics.as_flattened())?,
+            position: parameter(Group::Position, NAMES[0], 3, cloud.position.as_flattened())?,
+            log_scale: parameter(Group::LogScale, NAMES[1], 3, cloud.log_scale.as_flattened())?,
+            quaternion: parameter(Group::Quaternion, NAMES[2], 4, cloud.rotation.as_flattened())?,
+            logit: parameter(Group::Opacity, NAMES[3], 1, &cloud.logit)?,
+            harmonics: parameter(Group::Harmonics, NAMES[4], 3 * each as u32, harmonics.as_flattened())?,
+            higher,
         })
+    }
+
+    /// As many Gaussians of this degree as one binding of the device holds of every array, and a `u32` counts.
+    pub fn most(gpu: &Gpu, degree: u32) -> u32 {
+        // The widest array, less what rounding to whole vectors may add.
+        let widest = 4 * (3 * coefficients(degree) as u64).max(4);
+        ((gpu.info().max_binding_bytes.min(u32::MAX.into()) - 48) / widest) as u32
     }
 
     /// Position, log-scale, quaternion, logit, harmonics.
@@ -147,13 +218,15 @@ impl Static {
             let norm = q.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt().max(NORM_EPSILON);
             q.map(|v| (f64::from(v) / norm) as f32)
         };
+        let mut harmonics = triples(read(&self.harmonics)?);
+        scale_higher(&mut harmonics, coefficients(self.degree), self.higher.into());
         Ok(Cloud {
             position: triples(read(&self.position)?),
             log_scale: triples(read(&self.log_scale)?),
             rotation: read(&self.quaternion)?.as_chunks().0.iter().map(unit).collect(),
             logit: read(&self.logit)?,
             degree: self.degree,
-            harmonics: triples(read(&self.harmonics)?),
+            harmonics,
         })
     }
 }

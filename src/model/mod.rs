@@ -1,4 +1,4 @@
-//! What is learnt: anchors, decoder, attention; files on disk.
+//! What is learnt: anchors, decoder and attention, or plain Gaussians; files on disk.
 
 pub mod anchors;
 pub mod arrays;
@@ -7,7 +7,9 @@ pub mod config;
 pub mod files;
 pub mod gaussians;
 pub mod init;
+pub mod learnt;
 pub mod parameter;
 pub mod ply;
+pub mod stored;
 
 pub use config::Config;

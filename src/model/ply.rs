@@ -53,6 +53,13 @@ pub fn encode(cloud: &Cloud) -> Vec<u8> {
     bytes
 }
 
+/// Whether these are the first bytes of a PLY file of Gaussians, of whatever program: it has colours as harmonics.
+pub fn is_gaussians(bytes: &[u8]) -> bool {
+    let head = &bytes[..bytes.len().min(1 << 16)];
+    let end = head.windows(10).position(|w| w == b"end_header").unwrap_or(head.len());
+    String::from_utf8_lossy(&head[..end]).lines().any(|line| line.trim_end().ends_with(" f_dc_0"))
+}
+
 /// Reads what [`encode`] wrote; harmonics have the lowest degree that holds all that are not 0.
 ///
 /// # Errors

@@ -38,7 +38,8 @@ impl Reference for activate::Kernel {
             let h = harmonics(direction(wide(seen)));
             let of = &host.harmonics[i * each..(i + 1) * each];
             host.color[i] = std::array::from_fn(|c| {
-                (0.5 + of.iter().zip(h).map(|(of, h)| f64::from(of[c]) * h).sum::<f64>()).max(0.0) as f32
+                let term = |k: usize| f64::from(of[k][c]) * h[k] * if k > 0 { f64::from(push.higher) } else { 1.0 };
+                (0.5 + (0..each).map(term).sum::<f64>()).max(0.0) as f32
             });
         }
     }
@@ -68,7 +69,8 @@ impl Reference for activate_backward::Kernel {
             let h = harmonics(direction(wide(host.seen[i])));
             for (k, to) in host.grad_harmonics[i * each..(i + 1) * each].iter_mut().enumerate() {
                 let cut = |c: usize| host.color[i][c] <= 0.0;
-                *to = std::array::from_fn(|c| if cut(c) { 0.0 } else { (h[k] * of(host.grad_color[i][c])) as f32 });
+                let h = h[k] * if k > 0 { f64::from(push.higher) } else { 1.0 };
+                *to = std::array::from_fn(|c| if cut(c) { 0.0 } else { (h * of(host.grad_color[i][c])) as f32 });
             }
         }
     }
@@ -130,7 +132,8 @@ impl Activate {
             opacity: &self.opacity,
             color: &self.color,
         };
-        let push = activate::Push { center, center_low, count: of.count, coefficients: coefficients(of.degree) as u32 };
+        let coefficients = coefficients(of.degree) as u32;
+        let push = activate::Push { center, center_low, count: of.count, coefficients, higher: of.higher };
         rec.run(activate::Kernel, buffers, push, of.count);
     }
 }
@@ -180,7 +183,8 @@ pub fn backward(rec: &mut Recorder<'_>, of: &Static, forward: &Activate, grad: D
         grad_logit: gradient(&of.logit),
         grad_harmonics: &gradient(&of.harmonics).view(),
     };
-    let push = activate_backward::Push { count: of.count, coefficients: coefficients(of.degree) as u32 };
+    let coefficients = coefficients(of.degree) as u32;
+    let push = activate_backward::Push { count: of.count, coefficients, higher: of.higher };
     rec.run(activate_backward::Kernel, buffers, push, of.count);
 }
 
@@ -193,6 +197,7 @@ mod tests {
     use crate::gpu::testing::{self, UNWRITTEN};
 
     const CENTER: [f64; 3] = [0.4, -1.2, 2.5];
+    const HIGHER: f32 = 0.75;
 
     fn case(rng: &mut Pcg64, n: usize, degree: u32) -> activate::Arrays {
         let each = coefficients(degree);
@@ -215,7 +220,8 @@ mod tests {
 
     fn push(n: usize, degree: u32) -> activate::Push {
         let [center, center_low] = split(CENTER);
-        activate::Push { center, center_low, count: n as u32, coefficients: coefficients(degree) as u32 }
+        let coefficients = coefficients(degree) as u32;
+        activate::Push { center, center_low, count: n as u32, coefficients, higher: HIGHER }
     }
 
     fn backward_case(rng: &mut Pcg64, forward: &activate::Arrays, degree: u32) -> activate_backward::Arrays {
@@ -259,7 +265,8 @@ mod tests {
                 backward.grad_scale[i] = [f32::NAN; 3];
                 backward.grad_color[i] = [f32::NAN; 3];
             }
-            let push = activate_backward::Push { count: n as u32, coefficients: coefficients(degree) as u32 };
+            let coefficients = coefficients(degree) as u32;
+            let push = activate_backward::Push { count: n as u32, coefficients, higher: HIGHER };
             testing::assert_twin(activate_backward::Kernel, &gpu, backward, push, n);
         }
     }
@@ -277,7 +284,7 @@ mod tests {
         let mut grad = backward_case(&mut rng, &there, degree);
         grad.drawn = vec![1; n];
         grad.grad_seen = vec![[0.0; 3]; n];
-        let push = activate_backward::Push { count: n as u32, coefficients: 16 };
+        let push = activate_backward::Push { count: n as u32, coefficients: 16, higher: HIGHER };
         let got = testing::run_twin(activate_backward::Kernel, (), grad.clone(), push);
         let value = |at: &activate::Arrays, i: usize| -> f64 {
             let out = forward(at, n, degree);
