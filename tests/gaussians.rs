@@ -59,7 +59,8 @@ fn a_run_learns_and_is_the_same_again() {
     let mean = |steps: &[Progress]| steps.iter().map(|p| f64::from(p.loss)).sum::<f64>() / steps.len() as f64;
     let (first, last) = (mean(&watch.steps[..6]), mean(&watch.steps[84..]));
     assert!(last < 0.7 * first, "{first} to {last}");
-    assert_eq!(watch.lines.len(), 5, "{:?}", watch.lines);
+    let rounds = watch.lines.iter().filter(|line| line.contains("faded Gaussians moved"));
+    assert_eq!(rounds.count(), 5, "{:?}", watch.lines);
     assert_eq!(watch.steps[89].anchors, 330, "as many as there may be");
     assert!(watch.steps.iter().all(|p| p.visible == p.anchors && p.gaussians > 0));
     // Again, and with room for too few pairs at first.
@@ -113,8 +114,10 @@ fn every_pass_agrees_with_its_reference() {
     testing::gpu_in_both_forms().for_each(|gpu| {
         let (scene, settings) = (common::tiny(), settings(20));
         let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
-        for step in 1..=6 {
-            if ![1, 4, 5].contains(&step) {
+        for step in 1..=9 {
+            // Round ones, as all are before the first step, have no gradient of their rotation but roundings. 4 is the
+            // reference view.
+            if ![4, 9].contains(&step) {
                 run.run_one(step).expect("a step");
                 continue;
             }

@@ -245,6 +245,7 @@ pub fn make(
 
 #[cfg(test)]
 pub(crate) mod tests {
+    use glam::DVec3;
     use rand::{RngExt as _, SeedableRng as _};
     use rand_pcg::Pcg64;
 
