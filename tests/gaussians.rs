@@ -112,12 +112,13 @@ fn a_run_goes_on_to_the_same_bytes() {
 #[test]
 fn every_pass_agrees_with_its_reference() {
     testing::gpu_in_both_forms().for_each(|gpu| {
-        let (scene, settings) = (common::tiny(), settings(20));
+        let (scene, mut settings) = (common::tiny(), settings(20));
+        // The gradient of a nearly round one's rotation is what roundings leave of terms that cancel: none stays round.
+        settings.optimizer.learning_rate.log_scale = [0.1, 0.1];
         let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
-        for step in 1..=9 {
-            // Round ones, as all are before the first step, have no gradient of their rotation but roundings. 4 is the
-            // reference view.
-            if ![4, 9].contains(&step) {
+        for step in 1..=10 {
+            // Of the second round over the views; 10 is the reference view.
+            if ![9, 10].contains(&step) {
                 run.run_one(step).expect("a step");
                 continue;
             }

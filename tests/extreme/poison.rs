@@ -164,14 +164,14 @@ fn moments(gpu: &Gpu) {
     let setup = Setup::new();
     let tensors = |run: &Run<'_>| -> Vec<[Buffer<f32>; 3]> {
         let step = run.step();
-        let parameters = step.parameters().into_iter();
+        let parameters = step.learnt.rows().into_iter().chain(step.learnt.weights());
         parameters.map(|p| p.tensors().map(Buffer::view)).collect()
     };
     // Room for anchors to come, and what fills a buffer up to whole vectors, holds whatever it holds.
     let read = |run: &Run<'_>| -> Vec<Vec<u32>> {
         let step = run.step();
-        let of_anchors = step.anchors.parameters().iter().map(|p| (step.anchors.count * p.width) as usize);
-        let lengths = of_anchors.chain([step.weights.width as usize]);
+        let of_anchors = step.learnt.rows().into_iter().map(|p| (step.learnt.count() * p.width) as usize);
+        let lengths = of_anchors.chain(step.learnt.weights().map(|weights| weights.width as usize));
         let words = |(tensors, n): ([Buffer<f32>; 3], usize)| {
             tensors.map(|buffer| bits(&gpu.read_range(&buffer, n).expect("read")))
         };
