@@ -219,7 +219,7 @@ fn whole_run(gpu: &Gpu) {
             let mut run = setup.run(gpu);
             run.run_one(1).expect("a step");
             let step = run.step();
-            let n = step.anchors.count as usize;
+            let n = step.anchors().count as usize;
             // Every seventh anchor, or every 97th weight.
             let spread = |buffer: &Buffer<f32>, width: usize, n: usize, every: usize| {
                 let mut data = gpu.read(buffer).expect("read");
@@ -229,16 +229,19 @@ fn whole_run(gpu: &Gpu) {
                 gpu.write(buffer, &data).expect("write");
             };
             match what {
-                0 => spread(&step.anchors.position.view(), 3, n, 7),
+                0 => spread(&step.anchors().position.view(), 3, n, 7),
                 w @ 1..=3 => {
-                    let p = &step.anchors.parameters()[w - 1];
+                    let p = &step.anchors().parameters()[w - 1];
                     spread(&p.value, p.width as usize, n, 7);
                 }
                 w @ 4..=5 => {
-                    let p = step.anchors.feature();
+                    let p = step.anchors().feature();
                     spread(p.tensors()[w - 3], p.width as usize, n, 7);
                 }
-                w => spread(step.weights.tensors()[w - 6], 1, step.weights.width as usize, 97),
+                w => {
+                    let weights = step.learnt.weights().expect("decoders");
+                    spread(weights.tensors()[w - 6], 1, weights.width as usize, 97)
+                }
             }
             let folder = tempfile::tempdir().expect("a temporary folder");
             match run.train(folder.path(), &mut Silent) {
