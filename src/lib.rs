@@ -14,6 +14,7 @@
 //! | word | means |
 //! | --- | --- |
 //! | anchor | a point of the scene with a feature, from which the decoders make its Gaussians |
+//! | plain Gaussian | one that is learnt by itself, in a model without anchors (`model.form`) |
 //! | slot | the place of one Gaussian of one anchor: anchor x offsets + offset |
 //! | form | which kernels run where two exist: those for GPUs or those for CPU drivers ([`gpu::Form`]) |
 //! | tile | a square of pixels that one workgroup draws |

@@ -4,13 +4,13 @@ use crate::losses::Term;
 
 /// Training pictures and depth priors.
 pub const PICTURES: &str = "pictures";
-/// Anchors and decoders, with the optimiser's moments.
+/// Anchors and decoders, or plain Gaussians, with the optimiser's moments.
 pub const MODEL: &str = "model";
 /// The list of visible anchors.
 pub const CULL: &str = "cull";
 /// Cross-attention, both ways.
 pub const ATTENTION: &str = "attention";
-/// Anchors to Gaussians.
+/// The model to the Gaussians of a view: anchors decoded, or plain Gaussians activated.
 pub const DECODE: &str = "decode";
 /// Gaussians to the picture plane.
 pub const PROJECT: &str = "project";
@@ -30,7 +30,7 @@ pub const STATISTICS: &str = "statistics";
 pub const OPTIMIZER: &str = "adam";
 /// The search for values that are not finite.
 pub const SENTINEL: &str = "sentinel";
-/// Growing and pruning of anchors.
+/// Growing and pruning of anchors, or moving and adding of plain Gaussians.
 pub const GROWTH: &str = "grow and prune";
 /// Test views.
 pub const EVALUATION: &str = "evaluation";

@@ -63,6 +63,7 @@ fn rehearsed(gpu: &Gpu, scene: &Scene, settings: &Settings) -> Forecast {
     let anchors = initial.anchors.position.len() as u32;
     // Numbers like those of the scene: which stages there are does not depend on them.
     let survey = Survey { anchors, visible: anchors, pairs: 4000 };
+    let initial = forecast::Beginning::Anchors(initial);
     forecast::rehearse(gpu, scene, settings, &initial, survey, anchors + anchors / 4, None).expect("a rehearsal")
 }
 

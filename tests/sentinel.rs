@@ -162,10 +162,10 @@ fn what_breaks_without_a_cause_is_not_kept_and_can_be_gone_on_from() {
 
     type Pick = fn(&Run<'_>) -> Buffer<f32>;
     let cases: [(&str, Pick, f32); 4] = [
-        ("a feature", |run| run.step().anchors.feature().value.view(), f32::NAN),
-        ("an offset", |run| run.step().anchors.offset().value.view(), f32::NEG_INFINITY),
-        ("a first moment", |run| run.step().anchors.log_scaling().first.view(), f32::INFINITY),
-        ("a decoder's weight", |run| run.step().weights.value.view(), f32::INFINITY),
+        ("a feature", |run| run.step().anchors().feature().value.view(), f32::NAN),
+        ("an offset", |run| run.step().anchors().offset().value.view(), f32::NEG_INFINITY),
+        ("a first moment", |run| run.step().anchors().log_scaling().first.view(), f32::INFINITY),
+        ("a decoder's weight", |run| run.step().learnt.weights().expect("decoders").value.view(), f32::INFINITY),
     ];
     for (name, pick, value) in cases {
         let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");

@@ -54,7 +54,7 @@ fn train(gpu: &Gpu, scene: &Scene, settings: &Settings, capacity: Option<Capacit
     let folder = tempfile::tempdir().expect("a temporary folder");
     let mut run = Run::new(gpu, scene, settings).expect("the device has room");
     if let Some(capacity) = capacity {
-        run.resize(Capacity { anchors: run.step().anchors.capacity, ..capacity }).expect("the device has room");
+        run.resize(Capacity { anchors: run.step().learnt.capacity(), ..capacity }).expect("the device has room");
     }
     let mut watch = Watch::default();
     let summary = run.train(folder.path(), &mut watch).expect("a run");

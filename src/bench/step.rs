@@ -195,8 +195,8 @@ fn trace(gpu: &Gpu, bench: &mut Bench, settings: &Settings, view: usize) -> Resu
     let schedule = bench.clock(gpu, view)?.schedule;
     let words = bench.trace(gpu, view, &counts::WANTED)?;
     let known = Known {
-        anchors: bench.step.anchors.count,
-        offsets: bench.step.anchors.offsets,
+        anchors: bench.step.anchors().count,
+        offsets: bench.step.anchors().offsets,
         size: bench.size(view),
         gradient_scales: settings.losses.depth.gradient.scales,
     };

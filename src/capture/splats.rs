@@ -76,16 +76,16 @@ impl Splats {
         camera: &Camera,
         work: impl Fn(&mut Recorder<'_>, &Stages<Canvas>, Binned<'_>),
     ) -> Result<&Stages<Canvas>, Error> {
-        self.session.run(Model { anchors: &self.anchors, weights: &self.weights }, camera, work)
+        self.session.run(Model::Anchors { anchors: &self.anchors, weights: &self.weights }, camera, work)
     }
 
     /// Runs the forward stages for a camera; returns the slots of the Gaussians that exist, with their names.
     fn decode(&mut self, camera: &Camera) -> Result<Vec<(u32, u32)>, Error> {
         let (gpu, offsets) = (self.gpu.clone(), self.anchors.offsets);
         let forward = &self.run(camera, |_, _, _| {})?.forward;
-        let visible = gpu.read(&forward.visible.count)?[0];
-        let list = gpu.read_range(&forward.visible.list, visible as usize)?;
-        let existing = &forward.decode.existing;
+        let visible = gpu.read(&forward.visible().count)?[0];
+        let list = gpu.read_range(&forward.visible().list, visible as usize)?;
+        let existing = &forward.decode().existing;
         let count = gpu.read(&existing.count)?[0] as usize;
         let named = |slot: u32| (slot, list[(slot % visible) as usize] * offsets + slot / visible);
         Ok(gpu.read_range(&existing.list, count)?.into_iter().map(named).collect())
@@ -97,7 +97,7 @@ impl Splats {
     /// When the device has no room, or is lost.
     pub fn colors(&mut self, camera: &Camera) -> Result<Vec<(u32, [f32; 3])>, Error> {
         let names = self.decode(camera)?;
-        let colors = self.gpu.read(&self.session.stages().forward.decode.color)?;
+        let colors = self.gpu.read(&self.session.stages().forward.decode().color)?;
         Ok(names.into_iter().map(|(slot, name)| (name, colors[slot as usize])).collect())
     }
 
@@ -146,8 +146,8 @@ impl Splats {
         let names = self.decode(camera)?;
         let gpu = self.gpu.clone();
         let Stages { forward, own: Canvas { color, opacity, .. }, .. } = self.session.stages();
-        let mut colors = gpu.read(&forward.decode.color)?;
-        let mut opacities = gpu.read(&forward.decode.opacity)?;
+        let mut colors = gpu.read(&forward.decode().color)?;
+        let mut opacities = gpu.read(&forward.decode().opacity)?;
         for (slot, name) in names {
             let slot = slot as usize;
             match look(name, colors[slot]) {

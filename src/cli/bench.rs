@@ -6,7 +6,7 @@ use anyhow::{Context as _, bail};
 
 use super::next;
 use super::report::{command_line, last_part};
-use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, add_dense, load_scene, with_gpu};
+use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, add_dense, load_scene, only_anchors, with_gpu};
 use crate::bench::ceilings::Prober;
 use crate::bench::compare::{self, Subject};
 use crate::bench::{self, Device, Record, Trained, figures, loads, predict, tables, text};
@@ -85,6 +85,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let old = args.against.as_deref().map(|path| Ok::<_, compare::Error>((path, compare::read(path)?))).transpose()?;
     let peaks = args.predict.as_deref().map(predict::read).transpose()?.unwrap_or_default();
     let settings = args.settings.resolve()?;
+    only_anchors(&settings, "bench")?;
     let loaded = args
         .scene
         .clone()

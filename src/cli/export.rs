@@ -14,7 +14,7 @@ use super::shared::{self, DeviceArgs};
 use crate::config::{Settings, Source};
 use crate::export::{self, Cloud, Export, Observer, Options, gltf, low_pass, measure, ply, spz, up};
 use crate::folder::{self, Lock};
-use crate::model;
+use crate::model::stored::Stored;
 use crate::render::widen;
 use crate::scene::{Camera, Scene, path};
 
@@ -33,6 +33,8 @@ pub(super) const STEM: &str = "scene";
 ///
 /// scene.ply is the file of 3D Gaussian Splatting (62 floats), scene.spz Niantic's SPZ of version 3, scene.glb glTF with
 /// KHR_gaussian_splatting. Up is -y in the first two and +y in the last.
+///
+/// A model of plain Gaussians (model.form) is neither baked nor refined: it is written as it is.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   gscream-vk export runs/garden
@@ -112,7 +114,7 @@ impl Format {
 
     fn decode(self, bytes: &[u8]) -> Result<Cloud, export::Error> {
         match self {
-            Self::Ply => ply::decode(bytes),
+            Self::Ply => ply::decode(bytes).map_err(export::Error::Format),
             Self::Spz => spz::decode(bytes),
             Self::Glb => gltf::decode(bytes),
         }
@@ -241,7 +243,16 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let origin = Origin::find(&args.model)?;
     let file = args.config.iter().cloned().map(Source::File);
     let mut settings = origin.settings(file.chain(args.set.iter().cloned().map(Source::Set)).collect())?;
-    let model = model::files::load(&origin.model())?;
+    let model = Stored::load(&origin.model())?;
+    let given = [args.degree, args.views, args.steps];
+    let usual = Options::default();
+    if matches!(model, Stored::Gaussians(_)) && given != [usual.degree, usual.views, usual.steps] {
+        bail!(
+            "{}: its model is of plain Gaussians, which are written as they are: leave out --degree, --views and --steps, \
+             which belong to baking anchors",
+            args.model.display()
+        );
+    }
     let own = origin.scene().map(Path::new);
     let scene = args.scene.as_deref().or(own).with_context(|| {
         format!("{}: a model alone does not know its cameras; name the scene with --scene", args.model.display())
@@ -270,7 +281,12 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             seed: settings.train.seed,
         };
         let mut bars = Bars::default();
-        let made = export::make(gpu, (&model.0, &model.1), &scene, &settings, &options, &mut bars);
+        let made = match &model {
+            Stored::Anchors(anchors, weights) => {
+                export::make(gpu, (anchors, weights), &scene, &settings, &options, &mut bars)
+            }
+            Stored::Gaussians(cloud) => export::of_gaussians(gpu, cloud, &scene, &settings, &options, &mut bars),
+        };
         bars.end();
         let mut made = made?;
         // All files are made before the first is written.
@@ -358,15 +374,19 @@ fn size(bytes: usize) -> String {
 
 fn report(made: &Export, figures: &Figures, formats: &[Format]) {
     println!("{}", measure::table(&made.losses));
-    println!(
-        "measured on {}; {} Gaussians, of {} baked from {} training and {} virtual cameras; {:.0} s",
-        figures.measured_on,
-        figures.gaussians,
-        figures.gaussians_baked,
-        figures.train_views,
-        figures.virtual_views,
-        figures.seconds
-    );
+    if made.poses == [0, 0] {
+        println!("measured on {}; {} Gaussians; {:.0} s", figures.measured_on, figures.gaussians, figures.seconds);
+    } else {
+        println!(
+            "measured on {}; {} Gaussians, of {} baked from {} training and {} virtual cameras; {:.0} s",
+            figures.measured_on,
+            figures.gaussians,
+            figures.gaussians_baked,
+            figures.train_views,
+            figures.virtual_views,
+            figures.seconds
+        );
+    }
     if widen::variance(made.larger) > 0.0 {
         println!(
             "widened for pictures of {} pixels, {:.1} times the training's size; the files were drawn {} times as large",

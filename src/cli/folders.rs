@@ -3,7 +3,7 @@
 //! ```text
 //! RUN/run.json        version, device, scene and command line: see `Record`
 //! RUN/settings.toml   every setting of the run, resolved; --config reads it
-//! RUN/model/          point_cloud.ply and weights.safetensors
+//! RUN/model/          point_cloud.ply, and of anchors weights.safetensors
 //! RUN/log.jsonl       losses, counts and speed, a JSON object per line
 //! RUN/test/NAME.png   the test views as rendered at the end
 //! RUN/seen/NAME.png   white where some train view photographed what they show
@@ -20,6 +20,7 @@ use anyhow::{Context as _, bail};
 use serde::{Deserialize, Serialize};
 
 use crate::config::{Error as SettingsError, Settings, Source};
+use crate::model::config::Form;
 use crate::model::files::POINT_CLOUD;
 
 /// The record's file within a run folder.
@@ -58,19 +59,25 @@ pub struct Asked {
     voxel: f64,
     voxel_factor: f64,
     max_anchors: u32,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    max_gaussians: Option<u32>,
 }
 
 impl Asked {
     /// Those of these settings.
     pub fn of(settings: &Settings) -> Self {
         let Settings { model, densify, .. } = settings;
-        Self { voxel: model.voxel, voxel_factor: model.voxel_factor, max_anchors: densify.max_anchors }
+        let max_gaussians = (model.form == Form::Gaussians).then_some(densify.max_gaussians);
+        Self { voxel: model.voxel, voxel_factor: model.voxel_factor, max_anchors: densify.max_anchors, max_gaussians }
     }
 
     /// Undoes the reduction.
     pub fn restore(&self, settings: &mut Settings) {
         (settings.model.voxel, settings.model.voxel_factor) = (self.voxel, self.voxel_factor);
         settings.densify.max_anchors = self.max_anchors;
+        if let Some(most) = self.max_gaussians {
+            settings.densify.max_gaussians = most;
+        }
     }
 }
 

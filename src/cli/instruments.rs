@@ -9,7 +9,7 @@ use super::{index, pictures};
 use crate::config::Settings;
 use crate::evaluate::{Judge, Report, Residue, Shown, Surface, hole, seen_map};
 use crate::gpu::Gpu;
-use crate::model;
+use crate::model::stored::Stored;
 use crate::render::view::{Rendered, Renderer};
 use crate::scene::{Scene, View};
 
@@ -69,10 +69,10 @@ pub(super) fn measure(
     judge: &Judge,
     go_on: &dyn Fn() -> anyhow::Result<()>,
 ) -> anyhow::Result<Measured> {
-    let (mut anchors, mut weights) = model::files::load(folder)?;
-    model::files::rescale(&mut anchors, &mut weights, 1.0 / scene.unit);
+    let mut model = Stored::load(folder)?;
+    model.rescale(1.0 / scene.unit);
     let background = settings.train.background.map(|channel| channel as f32);
-    let mut renderer = Renderer::new(gpu, &anchors, &weights, &settings.render, background)?;
+    let mut renderer = Renderer::of(gpu, &model, &settings.render, background)?;
     let style = ProgressStyle::with_template("judging {wide_bar} {pos}/{len} views, {eta} left")?;
     let bar = ProgressBar::new((scene.train.len() + scene.test.len()) as u64).with_style(style);
     let mut draw = |views: &[View]| -> anyhow::Result<Vec<Drawn>> {

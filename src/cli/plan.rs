@@ -303,8 +303,12 @@ impl Shown<'_> {
             Ok(f) => {
                 let survey = f.survey;
                 line(format!(
-                    "  {} anchors at first, {} assumed at the end; in a view at most {} of them and {} (Gaussian, tile) pairs",
-                    survey.anchors, f.anchors, survey.visible, survey.pairs
+                    "  {} {} at first, {} assumed at the end; in a view at most {} of them and {} (Gaussian, tile) pairs",
+                    survey.anchors,
+                    f.form.rows(),
+                    f.anchors,
+                    survey.visible,
+                    survey.pairs
                 ));
                 for m in &f.moments {
                     line(format!("  step {:<8} {:<26} {:>12} bytes, peak {:>12}", m.step, m.what, m.bytes, m.peak));

@@ -9,7 +9,7 @@ use super::{next, pictures};
 use crate::atomic::shortened;
 use crate::config::Source;
 use crate::folder::{self, Lock};
-use crate::model;
+use crate::model::stored::Stored;
 use crate::render::view::Renderer;
 use crate::scene::{Camera, Scene, View, path};
 
@@ -105,14 +105,14 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let settings = origin.settings(changes)?;
     let trained = origin.settings(vec![])?.scene.downscale;
     let larger = f64::from(trained) / f64::from(settings.scene.downscale);
-    let (mut anchors, mut weights) = model::files::load(&origin.model())?;
+    let mut model = Stored::load(&origin.model())?;
     let own = origin.scene().map(Path::new);
     let scene = args.scene.as_deref().or(own).with_context(|| {
         format!("{}: a model alone does not know its cameras; name the scene with --scene", args.model.display())
     })?;
     let loaded = shared::load_scene(scene, &settings)?;
     // A model on disk has the lengths of the scene's own files.
-    model::files::rescale(&mut anchors, &mut weights, 1.0 / loaded.unit);
+    model.rescale(1.0 / loaded.unit);
     let cameras = args.views.cameras(&loaded, args.frames);
     if cameras.is_empty() {
         bail!("{}: the scene has no {} views; --views names others", scene.display(), args.views.name());
@@ -129,7 +129,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         }
     }
     args.device.with_gpu(|gpu| {
-        let mut renderer = Renderer::new(gpu, &anchors, &weights, &settings.render, background)?.larger(larger);
+        let mut renderer = Renderer::of(gpu, &model, &settings.render, background)?.larger(larger);
         let style = ProgressStyle::with_template("{wide_bar} {pos}/{len} views, {eta} left")?;
         let bar = ProgressBar::new(cameras.len() as u64).with_style(style);
         for (name, camera) in &cameras {

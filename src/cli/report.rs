@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::{Context as _, bail};
 
 use super::next;
-use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, add_dense, load_scene, with_gpu};
+use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, add_dense, load_scene, only_anchors, with_gpu};
 use super::train::default_folder;
 use crate::config::Settings;
 use crate::gpu::{Gpu, Options};
@@ -73,6 +73,7 @@ const JSON: &str = "report.json";
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let (mut scene, mut settings) = args.scene.load()?;
+    only_anchors(&settings, "report")?;
     let name = args.scene.name();
     let out = args.out.clone().unwrap_or_else(|| {
         let mut folder = default_folder(&name).into_os_string();

@@ -6,6 +6,7 @@ use anyhow::{Context as _, bail};
 
 use crate::config::{Settings, SettingsArgs};
 use crate::gpu::{Descriptors, Form, Gpu, Options};
+use crate::model::config;
 use crate::multiview;
 use crate::scene::{self, Scene, synthetic};
 
@@ -188,6 +189,17 @@ pub fn add_dense(gpu: &Gpu, path: &Path, scene: &mut Scene, settings: &mut Setti
 
 /// Views that are never gone below.
 const FEWEST_VIEWS: usize = 3;
+
+/// Refuses plain Gaussians for a command that knows anchors alone.
+///
+/// # Errors
+/// One sentence.
+pub fn only_anchors(settings: &Settings, command: &str) -> anyhow::Result<()> {
+    if settings.model.form == config::Form::Gaussians {
+        bail!("{command} measures models of anchors alone: leave out model.form=\"gaussians\"");
+    }
+    Ok(())
+}
 
 /// As [`load_scene`], in the lengths of the scene's files, which are those of a model on disk; what the settings say in
 /// training units is brought to them.

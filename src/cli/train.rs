@@ -17,6 +17,7 @@ use crate::config::{Settings, SettingsArgs, Source};
 use crate::evaluate::{Judge, Report};
 use crate::folder::{self, Lock};
 use crate::gpu::{self, Gpu, Options, Timing};
+use crate::model::config::Form;
 use crate::model::files::{POINT_CLOUD, WEIGHTS};
 use crate::render::view::Rendered;
 use crate::scene::{Camera, Scene};
@@ -189,7 +190,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             written.push(TRACE);
             println!("{}", summary.timings.table());
         }
-        println!("{}", describe(&summary));
+        println!("{}", describe(&summary, settings.model.form));
         println!("wrote {} in {}", written.join(", "), folder.display());
         warn(&looked);
         let page = (next::typed(&folder.join(index::INDEX).to_string_lossy()), "is the run as a page, for a browser");
@@ -348,7 +349,8 @@ fn start<'a>(
     if let Ok(forecast) = &verdict.forecast {
         run.resize(forecast.capacity)?;
         let mib = forecast.peak.div_ceil(1 << 20);
-        eprintln!("memory: about {mib} MiB of device memory at most, with {} anchors at the end", forecast.anchors);
+        let rows = settings.model.form.rows();
+        eprintln!("memory: about {mib} MiB of device memory at most, with {} {rows} at the end", forecast.anchors);
     }
     Ok(run)
 }
@@ -397,11 +399,12 @@ fn resume(
 
 /// Trains to the end and evaluates.
 fn finish(mut run: Run<'_>, settings: &Settings, folder: &Path, manner: &Manner) -> anyhow::Result<Trained> {
-    eprintln!("anchors: {}", run.step().anchors.count);
+    eprintln!("{}: {}", settings.model.form.rows(), run.step().learnt.count());
     let bar = bar(settings.train.iterations, run.done());
     let host = manner.board.as_ref().map(Host::new);
     let clock = manner.clock.clone().map(|clock| (clock, folder.join(SETTINGS), settings.clone()));
-    let mut watch = Watch { bar, pictures: folder.join(TEST), failed: None, began: manner.began, host, clock };
+    let rows = settings.model.form.rows();
+    let mut watch = Watch { bar, rows, pictures: folder.join(TEST), failed: None, began: manner.began, host, clock };
     let result = run.train(folder, &mut watch);
     watch.bar.finish_and_clear();
     let mut summary = result.inspect_err(|_| index::of_stopped(folder))?;
@@ -501,11 +504,12 @@ fn write(path: &Path, text: &str) -> std::io::Result<()> {
 const METRICS: &str = "metrics.json";
 const TRACE: &str = "trace.json";
 
-fn describe(summary: &Summary) -> String {
+fn describe(summary: &Summary, form: Form) -> String {
+    let rows = form.rows();
     let Summary { steps, seconds, repeated, anchors, gaussians, pairs, peak_device_bytes, .. } = summary;
     let repeated = if *repeated > 0 { format!(" ({repeated} repeated as buffers grew)") } else { String::new() };
     format!(
-        "{steps} steps{repeated} in {seconds:.1} s: {:.2} steps/s; {anchors} anchors, {gaussians:.0} Gaussians drawn and \
+        "{steps} steps{repeated} in {seconds:.1} s: {:.2} steps/s; {anchors} {rows}, {gaussians:.0} Gaussians drawn and \
          {pairs:.0} pairs sorted per view; {:.0} MiB of device memory at most",
         f64::from(*steps) / seconds,
         *peak_device_bytes as f64 / f64::from(1 << 20)
@@ -538,6 +542,8 @@ fn bar(steps: u32, done: u32) -> ProgressBar {
 /// Shows progress and keeps the test views.
 struct Watch {
     bar: ProgressBar,
+    /// What the model consists of.
+    rows: &'static str,
     pictures: PathBuf,
     failed: Option<pictures::Error>,
     /// Until the first step has ended.
@@ -556,7 +562,7 @@ impl Observer for Watch {
             host.step(progress);
         }
         self.bar.set_position(progress.step.into());
-        self.bar.set_message(format!("loss {:.4}  {} anchors", progress.loss, progress.anchors));
+        self.bar.set_message(format!("loss {:.4}  {} {}", progress.loss, progress.anchors, self.rows));
     }
 
     fn corrects(&mut self, last: &Progress) -> bool {

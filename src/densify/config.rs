@@ -43,6 +43,11 @@ pub struct Config {
     pub max_pixels: f64,
     /// Most anchors; growing stops there. 0 means no limit but memory.
     pub max_anchors: u32,
+    /// Most plain Gaussians: the model has memory for so many from the first step on, and more points than that are
+    /// thinned. In every round those that fade below `min_opacity` move onto others (3DGS-MCMC).
+    pub max_gaussians: u32,
+    /// Share by which a round enlarges the number of plain Gaussians (3DGS-MCMC: 0.05).
+    pub growth: f64,
 }
 
 impl Default for Config {
@@ -64,6 +69,8 @@ impl Default for Config {
             max_log_scaling: 0.05,
             max_pixels: 0.0,
             max_anchors: 0,
+            max_gaussians: 500_000,
+            growth: 0.05,
         }
     }
 }
@@ -98,6 +105,8 @@ impl Config {
         for (key, pixels) in [("coarsest_pixels", self.coarsest_pixels), ("max_pixels", self.max_pixels)] {
             ensure((0.0..=1e6).contains(&pixels), key, pixels, "must be a number of pixels, or 0 for none")?;
         }
+        ensure(self.max_gaussians > 0, "max_gaussians", self.max_gaussians, "must be at least 1")?;
+        ensure((0.0..=1.0).contains(&self.growth), "growth", self.growth, "must be between 0 and 1")?;
         ensure((0.0..=1.0).contains(&self.min_opacity), "min_opacity", self.min_opacity, "must be between 0 and 1")?;
         ensure(
             self.max_log_scaling > f64::NEG_INFINITY,

@@ -119,7 +119,7 @@ impl Baker {
     /// # Errors
     /// When the device has no room for it, or is lost.
     pub fn look(&mut self, camera: &Camera) -> Result<image::RgbImage, Error> {
-        let model = Model { anchors: &self.anchors, weights: &self.weights };
+        let model = Model::Anchors { anchors: &self.anchors, weights: &self.weights };
         let background = self.background;
         let stages = self.session.run(model, camera, |rec, stages, binned| {
             let Stages { room, forward, own: Shares { picture, backward, ones } } = stages;
@@ -135,14 +135,14 @@ impl Baker {
     fn take_down(&mut self, camera: &Camera) -> Result<(), Error> {
         let Stages { forward, own: Shares { backward, .. }, .. } = self.session.stages();
         let gpu = &self.gpu;
-        let visible_count = gpu.read(&forward.visible.count)?[0] as usize;
+        let visible_count = gpu.read(&forward.visible().count)?[0] as usize;
         let offsets = self.anchors.offsets as usize;
         let slots = visible_count * offsets;
-        let visible = gpu.read_range(&forward.visible.list, visible_count)?;
-        let opacity = gpu.read_range(&forward.decode.opacity, slots)?;
-        let color = gpu.read_range(&forward.decode.color, slots)?;
-        let scale = gpu.read_range(&forward.decode.scale, slots)?;
-        let rotation = gpu.read_range(&forward.decode.rotation, slots)?;
+        let visible = gpu.read_range(&forward.visible().list, visible_count)?;
+        let opacity = gpu.read_range(&forward.decode().opacity, slots)?;
+        let color = gpu.read_range(&forward.decode().color, slots)?;
+        let scale = gpu.read_range(&forward.decode().scale, slots)?;
+        let rotation = gpu.read_range(&forward.decode().rotation, slots)?;
         let tiles = gpu.read_range(forward.bin.tiles(), slots)?;
         let shares = gpu.read_range(&backward.grad_color, slots)?;
         let (near, size) = (self.near, camera.size.map(f64::from));

@@ -1,11 +1,12 @@
 //! Static Gaussians drawn, compared and improved: the training step's own stages behind [`Activate`].
 
-use super::activate::{Activate, ActivateBackward, DrawnGradients, Static};
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::losses::{self, Losses, View, Weights};
+use crate::model::gaussians::Static;
 use crate::optimizer::adam::{self, Tensors};
 use crate::primitives::Count;
 use crate::primitives::limit::{Counter, Limits};
+use crate::render::activate::{self, Activate, DrawnGradients};
 use crate::render::bin::{Bin, Binned};
 use crate::render::project::{Project, ProjectBackward, SplatGradients};
 use crate::render::rasterize::{self, Backward, Outputs, Picture, PictureGradient, Projected};
@@ -26,7 +27,6 @@ struct Stages {
     bin: Bin,
     rasterize_backward: Backward,
     project_backward: ProjectBackward,
-    activate_backward: ActivateBackward,
 }
 
 /// What depends on the pictures' size.
@@ -174,7 +174,7 @@ impl Drawer {
         camera: &Camera,
         (step, rates): (u32, Rates),
     ) {
-        let Stages { activate, rasterize_backward, project_backward, activate_backward, .. } = stages;
+        let Stages { activate, rasterize_backward, project_backward, .. } = stages;
         let weights = Weights { outside: 1.0, inside: 1.0 };
         let view = View { picture: &canvas.target, weights, depth: None };
         let gradient = canvas.losses.forward_backward(rec, &view, &canvas.picture.rgb, None);
@@ -194,9 +194,10 @@ impl Drawer {
             opacity: &rasterize_backward.grad_opacity,
             color: &rasterize_backward.grad_color,
         };
-        activate_backward.record(rec, &self.gaussians, activate, drawn);
-        let all = self.gaussians.parameters().into_iter().zip(activate_backward.gradients()).zip(rates);
-        for ((parameter, gradient), rate) in all.filter(|(_, rate)| *rate != 0.0) {
+        activate::backward(rec, &self.gaussians, activate, drawn);
+        let all = self.gaussians.parameters().into_iter().zip(rates).filter(|(_, rate)| *rate != 0.0);
+        for (parameter, rate) in all {
+            let Some(gradient) = &parameter.gradient else { continue };
             let tensors = Tensors { value: &parameter.value, gradient, first: &parameter.first, root: &parameter.root };
             let range = (0, self.gaussians.count * parameter.width);
             adam::record(rec, &adam::Config::default(), tensors, self.limits.overflow(), range, (step, rate));
@@ -215,13 +216,15 @@ impl Drawer {
             let n = gaussians.count;
             let method = Method::new(gpu, config)?;
             let project = Project::new(gpu, n, 1)?;
+            for parameter in gaussians.parameters_mut() {
+                parameter.make_gradient(gpu)?;
+            }
             *stages = Some(Stages {
                 activate: Activate::new(gpu, n)?,
                 all: Slots::all(gpu, n)?,
                 bin: Bin::new(gpu, method, n, *pairs, size)?,
                 rasterize_backward: Backward::new(gpu, method, n as usize, *pairs as usize, Outputs::Color)?,
                 project_backward: ProjectBackward::new(gpu, &project)?,
-                activate_backward: ActivateBackward::new(gpu, gaussians)?,
                 project,
             });
         }

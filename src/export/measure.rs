@@ -5,11 +5,11 @@ use std::fmt::Write as _;
 use image::{GrayImage, RgbImage};
 use serde::Serialize;
 
-use super::activate::Static;
 use super::draw::Drawer;
 use super::{Cloud, Error, low_pass};
 use crate::evaluate::{self, Mean, Report, ViewMetrics};
 use crate::gpu::Gpu;
+use crate::model::gaussians::Static;
 use crate::render::Config;
 use crate::render::view::{Renderer, to_rgb8};
 use crate::scene::{Camera, Scene};
@@ -146,12 +146,13 @@ impl Yardstick {
 
 /// An aligned table of what was measured, a line per name.
 pub fn table(lines: &[(String, Loss)]) -> String {
+    let first = lines.first().map_or("anchors", |(name, _)| name);
     let width = lines.iter().map(|(name, _)| name.chars().count()).max().unwrap_or(0);
     let masked = |mean: &Option<Mean>| mean.is_some_and(|mean| mean.metrics.mask.is_some());
     let photographs = lines.iter().any(|(_, loss)| loss.photographs.is_some());
     let masks = lines.iter().any(|(_, loss)| masked(&loss.photographs) || masked(&loss.anchors));
     let group = if masks { 32 } else { 15 };
-    let mut text = format!("{:width$}  {:>group$}", "", "against the anchors");
+    let mut text = format!("{:width$}  {:>group$}", "", format!("against the {first}"));
     if photographs {
         write!(text, "  {:>group$}", "against photographs").expect("a string takes everything");
     }

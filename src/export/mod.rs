@@ -1,12 +1,10 @@
 #![doc = include_str!("README.md")]
 
-pub mod activate;
 pub mod bake;
 pub mod draw;
 pub mod gltf;
 pub mod low_pass;
 pub mod measure;
-pub mod ply;
 pub mod poses;
 pub mod refine;
 pub mod spz;
@@ -16,12 +14,16 @@ use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 use crate::atomic::AtomicWriteFile;
-use glam::{DMat3, DQuat, DVec3};
+use glam::DMat3;
 
 use crate::config::Settings;
 use crate::gpu::Gpu;
 use crate::math::harmonics::coefficients;
 use crate::model::files;
+use crate::model::gaussians::Static;
+pub use crate::model::gaussians::{Cloud, logit, sigmoid};
+pub use crate::model::ply;
+use crate::model::stored::Stored;
 use crate::render::view::Renderer;
 use crate::scene::{Camera, Scene};
 
@@ -53,83 +55,6 @@ pub enum Error {
     /// Pictures that cannot be compared.
     #[error(transparent)]
     Evaluate(#[from] crate::evaluate::Error),
-}
-
-/// Static Gaussians: what a viewer draws.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Cloud {
-    /// \[gaussian\] scene units.
-    pub position: Vec<[f32; 3]>,
-    /// \[gaussian\] natural logarithms of the standard deviations in scene units.
-    pub log_scale: Vec<[f32; 3]>,
-    /// \[gaussian\] unit quaternions w x y z.
-    pub rotation: Vec<[f32; 4]>,
-    /// \[gaussian\] logit of the opacity.
-    pub logit: Vec<f32>,
-    /// Highest degree of the harmonics, 0 to 3.
-    pub degree: u32,
-    /// \[gaussian, coefficient\] rgb, `(degree + 1)^2` coefficients: see [`crate::math::harmonics`].
-    pub harmonics: Vec<[f32; 3]>,
-}
-
-impl Cloud {
-    /// Number of Gaussians.
-    pub fn len(&self) -> usize {
-        self.position.len()
-    }
-
-    /// True without Gaussians.
-    pub fn is_empty(&self) -> bool {
-        self.position.is_empty()
-    }
-
-    /// The coefficients of one Gaussian.
-    pub fn harmonics_of(&self, i: usize) -> &[[f32; 3]] {
-        let each = coefficients(self.degree);
-        &self.harmonics[i * each..(i + 1) * each]
-    }
-
-    /// Those for which `keep` says so, in their order.
-    pub fn retain(&mut self, keep: &[bool]) {
-        fn kept<T: Copy>(from: &mut Vec<T>, keep: &[bool], each: usize) {
-            let mut flags = keep.iter().flat_map(|k| std::iter::repeat_n(*k, each));
-            from.retain(|_| flags.next().unwrap_or(true));
-        }
-        let each = coefficients(self.degree);
-        kept(&mut self.position, keep, 1);
-        kept(&mut self.log_scale, keep, 1);
-        kept(&mut self.rotation, keep, 1);
-        kept(&mut self.logit, keep, 1);
-        kept(&mut self.harmonics, keep, each);
-    }
-
-    /// The same Gaussians in axes turned by a rotation matrix.
-    ///
-    /// # Panics
-    /// With harmonics beyond degree 0, which are to be fitted in the axes they are written in.
-    pub fn turn(&mut self, by: DMat3) {
-        assert_eq!(self.degree, 0, "harmonics are not turned");
-        let turn = DQuat::from_mat3(&by);
-        for position in &mut self.position {
-            *position = (by * DVec3::from_array(position.map(f64::from))).to_array().map(|v| v as f32);
-        }
-        for rotation in &mut self.rotation {
-            let [w, x, y, z] = rotation.map(f64::from);
-            let q = (turn * DQuat::from_xyzw(x, y, z, w)).normalize();
-            *rotation = [q.w, q.x, q.y, q.z].map(|v| v as f32);
-        }
-    }
-}
-
-/// The opacity of a logit, 0 to 1.
-pub fn sigmoid(logit: f32) -> f64 {
-    1.0 / (1.0 + (-f64::from(logit)).exp())
-}
-
-/// The logit of an opacity, finite: opacities are cut off at the largest alpha of a sample and at what a viewer skips.
-pub fn logit(opacity: f64) -> f32 {
-    let o = opacity.clamp(1e-4, 0.9999);
-    (o / (1.0 - o)).ln() as f32
 }
 
 /// Writes files that appear complete or not at all: all are on the disk before the first replaces its predecessor.
@@ -213,6 +138,46 @@ pub struct Export {
     pub larger: f64,
 }
 
+/// Plain Gaussians as they are, in the cloud's axes: nothing is baked, refined or pruned. Those thinner than the pixels of
+/// the training are widened for larger pictures, see [`low_pass`].
+///
+/// # Errors
+/// When the device has no room, or is lost.
+pub fn of_gaussians(
+    gpu: &Gpu,
+    cloud: &Cloud,
+    scene: &Scene,
+    settings: &Settings,
+    options: &Options,
+    observer: &mut dyn Observer,
+) -> Result<Export, Error> {
+    let background = settings.train.background.map(|channel| channel as f32);
+    let train: Vec<Camera> = scene.train.iter().map(|view| view.camera).collect();
+    let turn = if options.upright { up::upright(&train) } else { DMat3::IDENTITY };
+    let turned = |camera: &Camera| up::turn_camera(camera, turn);
+    let held_out = poses::virtual_views(&train, HELD_OUT, !options.seed);
+    let tests = if scene.test.is_empty() { held_out.len() } else { scene.test.len() };
+    observer.begin("drawing the Gaussians to compare with", tests as u64);
+    let model = Stored::Gaussians(cloud.clone());
+    let mut renderer = Renderer::of(gpu, &model, &settings.render, background)?;
+    let yardstick = measure::Yardstick::new(&mut renderer, scene, &held_out, turned, || observer.turn(""))?;
+    let losses = vec![("Gaussians".to_owned(), yardstick.of_anchors()?)];
+    let mut cloud = cloud.clone();
+    if options.upright {
+        cloud.turn(turn);
+    }
+    let larger = larger(options, &train);
+    low_pass::widen(&mut cloud, &train.iter().map(turned).collect::<Vec<_>>(), larger);
+    let gaussians = [cloud.len(); 2];
+    Ok(Export { cloud, turn, yardstick, losses, poses: [0, 0], gaussians, larger })
+}
+
+/// How many times larger than the training's pictures the scene will be looked at.
+fn larger(options: &Options, train: &[Camera]) -> f64 {
+    let longest = train.iter().flat_map(|camera| camera.size).max().unwrap_or(1);
+    (f64::from(options.screen) / f64::from(longest)).max(1.0)
+}
+
 /// Bakes, refines and prunes.
 ///
 /// # Errors
@@ -258,7 +223,7 @@ pub fn make(
     cloud.degree = options.degree;
 
     let gaussian_config = &settings.render;
-    let mut drawer = draw::Drawer::new(gpu, activate::Static::upload(gpu, &cloud)?, gaussian_config, background)?;
+    let mut drawer = draw::Drawer::new(gpu, Static::upload(gpu, &cloud)?, gaussian_config, background)?;
     losses.push(("baked".to_owned(), yardstick.of_drawer(&mut drawer)?));
     observer.begin("refining", options.steps.into());
     let config = refine::Config { steps: options.steps, seed: options.seed, radius: scene.radius.into() };
@@ -273,14 +238,14 @@ pub fn make(
     }
     cloud = drawer.gaussians.read(gpu)?;
     cloud.retain(&shares.iter().map(|share| *share > SEEN).collect::<Vec<_>>());
-    let longest = train.iter().flat_map(|camera| camera.size).max().unwrap_or(1);
-    let larger = (f64::from(options.screen) / f64::from(longest)).max(1.0);
+    let larger = larger(options, &train);
     low_pass::widen(&mut cloud, &train.iter().map(turned).collect::<Vec<_>>(), larger);
     Ok(Export { cloud, turn, yardstick, losses, poses: [looked.len(), between.len()], gaussians, larger })
 }
 
 #[cfg(test)]
 pub(crate) mod tests {
+    use glam::DVec3;
     use rand::{RngExt as _, SeedableRng as _};
     use rand_pcg::Pcg64;
 

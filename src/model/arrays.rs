@@ -1,8 +1,8 @@
 //! What an anchor has: the list of its learnt arrays, and their values on the host.
 //!
 //! The list is all that the device's copy ([`super::anchors`]), the files, the checkpoints, growth, pruning and the plan know
-//! of an array. Another form of the model brings a list of its own: static Gaussians, for instance, one of position,
-//! log-scales, rotation, opacity and harmonics.
+//! of an array. The other form of the model has a list of its own: position, log-scales, rotation, opacity and harmonics of
+//! static Gaussians ([`super::gaussians`]).
 
 use super::parameter::{Names, names};
 use crate::optimizer::Group;

@@ -2,12 +2,37 @@ use serde::{Deserialize, Serialize};
 
 use crate::config::{Invalid, ensure};
 
-/// What is learnt: anchors, their offsets, and the attention between them.
+/// The form of the model.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Form {
+    /// Anchors with features, from which decoders make Gaussians for each view (Scaffold-GS, GScream).
+    #[default]
+    Anchors,
+    /// Gaussians with colours in spherical harmonics, each learnt by itself (3DGS). A step is several times as fast.
+    Gaussians,
+}
+
+impl Form {
+    /// What the model consists of, in the plural.
+    pub fn rows(self) -> &'static str {
+        match self {
+            Self::Anchors => "anchors",
+            Self::Gaussians => "Gaussians",
+        }
+    }
+}
+
+/// What is learnt: anchors, their offsets, and the attention between them; or plain Gaussians.
 ///
 /// The feature length (32) and the decoders' hidden width (32) belong to the kernels and are not settings.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default, expecting = "a table")]
 pub struct Config {
+    /// Anchors, or plain Gaussians.
+    pub form: Form,
+    /// Highest degree of the harmonics of plain Gaussians, 0 to 3: 0 shows the same colour from everywhere.
+    pub degree: u32,
     /// Edge of the grid to which points are snapped to become anchors, in scene units (Scaffold-GS: 0.001 in general,
     /// GScream: 0.005 for SPIn-NeRF scenes). Zero or less means the median nearest-neighbour distance of the points.
     pub voxel: f64,
@@ -24,7 +49,7 @@ pub struct Config {
     /// Offsets begin uniformly in +- this, in units of the anchor's scaling; 0: all begin as 0 (Scaffold-GS).
     pub spread: f64,
     /// Opacity that the decoder's last bias gives all Gaussians to begin with; 0: that bias is random as PyTorch's, and
-    /// many Gaussians never exist (Scaffold-GS).
+    /// many Gaussians never exist (Scaffold-GS). Plain Gaussians begin with it, too, and with 0.1 where it is 0 (3DGS).
     pub opacity: f64,
     /// Bidirectional cross-attention between anchors inside and around the mask.
     pub attention: Attention,
@@ -55,6 +80,8 @@ pub struct Attention {
 impl Default for Config {
     fn default() -> Self {
         Self {
+            form: Form::Anchors,
+            degree: 1,
             voxel: 0.001,
             voxel_pixels: 0.0,
             voxel_factor: 1.0,
@@ -84,6 +111,14 @@ impl Default for Attention {
 impl Config {
     /// Refuses values that no run could use.
     pub fn validate(&self) -> Result<(), Invalid> {
+        ensure(self.degree <= 3, "degree", self.degree, "must be between 0 and 3")?;
+        ensure(
+            self.form == Form::Anchors || !self.attention.enabled,
+            "attention.enabled",
+            self.attention.enabled,
+            "model.form is \"gaussians\", which have no features to attend to; set model.attention.enabled=false",
+        )
+        .map_err(|invalid| invalid.against("form"))?;
         ensure(self.voxel.is_finite(), "voxel", self.voxel, "must be finite (0 derives it from the points)")?;
         let pixels = self.voxel_pixels;
         ensure((0.0..=1e6).contains(&pixels), "voxel_pixels", pixels, "must be a number of pixels, or 0")?;

@@ -276,7 +276,7 @@ fn check(anchors: &Anchors, weights: &Weights) -> Result<(), Error> {
     }
 }
 
-fn write_temporary(
+pub(super) fn write_temporary(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<&mut AtomicWriteFile>) -> io::Result<()>,
 ) -> Result<AtomicWriteFile, Error> {

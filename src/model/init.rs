@@ -1,15 +1,18 @@
 //! The model before the first step: anchors from structure-from-motion points, networks from a seed.
 
-use std::collections::BTreeMap;
+use std::cmp::Ordering;
+use std::collections::{BTreeMap, HashSet};
 use std::num::NonZero;
 
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rand::distr::{Distribution, Uniform};
 use rand_pcg::Pcg64;
 
+use crate::math::harmonics::{ZEROTH, coefficients};
 use crate::scene::Point;
 
 use super::files::{ATTENTION_WIDTH, Anchors, FEATURES, Tensor, Weights, weight_shapes};
+use super::gaussians::{Cloud, logit};
 
 /// Why a model cannot start from these points.
 #[derive(Debug, thiserror::Error, PartialEq)]
@@ -113,6 +116,83 @@ pub fn from_points(points: &[Point], config: &super::Config, seed: u64) -> Resul
         initial.anchors.offset.fill_with(|| uniform.sample(&mut generator));
     }
     Ok(initial)
+}
+
+/// Plain Gaussians at these points, at most `config.max_gaussians` of the densify settings: more points than that are
+/// thinned to one at the mean of each cell of the finest grid with as few occupied cells.
+///
+/// They are round, seven tenths as wide as [`mean_distance_to_nearest`], of the points' colours from all sides, and of the
+/// opacity that the settings say. The order of the points does not matter.
+///
+/// # Errors
+/// No points, or points that are not finite.
+pub fn gaussians(points: &[Point], config: &super::Config, most: u32) -> Result<Cloud, Error> {
+    if points.is_empty() {
+        return Err(Error::NoPoints);
+    }
+    let broken = points.iter().enumerate().find(|(_, p)| !p.position.iter().all(|v| v.is_finite()));
+    if let Some((index, point)) = broken {
+        return Err(Error::NotFinite { index, position: point.position });
+    }
+    let mut points: Vec<([f64; 3], [f64; 3])> =
+        points.iter().map(|p| (p.position.map(f64::from), p.color.map(f64::from))).collect();
+    let order = |a: &([f64; 3], [f64; 3]), b: &([f64; 3], [f64; 3])| {
+        let of = |p: &([f64; 3], [f64; 3])| [p.0, p.1];
+        of(a).as_flattened().partial_cmp(of(b).as_flattened()).unwrap_or(Ordering::Equal)
+    };
+    points.sort_unstable_by(order);
+    points.dedup_by(|a, b| a.0 == b.0);
+    if points.len() > most as usize {
+        points = thinned(&points, most as usize);
+    }
+    let position: Vec<[f32; 3]> = points.iter().map(|(p, _)| p.map(|v| v as f32)).collect();
+    let floor = median_nearest_distance(&position).map_or(1e-3, |d| (d * 0.01).max(1e-6));
+    let log_scale = mean_distance_to_nearest(&position, floor).into_iter().map(|d| [(0.7 * d).ln() as f32; 3]);
+    let each = coefficients(config.degree);
+    let harmonics = points.iter().flat_map(|(_, color)| {
+        let first = color.map(|v| ((v / 255.0 - 0.5) / ZEROTH) as f32);
+        std::iter::once(first).chain(std::iter::repeat_n([0.0; 3], each - 1))
+    });
+    let opacity = if config.opacity > 0.0 { config.opacity } else { 0.1 };
+    Ok(Cloud {
+        log_scale: log_scale.collect(),
+        rotation: vec![[1.0, 0.0, 0.0, 0.0]; points.len()],
+        logit: vec![logit(opacity); points.len()],
+        degree: config.degree,
+        harmonics: harmonics.collect(),
+        position,
+    })
+}
+
+/// The means of these positions and colours in the cells of a grid that at most `most` are occupied of.
+fn thinned(points: &[([f64; 3], [f64; 3])], most: usize) -> Vec<([f64; 3], [f64; 3])> {
+    let widest = (0..3).map(|c| points.iter().fold(0.0f64, |m, p| m.max((p.0[c] - points[0].0[c]).abs())));
+    let mut side = widest.fold(1e-30, f64::max) * 2.0;
+    let keys = |side: f64| points.iter().map(move |p| p.0.map(|v| ((v / side).floor() + 0.0).to_bits()));
+    let occupied = |side: f64| keys(side).collect::<HashSet<_>>().len();
+    // The side is found between one that is too long and one that is too short; both ends and halves are the same anywhere.
+    while occupied(side) <= most {
+        side *= 0.5;
+    }
+    let (mut short, mut long) = (side, side * 2.0);
+    for _ in 0..5 {
+        let middle = 0.5 * (short + long);
+        if occupied(middle) > most { short = middle } else { long = middle }
+    }
+    // Beyond the grid's first side, where a single cell is not enough, everything is one.
+    let mut cells = BTreeMap::<[u64; 3], ([f64; 6], f64)>::new();
+    for (key, (position, color)) in keys(long).zip(points) {
+        let (sum, count) = cells.entry(key).or_default();
+        sum.iter_mut().zip(position.iter().chain(color)).for_each(|(sum, v)| *sum += v);
+        *count += 1.0;
+    }
+    let mean = |(sum, count): ([f64; 6], f64)| {
+        let [x, y, z, r, g, b] = sum.map(|v| v / count);
+        ([x, y, z], [r, g, b])
+    };
+    let mut kept: Vec<_> = cells.into_values().map(mean).collect();
+    kept.truncate(most);
+    kept
 }
 
 /// Mean 8-bit RGB of the points in each occupied cell, in the order of [`anchors`].
@@ -303,6 +383,42 @@ mod tests {
             from_points(&points, &crate::model::Config { voxel: 1.0, ..Default::default() }, 1).expect("points");
         let positions: Vec<[f32; 3]> = points.iter().map(|p| p.position).collect();
         assert_eq!(plain, super::anchors(&positions, 1.0, 10).expect("points"), "zeros unless asked for");
+    }
+
+    #[test]
+    fn plain_gaussians_stand_at_the_points_or_at_the_means_of_cells() {
+        let colored = |position: [f32; 3]| Point { position, color: [255, 0, 51] };
+        let points: Vec<Point> = random_points(1000, 4).into_iter().map(colored).collect();
+        let config = crate::model::Config { degree: 1, ..Default::default() };
+        let made = |points: &[Point], most| gaussians(points, &config, most).expect("points");
+        let all = made(&points, 1000);
+        let mut sorted: Vec<[f32; 3]> = points.iter().map(|p| p.position).collect();
+        sorted.sort_by(|a, b| a.partial_cmp(b).expect("finite"));
+        assert_eq!(all.position, sorted);
+        // Half a white less 127.5 steps of 255 either way, and nothing that depends on the direction.
+        assert!((f64::from(all.harmonics_of(7)[0][0]) * ZEROTH - 0.5).abs() < 1e-6);
+        assert!((f64::from(all.harmonics_of(7)[0][1]) * ZEROTH + 0.5).abs() < 1e-6);
+        assert_eq!(all.harmonics_of(7)[1..], [[0.0; 3]; 3]);
+        assert!(all.logit.iter().all(|l| (crate::model::gaussians::sigmoid(*l) - 0.1).abs() < 1e-6));
+        let spacing = mean_distance_to_nearest(&sorted, 1e-9);
+        assert!(
+            all.log_scale
+                .iter()
+                .zip(spacing)
+                .all(|(s, d)| s.iter().all(|s| (f64::from(*s).exp() - 0.7 * d).abs() < 1e-5))
+        );
+        let mut doubled: Vec<Point> = points.iter().rev().copied().collect();
+        doubled.extend(&points);
+        assert_eq!(made(&doubled, 1000), all, "neither order nor duplicates matter");
+        for most in [999, 300, 1] {
+            let few = made(&doubled, most);
+            assert!(few.len() <= most as usize && few.len() as f64 >= 0.6 * f64::from(most), "{} of {most}", few.len());
+            assert!(few.position.as_flattened().iter().all(|v| v.abs() <= 4.0), "means stay among the points");
+        }
+        assert_eq!(gaussians(&[], &config, 9), Err(Error::NoPoints));
+        let far = gaussians(&[colored([f32::NAN, 0.0, 0.0])], &config, 9);
+        assert!(matches!(far, Err(Error::NotFinite { index: 0, .. })));
+        assert_eq!(made(&points[..1], 9).len(), 1, "a single one has no neighbour to be measured by");
     }
 
     #[test]

@@ -1,11 +1,15 @@
-//! What is learnt: anchors, decoder, attention; files on disk.
+//! What is learnt: anchors, decoder and attention, or plain Gaussians; files on disk.
 
 pub mod anchors;
 pub mod arrays;
 pub mod attention;
 pub mod config;
 pub mod files;
+pub mod gaussians;
 pub mod init;
+pub mod learnt;
 pub mod parameter;
+pub mod ply;
+pub mod stored;
 
 pub use config::Config;

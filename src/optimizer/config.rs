@@ -1,6 +1,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::config::{Invalid, ensure};
+use crate::model::config::Form;
 
 /// Adam (Kingma & Ba 2015) and the learning rate of every parameter group.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -12,6 +13,8 @@ pub struct Config {
     pub epsilon: f64,
     /// Steps from a group's initial to its final learning rate; 0 means `train.iterations`.
     pub schedule_length: u32,
+    /// Share of the harmonics' rate that the coefficients beyond the first have (3DGS: 0.05).
+    pub higher_harmonics: f64,
     /// Learning rates by group.
     pub learning_rate: LearningRates,
 }
@@ -76,18 +79,42 @@ groups! {
     MlpColor: mlp_color = [0.008, 0.00005];
     /// Projections of the cross-attention.
     Attention: attention = [0.002, 0.00002];
+    /// Positions of plain Gaussians, multiplied by the scene radius (3DGS).
+    Position: position = [0.00016, 0.0000016];
+    /// Log-scales of plain Gaussians (3DGS).
+    LogScale: log_scale = [0.005, 0.005];
+    /// Rotations of plain Gaussians, as quaternions (3DGS).
+    Quaternion: quaternion = [0.001, 0.001];
+    /// Opacities of plain Gaussians, as logits (3DGS: 0.05; gsplat: half of it).
+    Opacity: opacity = [0.05, 0.05];
+    /// Colours of plain Gaussians: the first coefficient of their harmonics (3DGS).
+    Harmonics: harmonics = [0.0025, 0.0025];
 }
 
 impl Group {
     /// Whether its rates are given for a scene of radius 1, and multiplied by the scene's.
     pub fn goes_with_radius(self) -> bool {
-        self == Self::Offset
+        matches!(self, Self::Offset | Self::Position)
+    }
+
+    /// The form of the model that has parameters of this group.
+    pub fn form(self) -> Form {
+        match self {
+            Self::Position | Self::LogScale | Self::Quaternion | Self::Opacity | Self::Harmonics => Form::Gaussians,
+            _ => Form::Anchors,
+        }
     }
 }
 
 impl Default for Config {
     fn default() -> Self {
-        Self { betas: [0.9, 0.999], epsilon: 1e-15, schedule_length: 0, learning_rate: LearningRates::default() }
+        Self {
+            betas: [0.9, 0.999],
+            epsilon: 1e-15,
+            schedule_length: 0,
+            higher_harmonics: 0.05,
+            learning_rate: LearningRates::default(),
+        }
     }
 }
 
@@ -107,6 +134,8 @@ impl Config {
             self.epsilon,
             "must be between 1e-37 and 1e30, as float32 holds it",
         )?;
+        let higher = self.higher_harmonics;
+        ensure((1e-6..=1.0).contains(&higher), "higher_harmonics", higher, "must be between 0.000001 and 1")?;
         for group in Group::ALL {
             let rate = self.learning_rate.of(group);
             // An infinite rate times an update of zero is not a number.

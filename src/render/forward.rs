@@ -1,14 +1,18 @@
 //! The forward stages, from anchors to the tiles' lists.
 
+use super::activate::Activate;
 use super::bin::{Bin, Binned};
 use super::decode::{self, Decode};
 use super::method::Method;
 use super::project::{Gaussians, Project};
 use super::rasterize::Projected;
+use super::slots::Slots;
 use super::visible::Visible;
 use super::widen;
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::model::anchors::Anchors;
+use crate::model::gaussians::Static;
+use crate::primitives::Count;
 use crate::primitives::limit::{COUNTERS, Counter, Limits};
 use crate::scene::Camera;
 use crate::stage;
@@ -63,12 +67,31 @@ fn most_pairs(gpu: &Gpu) -> u32 {
     (gpu.info().max_binding_bytes / 12).min(u32::MAX.into()) as u32
 }
 
-/// The forward stages, from anchors to a picture.
+/// The stages between what is learnt and the Gaussians of a view.
+#[expect(clippy::large_enum_variant, reason = "a step has one")]
+pub enum Front {
+    /// Of anchors.
+    Anchors {
+        /// What is in view.
+        visible: Visible,
+        /// Neural Gaussians.
+        decode: Decode,
+    },
+    /// Of plain Gaussians.
+    Gaussians {
+        /// All of them, as they are drawn.
+        activate: Activate,
+        /// All of them.
+        all: Slots,
+        /// How many.
+        count: u32,
+    },
+}
+
+/// The forward stages, from the model to a picture.
 pub struct Forward {
-    /// What is in view.
-    pub visible: Visible,
-    /// Neural Gaussians.
-    pub decode: Decode,
+    /// The stages that the forms of the model have of their own.
+    pub front: Front,
     /// Gaussians on the picture.
     pub project: Project,
     /// Tiles' lists.
@@ -79,7 +102,7 @@ pub struct Forward {
 }
 
 impl Forward {
-    /// Stages for pictures of at most `size`.
+    /// Stages for anchors of `offsets` Gaussians and pictures of at most `size`.
     ///
     /// # Errors
     /// As [`Gpu::buffer`].
@@ -92,8 +115,10 @@ impl Forward {
         cull: bool,
     ) -> Result<Self, Error> {
         Ok(Self {
-            visible: gpu.stage(stage::CULL, || Visible::new(gpu, capacity.anchors, capacity.visible, cull))?,
-            decode: gpu.stage(stage::DECODE, || Decode::new(gpu, capacity.visible, offsets))?,
+            front: Front::Anchors {
+                visible: gpu.stage(stage::CULL, || Visible::new(gpu, capacity.anchors, capacity.visible, cull))?,
+                decode: gpu.stage(stage::DECODE, || Decode::new(gpu, capacity.visible, offsets))?,
+            },
             project: gpu.stage(stage::PROJECT, || Project::new(gpu, capacity.visible, offsets))?,
             bin: gpu.stage(stage::BIN, || {
                 Bin::new(gpu, method, capacity.visible.saturating_mul(offsets), capacity.pairs, size)
@@ -103,31 +128,105 @@ impl Forward {
         })
     }
 
+    /// Stages for this model and pictures of at most `size`; for plain Gaussians, as many as there are now.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub fn of(
+        gpu: &Gpu,
+        capacity: Capacity,
+        model: Model<'_>,
+        method: Method,
+        size: [u32; 2],
+        cull: bool,
+    ) -> Result<Self, Error> {
+        let count = match model {
+            Model::Anchors { anchors, .. } => return Self::new(gpu, capacity, anchors.offsets, method, size, cull),
+            Model::Gaussians(gaussians) => gaussians.count,
+        };
+        let front = || {
+            Ok::<_, Error>(Front::Gaussians {
+                activate: Activate::new(gpu, count)?,
+                all: Slots::all(gpu, count)?,
+                count,
+            })
+        };
+        Ok(Self {
+            front: gpu.stage(stage::DECODE, front)?,
+            project: gpu.stage(stage::PROJECT, || Project::new(gpu, count, 1))?,
+            bin: gpu.stage(stage::BIN, || Bin::new(gpu, method, count, capacity.pairs, size))?,
+            larger: 1.0,
+            method,
+        })
+    }
+
+    /// The anchors in view.
+    ///
+    /// # Panics
+    /// For stages of plain Gaussians.
+    pub fn visible(&self) -> &Visible {
+        match &self.front {
+            Front::Anchors { visible, .. } => visible,
+            Front::Gaussians { .. } => panic!("plain Gaussians are not culled"),
+        }
+    }
+
+    /// The anchors' Gaussians.
+    ///
+    /// # Panics
+    /// For stages of plain Gaussians.
+    pub fn decode(&self) -> &Decode {
+        match &self.front {
+            Front::Anchors { decode, .. } => decode,
+            Front::Gaussians { .. } => panic!("plain Gaussians are not decoded"),
+        }
+    }
+
+    /// The Gaussians that there are, by slot.
+    pub fn existing(&self) -> &Slots {
+        match &self.front {
+            Front::Anchors { decode, .. } => &decode.existing,
+            Front::Gaussians { all, .. } => all,
+        }
+    }
+
     /// What the pictures are computed with.
     pub fn method(&self) -> Method {
         self.method
     }
 
-    /// The decoded Gaussians as the projection reads them.
+    /// The Gaussians as the projection reads them.
     pub fn gaussians(&self) -> Gaussians<'_> {
-        let Decode { position, scale, rotation, .. } = &self.decode;
-        Gaussians { position, scale, rotation }
+        match &self.front {
+            Front::Anchors { decode: Decode { position, scale, rotation, .. }, .. } => {
+                Gaussians { position, scale, rotation }
+            }
+            Front::Gaussians { activate, .. } => activate.gaussians(),
+        }
     }
 
     /// The projected Gaussians as the rasteriser reads them.
     pub fn projected(&self) -> Projected<'_> {
+        let (slots, opacity, color) = match &self.front {
+            Front::Anchors { decode, .. } => (decode.slots(), &decode.opacity, &decode.color),
+            Front::Gaussians { activate, count, .. } => (Count::Host(*count), &activate.opacity, &activate.color),
+        };
         Projected {
-            slots: self.decode.slots(),
-            existing: &self.decode.existing,
+            slots,
+            existing: self.existing(),
             mean: &self.project.mean,
             covariance: &self.project.covariance,
             depth: &self.project.depth,
-            opacity: &self.decode.opacity,
-            color: &self.decode.color,
+            opacity,
+            color,
         }
     }
 
-    /// Records everything before the picture: which anchors are in view, their Gaussians, and the tiles' lists.
+    /// Records everything before the picture: which anchors are in view, their Gaussians or the plain ones, and the tiles'
+    /// lists.
+    ///
+    /// # Panics
+    /// For a model of another form than the stages'.
     pub fn record<'s>(
         &'s self,
         rec: &mut Recorder<'_>,
@@ -136,29 +235,42 @@ impl Forward {
         near: f32,
         limits: &Limits,
     ) -> Binned<'s> {
-        let Model { anchors, weights } = model;
-        self.visible.record(rec, anchors, camera, near, limits);
-        let offset = anchors.offset().value.view();
-        let model = decode::Anchors {
-            position: &anchors.position,
-            feature: &anchors.feature().value,
-            offset: &offset,
-            log_scaling: &anchors.log_scaling().value,
-            weights,
-            visible: &self.visible.list,
-        };
-        self.decode.record(rec, model, &self.visible.count, camera.center());
-        widen::record(rec, &self.decode.existing, self.gaussians(), camera, self.larger);
-        self.project.record(rec, &self.decode.existing, self.gaussians(), camera, near);
+        match (&self.front, model) {
+            (Front::Anchors { visible, decode }, Model::Anchors { anchors, weights }) => {
+                visible.record(rec, anchors, camera, near, limits);
+                let offset = anchors.offset().value.view();
+                let model = decode::Anchors {
+                    position: &anchors.position,
+                    feature: &anchors.feature().value,
+                    offset: &offset,
+                    log_scaling: &anchors.log_scaling().value,
+                    weights,
+                    visible: &visible.list,
+                };
+                decode.record(rec, model, &visible.count, camera.center());
+            }
+            (Front::Gaussians { activate, all, .. }, Model::Gaussians(gaussians)) => {
+                activate.record(rec, gaussians, camera.center());
+                limits.note(rec, &all.count, Counter::Visible);
+            }
+            _ => panic!("the stages are of another form than the model"),
+        }
+        widen::record(rec, self.existing(), self.gaussians(), camera, self.larger);
+        self.project.record(rec, self.existing(), self.gaussians(), camera, near);
         self.bin.record(rec, self.projected(), camera.size, limits)
     }
 }
 
 /// A model on the device.
 #[derive(Clone, Copy)]
-pub struct Model<'a> {
-    /// The anchors.
-    pub anchors: &'a Anchors,
-    /// The decoders, flat.
-    pub weights: &'a Buffer<f32>,
+pub enum Model<'a> {
+    /// Anchors and their decoders.
+    Anchors {
+        /// The anchors.
+        anchors: &'a Anchors,
+        /// The decoders, flat.
+        weights: &'a Buffer<f32>,
+    },
+    /// Plain Gaussians.
+    Gaussians(&'a Static),
 }

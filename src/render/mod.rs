@@ -1,5 +1,6 @@
 //! Cull, decode, project, bin, rasterize: forward and backward of a stage in one room.
 
+pub mod activate;
 pub mod bin;
 pub mod config;
 pub mod cull;

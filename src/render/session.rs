@@ -139,7 +139,7 @@ impl<S> Session<S> {
             let kept = self.stages.take().filter(|stages| stages.room.size == camera.size);
             let stages = match kept {
                 Some(stages) => stages,
-                None => self.allocate(model.anchors.offsets, camera.size)?,
+                None => self.allocate(model, camera.size)?,
             };
             let mut rec = gpu.recorder()?;
             let binned = stages.forward.record(&mut rec, model, camera, self.near, &limits);
@@ -151,10 +151,13 @@ impl<S> Session<S> {
         Ok(if fits { self.stages.as_ref() } else { None })
     }
 
-    fn allocate(&self, offsets: u32, size: [u32; 2]) -> Result<Stages<S>, Error> {
+    fn allocate(&self, model: Model<'_>, size: [u32; 2]) -> Result<Stages<S>, Error> {
         let Self { gpu, method, capacity, .. } = self;
-        let mut forward = Forward::new(gpu, *capacity, offsets, *method, size, self.cull)?;
-        let slots = capacity.visible as usize * offsets as usize;
+        let mut forward = Forward::of(gpu, *capacity, model, *method, size, self.cull)?;
+        let slots = match model {
+            Model::Anchors { anchors, .. } => capacity.visible as usize * anchors.offsets as usize,
+            Model::Gaussians(gaussians) => gaussians.count as usize,
+        };
         let room = Room { method: *method, size, slots, pairs: capacity.pairs as usize };
         forward.larger = self.larger;
         Ok(Stages { room, forward, own: (self.make)(gpu, room)? })

@@ -6,6 +6,8 @@ use super::session::{Room, Session, Stages};
 use crate::gpu::{Buffer, Error, Gpu};
 use crate::model::anchors::Anchors;
 use crate::model::files;
+use crate::model::gaussians::Static;
+use crate::model::stored::Stored;
 use crate::scene::Camera;
 
 /// A finished picture on the host.
@@ -110,8 +112,14 @@ impl Painter {
 /// Renders views of a finished model.
 pub struct Renderer {
     painter: Painter,
-    anchors: Anchors,
-    weights: Buffer<f32>,
+    model: Finished,
+}
+
+/// A finished model on the device.
+#[expect(clippy::large_enum_variant, reason = "a renderer has one")]
+enum Finished {
+    Anchors(Anchors, Buffer<f32>),
+    Gaussians(Static),
 }
 
 impl Renderer {
@@ -129,7 +137,21 @@ impl Renderer {
         let weights = gpu.upload("weights", &weights.decoders())?;
         let anchors = Anchors::upload(gpu, anchors, 0)?;
         let painter = Painter::new(gpu, config, background, Capacity::guess(anchors.count))?;
-        Ok(Self { painter, anchors, weights })
+        Ok(Self { painter, model: Finished::Anchors(anchors, weights) })
+    }
+
+    /// A renderer of a model in either form.
+    ///
+    /// # Errors
+    /// When the device has no room for it.
+    pub fn of(gpu: &Gpu, model: &Stored, config: &super::Config, background: [f32; 3]) -> Result<Self, Error> {
+        let cloud = match model {
+            Stored::Anchors(anchors, weights) => return Self::new(gpu, anchors, weights, config, background),
+            Stored::Gaussians(cloud) => cloud,
+        };
+        let gaussians = Static::upload(gpu, cloud)?;
+        let painter = Painter::new(gpu, config, background, Capacity::guess(gaussians.count))?;
+        Ok(Self { painter, model: Finished::Gaussians(gaussians) })
     }
 
     /// For pictures so many times larger than those of the training.
@@ -143,6 +165,10 @@ impl Renderer {
     /// # Errors
     /// When the device has no room for it, or is lost.
     pub fn render(&mut self, camera: &Camera) -> Result<Rendered, Error> {
-        self.painter.render(Model { anchors: &self.anchors, weights: &self.weights }, camera)
+        let model = match &self.model {
+            Finished::Anchors(anchors, weights) => Model::Anchors { anchors, weights },
+            Finished::Gaussians(gaussians) => Model::Gaussians(gaussians),
+        };
+        self.painter.render(model, camera)
     }
 }

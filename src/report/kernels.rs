@@ -329,7 +329,7 @@ impl Warm {
         let (anchors, weights) = step.model()?;
         let mut tensors = vec![];
         let mut values = BTreeMap::new();
-        for parameter in step.anchors.parameters().iter().chain([&step.weights]) {
+        for parameter in step.learnt.rows().into_iter().chain(step.learnt.weights()) {
             let [value, first, root] = parameter.tensors().map(|tensor| gpu.read(tensor));
             let value = value?;
             values.insert(parameter.value.name(), value.clone());
@@ -453,7 +453,7 @@ impl Bench {
     fn capture(&mut self, gpu: &Gpu, view: usize, twins: bool) -> Result<Capture, gpu::Error> {
         let recorder = |gpu| if twins { Gpu::reference(gpu, &WANTED) } else { Gpu::traced(gpu, &WANTED) };
         let words = self.run(gpu, view, recorder, take_trace)?;
-        Ok(Capture { words, offsets: self.step.anchors.offsets as usize })
+        Ok(Capture { words, offsets: self.step.anchors().offsets as usize })
     }
 
     /// The worst of every stage's own passes against their twins on the same inputs.

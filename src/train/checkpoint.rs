@@ -32,9 +32,12 @@ use crate::gpu::{self, Buffer, Gpu};
 use crate::losses::Term;
 use crate::math::attention::WEIGHTS as ATTENTION;
 use crate::math::decoder::Layout;
+use crate::math::harmonics::coefficients;
 use crate::model::anchors::Anchors;
 use crate::model::arrays::ARRAYS;
 use crate::model::files;
+use crate::model::gaussians::{self, Cloud};
+use crate::model::learnt::Learnt;
 use crate::model::parameter::{Names, PROJECTIONS, WEIGHTS};
 use crate::render::forward::Capacity;
 use crate::scene::{Camera, Prior, Scene};
@@ -63,9 +66,9 @@ pub struct Model {
     pub capacity: Capacity,
     /// Side of the anchors' grid, scene units.
     pub voxel: f64,
-    /// Gaussians per anchor.
+    /// Gaussians per anchor; 0: the model's rows are plain Gaussians.
     pub offsets: u32,
-    /// Anchors.
+    /// Anchors or plain Gaussians.
     pub anchors: u32,
     arrays: BTreeMap<String, Values>,
 }
@@ -83,15 +86,18 @@ pub struct Culprit {
 
 /// A step's arrays of float32 with the length that is in use.
 fn floats(step: &Step) -> Vec<(Buffer<f32>, usize)> {
-    let Step { anchors, statistics, .. } = step;
-    let n = anchors.count as usize;
-    let mut all = vec![(anchors.position.view(), 3 * n)];
-    let of_anchors = anchors.parameters().iter().map(|parameter| (parameter, n));
-    for (parameter, rows) in of_anchors.chain(step.networks().map(|parameter| (parameter, 1))) {
+    let Step { learnt, statistics, .. } = step;
+    let n = learnt.count() as usize;
+    let mut all = match learnt {
+        Learnt::Anchors { anchors, .. } => vec![(anchors.position.view(), 3 * n)],
+        Learnt::Gaussians(_) => vec![],
+    };
+    let rows = learnt.rows().into_iter().map(|parameter| (parameter, n));
+    for (parameter, rows) in rows.chain(step.networks().map(|parameter| (parameter, 1))) {
         all.extend(parameter.tensors().map(|tensor| (tensor.view(), rows * parameter.width as usize)));
     }
     if let Some(statistics) = statistics {
-        all.push((statistics.gradient.view(), n * anchors.offsets as usize));
+        all.push((statistics.gradient.view(), n * learnt.offsets() as usize));
         all.push((statistics.opacity_sum.view(), n));
     }
     all
@@ -99,12 +105,15 @@ fn floats(step: &Step) -> Vec<(Buffer<f32>, usize)> {
 
 /// A step's arrays of counts, likewise.
 fn counts(step: &Step) -> Vec<(Buffer<u32>, usize)> {
-    let n = step.anchors.count as usize;
+    let n = step.learnt.count() as usize;
     let of = |statistics: &Statistics| {
-        [(statistics.seen.view(), n * step.anchors.offsets as usize), (statistics.visits.view(), n)]
+        [(statistics.seen.view(), n * step.learnt.offsets() as usize), (statistics.visits.view(), n)]
     };
     step.statistics.iter().flat_map(of).collect()
 }
+
+/// What stands for Gaussians per anchor where there are none.
+const PLAIN: u32 = 0;
 
 /// Projections of an attention whose time has not come.
 const WAITING: &str = "attention_initial";
@@ -125,8 +134,11 @@ impl Model {
         if let Some(initial) = &step.attention_weights {
             arrays.insert(WAITING.to_owned(), Values::Float(initial.clone()));
         }
-        let Anchors { offsets, count, .. } = step.anchors;
-        Ok(Self { capacity: step.capacity(), voxel: step.voxel, offsets, anchors: count, arrays })
+        let offsets = match &step.learnt {
+            Learnt::Anchors { anchors, .. } => anchors.offsets,
+            Learnt::Gaussians(_) => PLAIN,
+        };
+        Ok(Self { capacity: step.capacity(), voxel: step.voxel, offsets, anchors: step.learnt.count(), arrays })
     }
 
     fn float(&self, name: &str) -> &[f32] {
@@ -148,8 +160,27 @@ impl Model {
         })
     }
 
-    /// The model's files.
-    pub fn files(&self) -> (files::Anchors, files::Weights) {
+    /// The plain Gaussians, with what is learnt of their harmonics as it is.
+    fn cloud(&self) -> Cloud {
+        let triples = |name: &str| self.float(name).as_chunks().0.to_vec();
+        Cloud {
+            position: triples("position"),
+            log_scale: triples("log_scale"),
+            rotation: self.float("quaternion").as_chunks().0.to_vec(),
+            logit: self.float("logit").to_vec(),
+            degree: self.degree().unwrap_or(0),
+            harmonics: triples("harmonics"),
+        }
+    }
+
+    /// Degree of the plain Gaussians' harmonics; `None` for a length that belongs to none.
+    fn degree(&self) -> Option<u32> {
+        let floats = self.float("harmonics").len();
+        (0..=3).find(|degree| floats == 3 * coefficients(*degree) * self.anchors as usize)
+    }
+
+    /// The anchors' files.
+    fn files(&self) -> (files::Anchors, files::Weights) {
         let mut anchors = files::Anchors { offsets_per_anchor: self.offsets as usize, ..files::Anchors::default() };
         anchors.position = self.float("position").as_chunks().0.to_vec();
         for array in &ARRAYS {
@@ -165,19 +196,26 @@ impl Model {
     /// # Errors
     /// When the device has no room.
     pub fn restore(&self, gpu: &Gpu, plan: Plan, settings: &Settings) -> Result<Step, gpu::Error> {
-        let (anchors, weights) = self.files();
-        let mut step = Step::new(gpu, plan, settings, &anchors, &weights, self.voxel)?;
-        step.anchors = Anchors::upload(gpu, &anchors, self.capacity.anchors)?;
+        let mut step = if self.offsets == PLAIN {
+            Step::of_gaussians(gpu, plan, settings, &self.cloud())?
+        } else {
+            let (anchors, weights) = self.files();
+            let mut step = Step::new(gpu, plan, settings, &anchors, &weights, self.voxel)?;
+            if let Learnt::Anchors { anchors: device, .. } = &mut step.learnt {
+                *device = Anchors::upload(gpu, &anchors, self.capacity.anchors)?;
+            }
+            step
+        };
         step.resize(self.capacity)?;
         if self.arrays.contains_key(PROJECTIONS.value) {
             let (config, seed) = (&settings.model.attention, settings.train.seed);
             let initial = self.float(PROJECTIONS.value);
-            step.attend = Some(Attend::new(gpu, config, seed, step.anchors.capacity, initial)?);
+            step.attend = Some(Attend::new(gpu, config, seed, step.learnt.capacity(), initial)?);
             step.attention_weights = None;
         }
         if self.arrays.contains_key("visits") {
             step.statistics =
-                Some(Statistics::new(gpu, step.anchors.capacity, self.offsets, settings.densify.count_touched)?);
+                Some(Statistics::new(gpu, step.learnt.capacity(), self.offsets, settings.densify.count_touched)?);
         }
         for (buffer, _) in floats(&step) {
             gpu.write(&buffer, self.float(buffer.name()))?;
@@ -193,12 +231,21 @@ impl Model {
     /// What is wrong with the lengths, if anything is: [`Model::restore`] relies on them.
     fn check(&self) -> Result<(), String> {
         let (n, k) = (self.anchors as usize, self.offsets as usize);
-        let mut wanted = vec![("position", 3 * n)];
+        let mut wanted = vec![];
         let mut parameter = |names: Names, len: usize| wanted.extend(names.kept().map(|name| (name, len)));
-        for array in &ARRAYS {
-            parameter(array.names, n * (array.width)(self.offsets) as usize);
+        if self.offsets == PLAIN {
+            let each = self.degree().map_or(1, coefficients);
+            for (names, width) in gaussians::NAMES.into_iter().zip([3, 3, 4, 1, 3 * each]) {
+                parameter(names, n * width);
+            }
+        } else {
+            for array in &ARRAYS {
+                parameter(array.names, n * (array.width)(self.offsets) as usize);
+            }
+            parameter(WEIGHTS, Layout { offsets: k }.weights());
+            wanted.push(("position", 3 * n));
         }
-        parameter(WEIGHTS, Layout { offsets: k }.weights());
+        let mut parameter = |names: Names, len: usize| wanted.extend(names.kept().map(|name| (name, len)));
         if self.arrays.contains_key(PROJECTIONS.value) {
             parameter(PROJECTIONS, ATTENTION);
         }

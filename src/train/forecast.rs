@@ -17,7 +17,10 @@ use super::step::{Rates, Step};
 use crate::config::Settings;
 use crate::gpu::{self, Gpu, Schedule, Used};
 use crate::model::anchors::Anchors;
+use crate::model::config::Form;
+use crate::model::gaussians::{Cloud, Static};
 use crate::model::init::{self, Initial};
+use crate::model::learnt::Learnt;
 use crate::primitives::limit::{Counter, Limits};
 use crate::render::Method;
 use crate::render::forward::{self, Capacity, Forward, Model};
@@ -65,6 +68,38 @@ pub fn initial(scene: &Scene, settings: &Settings) -> Result<Initial, init::Erro
     init::from_points(&scene.starts(), &settings.fitted(scene).model, settings.train.seed)
 }
 
+/// What a run starts from, in either form of the model.
+#[derive(Clone, Debug)]
+pub enum Beginning {
+    /// Anchors.
+    Anchors(Initial),
+    /// Plain Gaussians.
+    Gaussians(Cloud),
+}
+
+impl Beginning {
+    /// That of a run under these settings.
+    ///
+    /// # Errors
+    /// Points that make no model.
+    pub fn of(scene: &Scene, settings: &Settings) -> Result<Self, init::Error> {
+        Ok(match settings.model.form {
+            Form::Anchors => Self::Anchors(initial(scene, settings)?),
+            Form::Gaussians => {
+                Self::Gaussians(init::gaussians(&scene.starts(), &settings.model, settings.densify.max_gaussians)?)
+            }
+        })
+    }
+
+    /// Anchors or plain Gaussians.
+    pub fn count(&self) -> u32 {
+        match self {
+            Self::Anchors(initial) => initial.anchors.position.len() as u32,
+            Self::Gaussians(cloud) => cloud.len() as u32,
+        }
+    }
+}
+
 /// Most cameras that a survey looks through: it comes before the first step, and what they miss the margin of
 /// [`Survey::capacity`] covers.
 const SURVEYED: usize = 12;
@@ -75,39 +110,57 @@ const SURVEYED: usize = 12;
 /// When the device has no room for a forward pass.
 pub fn survey<'c>(
     gpu: &Gpu,
-    initial: &Initial,
+    initial: &Beginning,
     settings: &Settings,
     cameras: impl IntoIterator<Item = &'c Camera>,
 ) -> Result<Survey, gpu::Error> {
     let cameras: Vec<&Camera> = cameras.into_iter().collect();
-    let offsets = initial.anchors.offsets_per_anchor as u32;
-    let flat = init::weights(settings.train.seed, offsets as usize, false, settings.model.opacity).decoders();
-    let weights = gpu.upload("weights", &flat)?;
-    let anchors = Anchors::upload(gpu, &initial.anchors, 0)?;
+    match initial {
+        Beginning::Anchors(initial) => {
+            let offsets = initial.anchors.offsets_per_anchor;
+            let flat = init::weights(settings.train.seed, offsets, false, settings.model.opacity).decoders();
+            let weights = gpu.upload("weights", &flat)?;
+            let anchors = Anchors::upload(gpu, &initial.anchors, 0)?;
+            survey_of(gpu, Model::Anchors { anchors: &anchors, weights: &weights }, anchors.count, settings, cameras)
+        }
+        Beginning::Gaussians(cloud) => {
+            let gaussians = Static::upload(gpu, cloud)?;
+            survey_of(gpu, Model::Gaussians(&gaussians), gaussians.count, settings, cameras)
+        }
+    }
+}
+
+fn survey_of(
+    gpu: &Gpu,
+    model: Model<'_>,
+    count: u32,
+    settings: &Settings,
+    cameras: Vec<&Camera>,
+) -> Result<Survey, gpu::Error> {
     let size = cameras.iter().fold([1, 1], |a, c| [a[0].max(c.size[0]), a[1].max(c.size[1])]);
     let method = Method::new(gpu, &settings.render)?;
     let limits = Limits::new(gpu)?;
     let near = settings.render.near as f32;
     // Pairs are counted whether they fit or not.
-    let mut capacity = Capacity { pairs: 1, ..Capacity::guess(anchors.capacity) };
-    let mut forward = Forward::new(gpu, capacity, offsets, method, size, settings.render.cull)?;
-    let mut most = Survey { anchors: anchors.count, visible: 0, pairs: 0 };
+    let mut capacity = Capacity { pairs: 1, ..Capacity::guess(count.max(1)) };
+    let mut forward = Forward::of(gpu, capacity, model, method, size, settings.render.cull)?;
+    let mut most = Survey { anchors: count, visible: 0, pairs: 0 };
     let every = cameras.len().div_ceil(SURVEYED).max(1);
     for camera in cameras.into_iter().step_by(every) {
         loop {
             let mut rec = gpu.recorder()?;
             limits.lower(&mut rec);
-            forward.record(&mut rec, Model { anchors: &anchors, weights: &weights }, camera, near, &limits);
+            forward.record(&mut rec, model, camera, near, &limits);
             rec.submit()?.wait()?;
             let counters = gpu.read(limits.counters())?;
             let [visible, pairs] = [Counter::Visible, Counter::Pairs].map(|c| counters[c as usize]);
-            if visible <= capacity.visible {
+            if visible <= capacity.visible || matches!(model, Model::Gaussians(_)) {
                 most = Survey { visible: most.visible.max(visible), pairs: most.pairs.max(pairs), ..most };
                 break;
             }
             drop(forward);
-            capacity.visible = visible.saturating_add(visible / 2).min(anchors.capacity);
-            forward = Forward::new(gpu, capacity, offsets, method, size, settings.render.cull)?;
+            capacity.visible = visible.saturating_add(visible / 2).min(count.max(1));
+            forward = Forward::of(gpu, capacity, model, method, size, settings.render.cull)?;
         }
     }
     Ok(most)
@@ -120,11 +173,20 @@ pub fn survey<'c>(
 /// that within the first eight rounds: `N + M c^2 / 5 * r / (r + 8)` for N anchors in M such cells after r rounds. The two
 /// numbers come from three scenes (the built-in one, fern and SPIn-NeRF's scene 1 at a quarter of its size), whose growth
 /// the formula meets within 4 % of all anchors; other scenes may differ by more. `densify.max_anchors` and the device's
-/// largest binding limit it.
-pub fn expected_anchors(gpu: &Gpu, plan: &Plan, settings: &Settings, initial: &Initial) -> u32 {
-    let count = initial.anchors.position.len() as u32;
+/// largest binding limit it. Plain Gaussians grow by the same share in each round, up to `densify.max_gaussians`.
+pub fn expected_anchors(gpu: &Gpu, plan: &Plan, settings: &Settings, initial: &Beginning) -> u32 {
+    let count = initial.count();
     let Some(rounds) = plan.rounds else { return count };
     let config = &settings.densify;
+    let initial = match initial {
+        Beginning::Anchors(initial) => initial,
+        Beginning::Gaussians(cloud) => {
+            let rounds = (rounds.last - rounds.first) / config.every + 1;
+            let grown = f64::from(count) * (1.0 + config.growth).powi(rounds.min(10_000) as i32);
+            let most = config.max_gaussians.min(Static::most(gpu, cloud.degree));
+            return grown.min(most.max(count).into()) as u32;
+        }
+    };
     let side = initial.voxel * config.coarsest_cell;
     let cells: BTreeSet<[i64; 3]> =
         initial.anchors.position.iter().map(|p| p.map(|x| (f64::from(x) / side).round_ties_even() as i64)).collect();
@@ -163,7 +225,9 @@ pub struct Forecast {
     pub survey: Survey,
     /// Room to start with.
     pub capacity: Capacity,
-    /// Anchors at the end, as assumed.
+    /// The form of the model.
+    pub form: Form,
+    /// Anchors or plain Gaussians at the end, as assumed.
     pub anchors: u32,
     /// Bytes with the first step's stages.
     pub start: u64,
@@ -207,18 +271,23 @@ pub fn rehearse(
     gpu: &Gpu,
     scene: &Scene,
     settings: &Settings,
-    initial: &Initial,
+    initial: &Beginning,
     survey: Survey,
     anchors: u32,
     also: Option<u32>,
 ) -> Result<Forecast, Error> {
     let gpu = gpu.rehearsal();
     let plan = Plan::new(scene, settings);
-    let offsets = settings.model.offsets as usize;
-    let weights = init::weights(settings.train.seed, offsets, plan.attention, settings.model.opacity);
     let coarse = settings.train.coarse;
     let mut photographs = photographs::upload(&gpu, scene, &plan, coarse.reduction(1))?;
-    let mut step = Step::new(&gpu, plan.clone(), settings, &initial.anchors, &weights, initial.voxel)?;
+    let mut step = match initial {
+        Beginning::Anchors(initial) => {
+            let offsets = settings.model.offsets as usize;
+            let weights = init::weights(settings.train.seed, offsets, plan.attention, settings.model.opacity);
+            Step::new(&gpu, plan.clone(), settings, &initial.anchors, &weights, initial.voxel)?
+        }
+        Beginning::Gaussians(cloud) => Step::of_gaussians(&gpu, plan.clone(), settings, cloud)?,
+    };
     let capacity = survey.capacity();
     step.resize(capacity)?;
     let start = gpu.memory().0;
@@ -227,7 +296,7 @@ pub fn rehearse(
         let (bytes, peak) = gpu.memory();
         moments.push(Moment { what: what.to_owned(), step: at, anchors, bytes, peak });
     };
-    note("the first step", 1, step.anchors.count);
+    note("the first step", 1, step.learnt.count());
 
     let iterations = plan.iterations;
     let counted = plan.counted;
@@ -237,7 +306,11 @@ pub fn rehearse(
     let mut at: BTreeSet<u32> = [1, iterations].into_iter().chain(also).collect();
     at.extend(counted.map(|c| c.first).into_iter().chain(attention).chain(after).chain(evaluations));
     let every = settings.densify.every as usize;
-    let rounds: Vec<u32> = plan.rounds.map_or(vec![], |r| (r.first..=r.last).step_by(every).collect());
+    let mut rounds: Vec<u32> = plan.rounds.map_or(vec![], |r| (r.first..=r.last).step_by(every).collect());
+    if matches!(initial, Beginning::Gaussians(_)) {
+        // All rounds are alike, and the room of the last is there from the first step on.
+        rounds.drain(..rounds.len().saturating_sub(1));
+    }
     at.extend(&rounds);
     at.extend((coarse.until > 0).then_some(coarse.until + 1));
     at.retain(|&s| s <= iterations || Some(s) == also);
@@ -251,7 +324,7 @@ pub fn rehearse(
             photographs.clear();
             step.resize_pictures(Plan::reduced_sizes(scene, reduction))?;
             photographs = photographs::upload(&gpu, scene, &plan, reduction)?;
-            note("pictures of the full size", number, step.anchors.count);
+            note("pictures of the full size", number, step.learnt.count());
         }
         step.prepare(number)?;
         let kept = !rounds.contains(&number) || Some(number) == also;
@@ -266,43 +339,60 @@ pub fn rehearse(
             }
         }
         if Some(number) == counted.map(|c| c.first) {
-            note("statistics begin", number, step.anchors.count);
+            note("statistics begin", number, step.learnt.count());
         }
         if Some(number) == attention {
-            note("attention begins", number, step.anchors.count);
+            note("attention begins", number, step.learnt.count());
         }
-        if step.changes_anchors(number) && number <= iterations {
+        if let Learnt::Gaussians(gaussians) = &mut step.learnt {
+            if rounds.last() == Some(&number) && number <= iterations {
+                gaussians.count = anchors.clamp(gaussians.count, gaussians.capacity);
+                step.resize(step.capacity())?;
+                note("the last round of growing", number, step.learnt.count());
+            }
+        } else if step.changes_anchors(number) && number <= iterations {
             let round = rounds.partition_point(|&r| r <= number);
             let target = f64::from(survey.anchors) + grown * share(round) / share(rounds.len());
-            let more = (target as u32).saturating_sub(step.anchors.count).div_ceil(settings.densify.levels);
+            let more = (target as u32).saturating_sub(step.learnt.count()).div_ceil(settings.densify.levels);
             let room = most_anchors(&gpu, settings, survey.anchors);
             // A level has a candidate for every Gaussian at most, and no more free cells than candidates.
-            let candidates = more.saturating_mul(4).min(step.anchors.count.saturating_mul(settings.model.offsets));
+            let candidates = more.saturating_mul(4).min(step.learnt.count().saturating_mul(settings.model.offsets));
             let free = more.min(candidates);
-            let kept = (step.anchors.count + free * settings.densify.levels).min(room.max(step.anchors.count));
+            let kept = (step.learnt.count() + free * settings.densify.levels).min(room.max(step.learnt.count()));
             for (buffer, word) in [("candidate_count", candidates), ("free_count", free), ("kept_count", kept)] {
                 gpu.answer(buffer, word);
             }
             step.change_anchors(number)?;
             if number == rounds[rounds.len() - 1] {
-                note("the last round of growing", number, step.anchors.count);
+                note("the last round of growing", number, step.learnt.count());
             }
         }
-        if Some(number) == after {
-            note("statistics have ended", number, step.anchors.count);
+        if Some(number) == after && counted.is_some() {
+            note("statistics have ended", number, step.learnt.count());
         }
         if Some(number) == evaluations || (plan.evaluation && number == iterations) {
             let mut sizes = BTreeSet::new();
             let cameras = scene.test.iter().map(|v| &v.camera).filter(|c| sizes.insert(c.size));
             step.draw(cameras, |_, _| Ok::<_, gpu::Error>(()))?;
-            note("test views", number, step.anchors.count);
+            note("test views", number, step.learnt.count());
         }
     }
-    step.model()?;
-    note("the model is saved", iterations, step.anchors.count);
+    step.stored()?;
+    note("the model is saved", iterations, step.learnt.count());
     let (used, pipelines, peak) = (gpu.used(), gpu.pipelines(), gpu.memory().1);
-    let anchors = step.anchors.count;
-    Ok(Forecast { survey, capacity, anchors, start, peak, moments, used, pipelines, schedules })
+    let anchors = step.learnt.count();
+    Ok(Forecast {
+        survey,
+        capacity,
+        form: settings.model.form,
+        anchors,
+        start,
+        peak,
+        moments,
+        used,
+        pipelines,
+        schedules,
+    })
 }
 
 /// A change of settings under which a run would fit.
@@ -349,11 +439,12 @@ impl Verdict {
         };
         Some(match &self.forecast {
             Ok(f) => format!(
-                "this run needs about {} MiB of device memory ({} MiB at its start, the rest with {} anchors at its end), \
+                "this run needs about {} MiB of device memory ({} MiB at its start, the rest with {} {} at its end), \
                  and {} MiB are free; {remedies}",
                 mib(f.needs()),
                 mib(f.start + gpu::device::SPARE_BYTES),
                 f.anchors,
+                f.form.rows(),
                 mib(self.available)
             ),
             Err(buffer) => format!("{buffer}; {remedies}"),
@@ -429,13 +520,13 @@ pub fn forecast(gpu: &Gpu, scene: &Scene, settings: &Settings, question: Questio
 
 /// What a run starts from, looked up once for several rehearsals.
 struct Start {
-    initial: Initial,
+    initial: Beginning,
     counts: Survey,
 }
 
 impl Start {
     fn of(gpu: &Gpu, scene: &Scene, settings: &Settings) -> Result<Self, Error> {
-        let initial = initial(scene, settings)?;
+        let initial = Beginning::of(scene, settings)?;
         let counts = surveyed(gpu, &initial, settings, scene.train.iter().map(|v| &v.camera))?;
         Ok(Self { initial, counts })
     }
@@ -484,6 +575,9 @@ const GROWTH_SHARES: [f64; 6] = [1.0, 0.75, 0.5, 0.25, 0.1, 0.0];
 /// As [`forecast`].
 pub fn fitting(gpu: &Gpu, scene: &Scene, asked: &Settings, available: Option<u64>) -> Result<Fitting, Error> {
     let available = available.unwrap_or_else(|| gpu.available_bytes());
+    if asked.model.form == Form::Gaussians {
+        return fitting_gaussians(gpu, scene, asked, available);
+    }
     let most = forward::most_anchors(gpu, asked.model.offsets) as usize;
     for coarser in COARSER {
         let mut settings = asked.clone();
@@ -525,17 +619,42 @@ pub fn fitting(gpu: &Gpu, scene: &Scene, asked: &Settings, available: Option<u64
     Ok(Fitting { settings: asked.clone(), verdict, reduced: None })
 }
 
+/// As [`fitting`]: fewer Gaussians until they fit.
+fn fitting_gaussians(gpu: &Gpu, scene: &Scene, asked: &Settings, available: u64) -> Result<Fitting, Error> {
+    let most = asked.densify.max_gaussians.min(Static::most(gpu, asked.model.degree));
+    for share in GAUSSIANS {
+        let mut settings = asked.clone();
+        settings.densify.max_gaussians = if share < 1.0 { (f64::from(most) * share).ceil() as u32 } else { most };
+        let verdict = forecast(gpu, scene, &settings, Question { available: Some(available), ..Question::default() })?;
+        if verdict.fits() {
+            let fewer = settings.densify.max_gaussians;
+            let reduced = (fewer < asked.densify.max_gaussians).then(|| {
+                format!(
+                    "there are {fewer} Gaussians at most (densify.max_gaussians), which is what the device has room for"
+                )
+            });
+            return Ok(Fitting { settings, verdict, reduced });
+        }
+    }
+    let verdict = forecast(gpu, scene, asked, Question { available: Some(available), ..Question::default() })?;
+    Ok(Fitting { settings: asked.clone(), verdict, reduced: None })
+}
+
+/// Shares of the Gaussians asked for that are tried, the most first.
+const GAUSSIANS: [f64; 6] = [1.0, 0.75, 0.5, 0.25, 0.1, 0.03];
+
 /// As [`survey`]; where the device has no room for that either, or no memory at all, as if all anchors were in view.
 fn surveyed<'c>(
     gpu: &Gpu,
-    initial: &Initial,
+    initial: &Beginning,
     settings: &Settings,
     cameras: impl IntoIterator<Item = &'c Camera>,
 ) -> Result<Survey, Error> {
     match survey(gpu, initial, settings, cameras) {
         Err(gpu::Error::TooLarge { .. } | gpu::Error::OutOfMemory { .. } | gpu::Error::Missing { .. }) => {
-            let anchors = initial.anchors.position.len() as u32;
-            Ok(Survey { anchors, visible: anchors, pairs: anchors.saturating_mul(settings.model.offsets) })
+            let anchors = initial.count();
+            let offsets = if settings.model.form == Form::Anchors { settings.model.offsets } else { 1 };
+            Ok(Survey { anchors, visible: anchors, pairs: anchors.saturating_mul(offsets) })
         }
         other => Ok(other?),
     }
@@ -552,7 +671,7 @@ fn remedies(
     // Bytes that a run of these settings needs, if they are as many as there are or fewer.
     let needs = |scene: &Scene, settings: &Settings| -> Result<Option<u64>, Error> {
         let plan = Plan::new(scene, settings);
-        let first = initial(scene, settings)?;
+        let first = Beginning::of(scene, settings)?;
         let cameras = scene.train.iter().step_by(every).map(|v| &v.camera);
         let mut counts = surveyed(gpu, &first, settings, cameras)?;
         if every > 1 {
@@ -577,6 +696,18 @@ fn remedies(
             break;
         }
     }
+    if settings.model.form == Form::Gaussians {
+        for share in GAUSSIANS.into_iter().skip(1) {
+            let mut changed = settings.clone();
+            changed.densify.max_gaussians = (f64::from(settings.densify.max_gaussians) * share).ceil() as u32;
+            if let Some(needs) = needs(scene, &changed)? {
+                let change = format!("--set densify.max_gaussians={}", changed.densify.max_gaussians);
+                found.push(Remedy { change, needs });
+                break;
+            }
+        }
+        return Ok(found);
+    }
     for factor in [1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0] {
         let mut changed = settings.clone();
         let change = if settings.model.voxel > 0.0 {
@@ -591,9 +722,9 @@ fn remedies(
             break;
         }
     }
-    let first = initial(scene, settings)?;
+    let first = Beginning::of(scene, settings)?;
     let plan = Plan::new(scene, settings);
-    let count = first.anchors.position.len() as u32;
+    let count = first.count();
     if plan.growth && question.anchors.is_none() {
         let expected = expected_anchors(gpu, &plan, settings, &first);
         // In eighths of the growth, the most first.

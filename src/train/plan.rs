@@ -4,6 +4,7 @@ use super::photographs::reduced_size;
 use crate::config::Settings;
 use crate::losses;
 use crate::model::arrays::ARRAYS;
+use crate::model::config::Form;
 use crate::model::parameter::DECODERS;
 use crate::optimizer::Group;
 use crate::render::rasterize::Outputs;
@@ -86,7 +87,10 @@ pub struct Plan {
     pub other_depth: DepthLosses,
     /// Cross-attention, from `model.attention.start` on.
     pub attention: bool,
-    /// Growing and pruning of anchors.
+    /// Anchors, or plain Gaussians.
+    #[serde(skip)]
+    pub form: Form,
+    /// Growing and pruning of anchors, or moving and adding of plain Gaussians.
     pub growth: bool,
     /// Likewise, with the steps behind which the first and the last round come.
     pub rounds: Option<Steps>,
@@ -192,6 +196,8 @@ impl Plan {
             };
             leave("cross-attention", &why);
         }
+        let form = settings.model.form;
+        let plain = form == Form::Gaussians;
         let rounds = rounds(settings);
         if rounds.is_none() {
             let why = if settings.densify.enabled {
@@ -202,8 +208,14 @@ impl Plan {
             leave("statistics, growing and pruning", &why);
         }
         let counted = rounds.map(|r| Steps { first: settings.densify.statistics_from.max(1), last: r.last });
-        let cull = settings.render.cull;
-        if !cull {
+        let counted = counted.filter(|_| !plain);
+        if plain && rounds.is_some() {
+            leave("statistics", "plain Gaussians move by their opacity alone");
+        }
+        let cull = settings.render.cull && !plain;
+        if plain {
+            leave("culling", "model.form is \"gaussians\": each is projected by itself");
+        } else if !cull {
             leave("culling", "render.cull is false");
         }
         let sentinel = settings.train.sentinel_interval > 0;
@@ -212,19 +224,22 @@ impl Plan {
         }
         let rates = &settings.optimizer.learning_rate;
         let trained = |group: &Group| match group {
+            group if group.form() != form => false,
             // Gradients pass through the features to the attention's projections.
             Group::Feature if attention => true,
             Group::Attention => attention,
             _ => rates.of(*group) != [0.0; 2],
         };
         let trained = Trained(Group::ALL.into_iter().filter(trained).collect());
-        for array in ARRAYS.iter().filter(|array| !trained.any([array.group])) {
-            leave(array.gradient, &format!("optimizer.learning_rate.{} is zero", array.group.name()));
+        if !plain {
+            for array in ARRAYS.iter().filter(|array| !trained.any([array.group])) {
+                leave(array.gradient, &format!("optimizer.learning_rate.{} is zero", array.group.name()));
+            }
+            if !trained.any(DECODERS) {
+                leave("gradient of decoders", "optimizer.learning_rate.mlp_* is zero");
+            }
+            leave("gradient of anchor positions", "anchors do not move");
         }
-        if !trained.any(DECODERS) {
-            leave("gradient of decoders", "optimizer.learning_rate.mlp_* is zero");
-        }
-        leave("gradient of anchor positions", "anchors do not move");
         leave("gradient of view directions and distances", "cameras do not move");
         leave("transmittance and its gradient", "no loss looks at it");
         let evaluation = !scene.test.is_empty();
@@ -240,6 +255,7 @@ impl Plan {
             align_to_points: settings.losses.depth.align_to_points,
             other_depth,
             attention,
+            form,
             growth: rounds.is_some(),
             rounds,
             counted,
@@ -292,6 +308,7 @@ impl Plan {
         match name {
             stage::ATTENTION => self.attention.then_some(Steps { first: settings.model.attention.start.max(1), ..all }),
             stage::SENTINEL => self.sentinel.then_some(all),
+            stage::CULL => (self.form == Form::Anchors).then_some(all),
             stage::STATISTICS => self.counted,
             stage::GROWTH => self.rounds,
             stage::EVALUATION => {
@@ -311,7 +328,10 @@ impl Plan {
         let listed = |what: &str| self.left_out.iter().find(|left| left.what == what).map(|left| left.why.as_str());
         match name {
             stage::ATTENTION => listed("cross-attention"),
-            stage::STATISTICS | stage::GROWTH => listed("statistics, growing and pruning"),
+            stage::CULL => listed("culling"),
+            stage::STATISTICS | stage::GROWTH => {
+                listed("statistics, growing and pruning").or_else(|| listed("statistics"))
+            }
             stage::SENTINEL => listed("sentinel"),
             stage::EVALUATION => listed("evaluation"),
             _ => losses::Term::of_stage(name)?.left_out.iter().find_map(|what| listed(what)),

@@ -114,7 +114,7 @@ fn alone() {
     // Without the validation layer, under which every pass of this runs in other tests.
     let gpu = Gpu::open(&Options { device, ..Options::default() }).expect("a device");
     let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
-    let initial = run.step().anchors.count;
+    let initial = run.step().anchors().count;
     let folder = tempfile::tempdir().expect("a temporary folder");
     let mut watch = Watch { folder: folder.path().to_owned(), ..Watch::default() };
     let summary = run.train(folder.path(), &mut watch).expect("a run");
@@ -132,7 +132,7 @@ fn alone() {
     for (half, end) in half.iter().zip(end) {
         assert!(end.is_finite() && end < 2.0 * half, "largest magnitudes {half}, {end}");
     }
-    for parameter in run.step().anchors.parameters().iter().chain([&run.step().weights]) {
+    for parameter in run.step().parameters() {
         for tensor in parameter.tensors() {
             assert!(gpu.read(tensor).expect("read").iter().all(|v| v.is_finite()), "{}", tensor.name());
         }

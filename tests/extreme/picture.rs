@@ -148,7 +148,7 @@ fn run_with(gpu: &Gpu, method: Method, model: &Model, camera: &Camera, near: f32
     let slots = capacity.visible as usize * K;
     let backward = Backward::new(gpu, method, slots, 1 << 18, Outputs::Transmittance).expect(fine);
     let project_backward = ProjectBackward::new(gpu, &forward.project).expect(fine);
-    let decode_backward = DecodeBackward::new(gpu, &forward.decode).expect(fine);
+    let decode_backward = DecodeBackward::new(gpu, forward.decode()).expect(fine);
     let zeros = |name, len: usize| gpu.upload(name, &vec![0f32; len]).expect(fine);
     let grad_feature = zeros("grad_feature", anchors.feature().value.len());
     let grad_offset = zeros("grad_offset", anchors.offset().value.len());
@@ -162,7 +162,7 @@ fn run_with(gpu: &Gpu, method: Method, model: &Model, camera: &Camera, near: f32
     let grad_z = gpu.upload("grad_depth_map", &z).expect(fine);
 
     let mut rec = gpu.recorder().expect(fine);
-    forward.visible.record(&mut rec, &anchors, camera, near, &limits);
+    forward.visible().record(&mut rec, &anchors, camera, near, &limits);
     let offset = anchors.offset().value.view();
     let of = decode::Anchors {
         position: &anchors.position,
@@ -170,14 +170,14 @@ fn run_with(gpu: &Gpu, method: Method, model: &Model, camera: &Camera, near: f32
         offset: &offset,
         log_scaling: &anchors.log_scaling().value,
         weights: &weights,
-        visible: &forward.visible.list,
+        visible: &forward.visible().list,
     };
-    forward.decode.record(&mut rec, of, &forward.visible.count, camera.center());
+    forward.decode().record(&mut rec, of, &forward.visible().count, camera.center());
     // What does not exist is not written: absent.
     rec.zero(&forward.project.mean);
     rec.zero(&forward.project.covariance);
     rec.zero(&forward.project.depth);
-    forward.project.record(&mut rec, &forward.decode.existing, forward.gaussians(), camera, near);
+    forward.project.record(&mut rec, &forward.decode().existing, forward.gaussians(), camera, near);
     let binned = forward.bin.record(&mut rec, forward.projected(), size, &limits);
     rasterize::forward(&mut rec, method, forward.projected(), binned, BACKGROUND, &picture);
     let gradient = PictureGradient { rgb: &grad_rgb, depth: Some(&grad_z), transmittance: None };
@@ -203,7 +203,7 @@ fn run_with(gpu: &Gpu, method: Method, model: &Model, camera: &Camera, near: f32
         log_scaling: &grad_scaling,
         weights: &grad_weights,
     };
-    decode_backward.record(&mut rec, &forward.decode, of, gaussians, to);
+    decode_backward.record(&mut rec, forward.decode(), of, gaussians, to);
     rec.submit().expect(fine).wait().expect(fine);
     let counters = gpu.read(limits.counters()).expect(fine);
     assert_eq!(gpu.read(limits.overflow()).expect(fine), [0], "{counters:?}");
@@ -217,8 +217,8 @@ fn run_with(gpu: &Gpu, method: Method, model: &Model, camera: &Camera, near: f32
             mean: gpu.read_range(&forward.project.mean, slots).expect(fine),
             covariance: gpu.read_range(&forward.project.covariance, slots).expect(fine),
             depth: gpu.read_range(&forward.project.depth, slots).expect(fine),
-            opacity: gpu.read_range(&forward.decode.opacity, slots).expect(fine),
-            color: gpu.read_range(&forward.decode.color, slots).expect(fine),
+            opacity: gpu.read_range(&forward.decode().opacity, slots).expect(fine),
+            color: gpu.read_range(&forward.decode().color, slots).expect(fine),
         },
         rgb: gpu.read(&picture.rgb).expect(fine),
         depth: read(depth),

@@ -94,7 +94,7 @@ fn drawn_anchor(gpu: &Gpu, setup: &Setup) -> (usize, [Vec<u32>; 3]) {
         std::array::from_fn(|i| (camera.center()[i] - 5.0 * f64::from(camera.rotation[2][i])) as f32);
     for anchor in 0.. {
         let mut run = setup.run(gpu);
-        let position = run.step().anchors.position.view::<f32>();
+        let position = run.step().anchors().position.view::<f32>();
         for (i, v) in behind.into_iter().enumerate() {
             put(gpu, &position, 3 * anchor + i..3 * anchor + i + 1, v);
         }
@@ -113,7 +113,7 @@ fn anchors(gpu: &Gpu) {
         for tensor in 0..4 {
             let mut run = setup.run(gpu);
             let of = |run: &Run<'_>| {
-                let model = &run.step().anchors;
+                let model = run.step().anchors();
                 match tensor {
                     0 => (model.position.view::<f32>(), 3),
                     t => (model.parameters()[t - 1].value.view(), model.parameters()[t - 1].width as usize),
@@ -148,7 +148,7 @@ fn decoders(gpu: &Gpu) {
             let mut at = layout.head(head);
             for length in lengths {
                 let mut run = setup.run(gpu);
-                let weights = run.step().weights.value.view();
+                let weights = run.step().learnt.weights().expect("decoders").value.view();
                 put(gpu, &weights, at + length / 2..at + length / 2 + 1, poison);
                 first_step(gpu, &mut run);
                 let after = gpu.read(&weights).expect("read");
@@ -164,14 +164,14 @@ fn moments(gpu: &Gpu) {
     let setup = Setup::new();
     let tensors = |run: &Run<'_>| -> Vec<[Buffer<f32>; 3]> {
         let step = run.step();
-        let parameters = step.anchors.parameters().iter().chain([&step.weights]);
+        let parameters = step.learnt.rows().into_iter().chain(step.learnt.weights());
         parameters.map(|p| p.tensors().map(Buffer::view)).collect()
     };
     // Room for anchors to come, and what fills a buffer up to whole vectors, holds whatever it holds.
     let read = |run: &Run<'_>| -> Vec<Vec<u32>> {
         let step = run.step();
-        let of_anchors = step.anchors.parameters().iter().map(|p| (step.anchors.count * p.width) as usize);
-        let lengths = of_anchors.chain([step.weights.width as usize]);
+        let of_anchors = step.learnt.rows().into_iter().map(|p| (step.learnt.count() * p.width) as usize);
+        let lengths = of_anchors.chain(step.learnt.weights().map(|weights| weights.width as usize));
         let words = |(tensors, n): ([Buffer<f32>; 3], usize)| {
             tensors.map(|buffer| bits(&gpu.read_range(&buffer, n).expect("read")))
         };
@@ -211,7 +211,7 @@ fn whole_run(gpu: &Gpu) {
     let mut run = setup.run(gpu);
     let most = {
         run.train(folder.path(), &mut Silent).expect("a run");
-        run.step().anchors.count
+        run.step().anchors().count
     };
     drop(run);
     for poison in POISONS {
@@ -219,7 +219,7 @@ fn whole_run(gpu: &Gpu) {
             let mut run = setup.run(gpu);
             run.run_one(1).expect("a step");
             let step = run.step();
-            let n = step.anchors.count as usize;
+            let n = step.anchors().count as usize;
             // Every seventh anchor, or every 97th weight.
             let spread = |buffer: &Buffer<f32>, width: usize, n: usize, every: usize| {
                 let mut data = gpu.read(buffer).expect("read");
@@ -229,16 +229,19 @@ fn whole_run(gpu: &Gpu) {
                 gpu.write(buffer, &data).expect("write");
             };
             match what {
-                0 => spread(&step.anchors.position.view(), 3, n, 7),
+                0 => spread(&step.anchors().position.view(), 3, n, 7),
                 w @ 1..=3 => {
-                    let p = &step.anchors.parameters()[w - 1];
+                    let p = &step.anchors().parameters()[w - 1];
                     spread(&p.value, p.width as usize, n, 7);
                 }
                 w @ 4..=5 => {
-                    let p = step.anchors.feature();
+                    let p = step.anchors().feature();
                     spread(p.tensors()[w - 3], p.width as usize, n, 7);
                 }
-                w => spread(step.weights.tensors()[w - 6], 1, step.weights.width as usize, 97),
+                w => {
+                    let weights = step.learnt.weights().expect("decoders");
+                    spread(weights.tensors()[w - 6], 1, weights.width as usize, 97)
+                }
             }
             let folder = tempfile::tempdir().expect("a temporary folder");
             match run.train(folder.path(), &mut Silent) {
@@ -248,7 +251,7 @@ fn whole_run(gpu: &Gpu) {
                     assert!(!text.is_empty() && !text.contains('\n'), "{text}");
                 }
             }
-            assert!(run.step().anchors.count <= 2 * most, "{} anchors", run.step().anchors.count);
+            assert!(run.step().anchors().count <= 2 * most, "{} anchors", run.step().anchors().count);
         }
     }
 }

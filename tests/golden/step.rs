@@ -143,11 +143,11 @@ fn whole(gpu: &Gpu, case: &Case) {
             compare(gpu, case, &step, number, size);
         }
         if step.changes_anchors(number as u32) {
-            let before = step.anchors.count;
+            let before = step.anchors().count;
             step.change_anchors(number as u32).unwrap();
             let (now, _) = step.model().unwrap();
             let [grown, gone] = case.f64(&format!("round{number}.counts"))[..] else { panic!("grown and gone") };
-            assert_eq!(f64::from(step.anchors.count), f64::from(before) + grown - gone, "{grown} grown, {gone} gone");
+            assert_eq!(f64::from(step.anchors().count), f64::from(before) + grown - gone, "{grown} grown, {gone} gone");
             // Where they stand is decided, not computed; features and scales are what Adam's steps have made of them.
             let exact = Check { relative: 1e-6, absolute: 1e-6, band: 0.0 };
             case.compare(&format!("round{number}.anchor"), now.position.as_flattened(), exact);

@@ -161,8 +161,8 @@ const ELSEWHERE: [&str; 14] = [
     "bench/ceilings_exp",
     "bench/ceilings_fma",
     // `export` and pictures larger than the training's.
-    "export/activate",
-    "export/activate_backward",
+    "render/activate",
+    "render/activate_backward",
     "render/widen",
     // Depths of several views, before a training.
     "multiview/choose",

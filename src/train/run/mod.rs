@@ -9,7 +9,8 @@ use crate::config::Settings;
 use crate::evaluate::{self, Report, ViewMetrics};
 use crate::gpu::{self, Buffer, Gpu, NotFinite, Submission, Timing, Timings};
 use crate::losses::{Term, photometric};
-use crate::model::{files, init};
+use crate::model::config::Form;
+use crate::model::init;
 use crate::primitives::finite::NOT_FINITE;
 use crate::primitives::limit::{COUNTERS, Counter};
 use crate::render::forward::Capacity;
@@ -148,6 +149,10 @@ const DEPTH: usize = 2;
 fn fresh(gpu: &Gpu, scene: &Scene, settings: &Settings) -> Result<Step, Error> {
     let settings = &settings.fitted(scene);
     let plan = Plan::new(scene, settings);
+    if settings.model.form == Form::Gaussians {
+        let cloud = init::gaussians(&scene.starts(), &settings.model, settings.densify.max_gaussians)?;
+        return Ok(Step::of_gaussians(gpu, plan, settings, &cloud)?);
+    }
     let offsets = settings.model.offsets as usize;
     let initial = init::from_points(&scene.starts(), &settings.model, settings.train.seed)?;
     let weights = init::weights(settings.train.seed, offsets, plan.attention, settings.model.opacity);
@@ -291,7 +296,7 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// Grows and prunes anchors where the settings have a round behind this step. Nothing may be in flight.
+    /// Grows and prunes where the settings have a round behind this step. Nothing may be in flight.
     ///
     /// # Errors
     /// When the device has no room.
@@ -375,7 +380,7 @@ impl<'a> Run<'a> {
             steps: history.last.step,
             seconds: history.last.seconds,
             repeated: history.repeated,
-            anchors: self.step.anchors.count,
+            anchors: self.step.learnt.count(),
             gaussians: mean(&|r| r.0),
             pairs: mean(&|r| r.1),
             peak_device_bytes: self.gpu.memory().1,
@@ -480,7 +485,7 @@ impl<'a> Run<'a> {
                 view: self.photographs[view].name.clone(),
                 loss: values.iter().sum(),
                 losses: Term::ALL.iter().map(|t| t.name).zip(values.iter().copied()).collect(),
-                anchors: self.step.anchors.count,
+                anchors: self.step.learnt.count(),
                 visible: counters[Counter::Visible as usize],
                 gaussians: counters[Counter::Drawn as usize],
                 pairs: counters[Counter::Pairs as usize],
@@ -730,9 +735,9 @@ impl<'a> Run<'a> {
     /// # Errors
     /// When it cannot be read back or written.
     pub fn save(&self, folder: &Path) -> Result<(), Error> {
-        let (mut anchors, mut weights) = self.step.model()?;
-        files::rescale(&mut anchors, &mut weights, self.scene.unit);
-        Ok(files::save(&folder.join("model"), &anchors, &weights)?)
+        let mut model = self.step.stored()?;
+        model.rescale(self.scene.unit);
+        Ok(model.save(&folder.join("model"))?)
     }
 
     fn grow(&mut self, counters: &[u32]) -> Result<(), Error> {

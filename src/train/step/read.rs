@@ -3,8 +3,10 @@
 use super::Step;
 use crate::gpu::Error;
 use crate::model::files;
+use crate::model::learnt::Learnt;
 use crate::model::parameter::Parameter;
-use crate::render::forward::{Capacity, Model};
+use crate::model::stored::Stored;
+use crate::render::forward::Capacity;
 use crate::render::rasterize::Picture;
 use crate::render::view::{Painter, Rendered};
 use crate::scene::Camera;
@@ -25,7 +27,7 @@ impl Step {
         let gpu = self.gpu.clone();
         gpu.stage(stage::EVALUATION, || {
             let mut painter = Painter::new(&gpu, &self.config.render, self.background, self.capacity)?;
-            let model = Model { anchors: &self.anchors, weights: &self.weights.value };
+            let model = self.model_view();
             cameras.into_iter().enumerate().try_for_each(|(i, camera)| look(i, painter.render(model, camera)?))
         })?;
         Ok(self.furnish()?)
@@ -39,12 +41,12 @@ impl Step {
     /// When the device has no room, or is lost.
     pub fn glance(&self, camera: &Camera) -> Result<Option<Rendered>, Error> {
         self.gpu.stage(stage::EVALUATION, || {
-            let capacity = Capacity { anchors: self.anchors.capacity, ..self.capacity };
+            let capacity = Capacity { anchors: self.learnt.capacity(), ..self.capacity };
             let longest = |size: &[u32; 2]| f64::from(size[0].max(size[1]));
             let trained = self.plan.sizes.iter().map(longest).fold(1.0, f64::max);
             let painter = Painter::new(&self.gpu, &self.config.render, self.background, capacity)?;
             let mut painter = painter.larger(longest(&camera.size) / trained);
-            let model = Model { anchors: &self.anchors, weights: &self.weights.value };
+            let model = self.model_view();
             painter.render_within(model, camera, capacity.pairs.max(1 << 20).saturating_mul(4))
         })
     }
@@ -59,13 +61,14 @@ impl Step {
             let len = (rows * parameter.width) as usize;
             parameter.gradient.as_ref().map(|gradient| self.gpu.read_range(gradient, len)).transpose()
         };
-        for parameter in self.anchors.parameters() {
-            let gradient = read(parameter, self.anchors.count)?;
+        for parameter in self.learnt.rows() {
+            let gradient = read(parameter, self.learnt.count())?;
             all.extend(gradient.map(|gradient| (parameter.names.value.to_owned(), gradient)));
         }
-        let Some(flat) = read(&self.weights, 1)? else { return Ok(all) };
+        let weights = self.learnt.weights().map(|weights| read(weights, 1)).transpose()?;
+        let Some(flat) = weights.flatten() else { return Ok(all) };
         let attention = self.attend.as_ref().map_or(Ok(None), |attend| read(&attend.weights, 1))?;
-        let weights = files::Weights::from_device(self.anchors.offsets as usize, &flat, attention.as_deref());
+        let weights = files::Weights::from_device(self.learnt.offsets() as usize, &flat, attention.as_deref());
         all.extend(weights.tensors.into_iter().map(|(name, tensor)| (name, tensor.data)));
         Ok(all)
     }
@@ -79,13 +82,31 @@ impl Step {
     ///
     /// # Errors
     /// Whatever the copies meet.
-    pub fn model(&self) -> Result<(files::Anchors, files::Weights), Error> {
-        let flat = self.weights.read(&self.gpu, 1)?;
+    pub fn stored(&self) -> Result<Stored, Error> {
+        let (anchors, weights) = match &self.learnt {
+            Learnt::Anchors { anchors, weights } => (anchors, weights),
+            Learnt::Gaussians(gaussians) => return Ok(Stored::Gaussians(gaussians.read(&self.gpu)?)),
+        };
+        let flat = weights.read(&self.gpu, 1)?;
         let attention = match (&self.attend, &self.attention_weights) {
             (Some(attend), _) => Some(attend.weights.read(&self.gpu, 1)?),
             (None, initial) => initial.clone(),
         };
-        let weights = files::Weights::from_device(self.anchors.offsets as usize, &flat, attention.as_deref());
-        Ok((self.anchors.read(&self.gpu)?, weights))
+        let weights = files::Weights::from_device(anchors.offsets as usize, &flat, attention.as_deref());
+        Ok(Stored::Anchors(anchors.read(&self.gpu)?, weights))
+    }
+
+    /// The anchors and networks as they are now.
+    ///
+    /// # Errors
+    /// Whatever the copies meet.
+    ///
+    /// # Panics
+    /// For a step of plain Gaussians.
+    pub fn model(&self) -> Result<(files::Anchors, files::Weights), Error> {
+        match self.stored()? {
+            Stored::Anchors(anchors, weights) => Ok((anchors, weights)),
+            Stored::Gaussians(_) => panic!("plain Gaussians have no anchors"),
+        }
     }
 }

@@ -37,9 +37,9 @@ impl Step {
         if !step.is_multiple_of(interval) {
             return;
         }
-        for parameter in self.anchors.parameters() {
+        for parameter in self.learnt.rows() {
             for tensor in parameter.tensors().into_iter().chain(&parameter.gradient) {
-                finite::record(rec, tensor, self.anchors.count * parameter.width, flag, None);
+                finite::record(rec, tensor, self.learnt.count() * parameter.width, flag, None);
             }
         }
         // The networks' gradients were looked at already.
@@ -51,21 +51,22 @@ impl Step {
     }
 
     pub(super) fn optimize(&self, rec: &mut Recorder<'_>, attended: Option<Attended<'_>>, step: u32, rates: Rates) {
-        let Self { anchors, weights, .. } = self;
         let overflow = self.limits.overflow();
         // Before the optimiser, which goes on from the features that were decoded.
         let attention = self.attend.as_ref().zip(attended);
         let attention =
-            attention.map(|(attend, attended)| (attend, attend.write_back(rec, attended, anchors, overflow)));
+            attention.map(|(attend, attended)| (attend, attend.write_back(rec, attended, self.anchors(), overflow)));
         rec.stage(stage::OPTIMIZER);
         // What the release writes back it does not train any further.
         let config = &self.config.model.attention;
         let written_back = config.write_back && self.plan.attention && step >= config.start;
         let trained = |parameter: &&Parameter| !written_back || parameter.groups().all(|g| g != Group::Feature);
-        for parameter in anchors.parameters().iter().filter(trained) {
-            self.update(rec, parameter, anchors.count, overflow, (step, rates));
+        for parameter in self.learnt.rows().into_iter().filter(trained) {
+            self.update(rec, parameter, self.learnt.count(), overflow, (step, rates));
         }
-        self.update(rec, weights, 1, overflow, (step, rates));
+        if let Some(weights) = self.learnt.weights() {
+            self.update(rec, weights, 1, overflow, (step, rates));
+        }
         if let Some((attend, skip)) = attention {
             let since = step + 1 - config.start.max(1);
             self.update(rec, &attend.weights, 1, skip, (since, rates));

@@ -1,18 +1,15 @@
-//! Static Gaussians on the device, and from what is learnt of them to what is drawn and back.
+//! From what is learnt of static Gaussians to what is drawn, and back.
 
-use super::Cloud;
-use crate::gpu::kernels::export::{activate, activate_backward};
+use super::project::Gaussians;
+use crate::gpu::kernels::render::{activate, activate_backward};
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::math::camera::{from_center, split};
 use crate::math::harmonics::{coefficients, harmonics};
-use crate::model::parameter::{Parameter, names};
-use crate::render::project::Gaussians;
+use crate::model::gaussians::{NORM_EPSILON, Static};
+use crate::model::parameter::Parameter;
 
 /// The kernel's: e^88 is the last power of e below the largest float32.
 const LARGEST_EXPONENT: f64 = 88.0;
-/// Shortest quaternion that is normalised to length one.
-const NORM_EPSILON: f64 = 1e-12;
-
 fn wide<const C: usize>(v: [f32; C]) -> [f64; C] {
     v.map(f64::from)
 }
@@ -41,7 +38,8 @@ impl Reference for activate::Kernel {
             let h = harmonics(direction(wide(seen)));
             let of = &host.harmonics[i * each..(i + 1) * each];
             host.color[i] = std::array::from_fn(|c| {
-                (0.5 + of.iter().zip(h).map(|(of, h)| f64::from(of[c]) * h).sum::<f64>()).max(0.0) as f32
+                let term = |k: usize| f64::from(of[k][c]) * h[k] * if k > 0 { f64::from(push.higher) } else { 1.0 };
+                (0.5 + (0..each).map(term).sum::<f64>()).max(0.0) as f32
             });
         }
     }
@@ -71,7 +69,8 @@ impl Reference for activate_backward::Kernel {
             let h = harmonics(direction(wide(host.seen[i])));
             for (k, to) in host.grad_harmonics[i * each..(i + 1) * each].iter_mut().enumerate() {
                 let cut = |c: usize| host.color[i][c] <= 0.0;
-                *to = std::array::from_fn(|c| if cut(c) { 0.0 } else { (h[k] * of(host.grad_color[i][c])) as f32 });
+                let h = h[k] * if k > 0 { f64::from(push.higher) } else { 1.0 };
+                *to = std::array::from_fn(|c| if cut(c) { 0.0 } else { (h * of(host.grad_color[i][c])) as f32 });
             }
         }
     }
@@ -79,73 +78,6 @@ impl Reference for activate_backward::Kernel {
     /// Ten roundings; `g - q (q . g)` and a harmonic's polynomial cancel: relative to the largest.
     fn check(_: &'static str) -> Check {
         Check { relative: 1e-6, absolute: 2e-6, band: 0.0 }
-    }
-}
-
-/// What is learnt of static Gaussians, with Adam's moments.
-#[derive(Debug)]
-pub struct Static {
-    /// Gaussians.
-    pub count: u32,
-    /// Highest degree of the harmonics.
-    pub degree: u32,
-    /// 3 per Gaussian, world.
-    pub position: Parameter,
-    /// 3 per Gaussian, natural logarithms of scene units.
-    pub log_scale: Parameter,
-    /// 4 per Gaussian, w x y z.
-    pub quaternion: Parameter,
-    /// 1 per Gaussian, logit of the opacity.
-    pub logit: Parameter,
-    /// 3 per coefficient, `(degree + 1)^2` coefficients per Gaussian.
-    pub harmonics: Parameter,
-}
-
-impl Static {
-    /// These Gaussians on the device, moments zero.
-    ///
-    /// # Errors
-    /// As [`Gpu::buffer`].
-    pub fn upload(gpu: &Gpu, cloud: &Cloud) -> Result<Self, Error> {
-        let count = cloud.len() as u32;
-        let each = coefficients(cloud.degree) as u32;
-        let rows = count.max(1);
-        let parameter = |names, width, data: &[f32]| Parameter::upload(gpu, names, width, rows, data);
-        Ok(Self {
-            count,
-            degree: cloud.degree,
-            position: parameter(names!("position"), 3, cloud.position.as_flattened())?,
-            log_scale: parameter(names!("log_scale"), 3, cloud.log_scale.as_flattened())?,
-            quaternion: parameter(names!("quaternion"), 4, cloud.rotation.as_flattened())?,
-            logit: parameter(names!("logit"), 1, &cloud.logit)?,
-            harmonics: parameter(names!("harmonics"), 3 * each, cloud.harmonics.as_flattened())?,
-        })
-    }
-
-    /// Position, log-scale, quaternion, logit, harmonics.
-    pub fn parameters(&self) -> [&Parameter; 5] {
-        [&self.position, &self.log_scale, &self.quaternion, &self.logit, &self.harmonics]
-    }
-
-    /// The Gaussians as they are now, quaternions normalised.
-    ///
-    /// # Errors
-    /// Whatever the copies meet.
-    pub fn read(&self, gpu: &Gpu) -> Result<Cloud, Error> {
-        let read = |parameter: &Parameter| parameter.read(gpu, self.count);
-        let triples = |flat: Vec<f32>| -> Vec<[f32; 3]> { flat.as_chunks().0.to_vec() };
-        let unit = |q: &[f32; 4]| {
-            let norm = wide(*q).iter().map(|v| v * v).sum::<f64>().sqrt().max(NORM_EPSILON);
-            q.map(|v| (f64::from(v) / norm) as f32)
-        };
-        Ok(Cloud {
-            position: triples(read(&self.position)?),
-            log_scale: triples(read(&self.log_scale)?),
-            rotation: read(&self.quaternion)?.as_chunks().0.iter().map(unit).collect(),
-            logit: read(&self.logit)?,
-            degree: self.degree,
-            harmonics: triples(read(&self.harmonics)?),
-        })
     }
 }
 
@@ -200,7 +132,8 @@ impl Activate {
             opacity: &self.opacity,
             color: &self.color,
         };
-        let push = activate::Push { center, center_low, count: of.count, coefficients: coefficients(of.degree) as u32 };
+        let coefficients = coefficients(of.degree) as u32;
+        let push = activate::Push { center, center_low, count: of.count, coefficients, higher: of.higher };
         rec.run(activate::Kernel, buffers, push, of.count);
     }
 }
@@ -222,60 +155,37 @@ pub struct DrawnGradients<'a> {
     pub color: &'a Buffer<[f32; 3]>,
 }
 
-/// The backward stage: the gradients of what is learnt, laid out as the parameters are.
-#[derive(Debug)]
-pub struct ActivateBackward {
-    position: Buffer<f32>,
-    log_scale: Buffer<f32>,
-    quaternion: Buffer<f32>,
-    logit: Buffer<f32>,
-    harmonics: Buffer<f32>,
+/// The gradient's buffer of a parameter.
+fn gradient(parameter: &Parameter) -> &Buffer<f32> {
+    parameter.gradient.as_ref().expect("made before the way back is recorded")
 }
 
-impl ActivateBackward {
-    /// Buffers for the gradients of these Gaussians.
-    ///
-    /// # Errors
-    /// As [`Gpu::buffer`].
-    pub fn new(gpu: &Gpu, of: &Static) -> Result<Self, Error> {
-        let like = |parameter: &Parameter| gpu.buffer(parameter.names.gradient, parameter.value.len());
-        Ok(Self {
-            position: like(&of.position)?,
-            log_scale: like(&of.log_scale)?,
-            quaternion: like(&of.quaternion)?,
-            logit: like(&of.logit)?,
-            harmonics: like(&of.harmonics)?,
-        })
-    }
-
-    /// In the order of [`Static::parameters`].
-    pub fn gradients(&self) -> [&Buffer<f32>; 5] {
-        [&self.position, &self.log_scale, &self.quaternion, &self.logit, &self.harmonics]
-    }
-
-    /// Records the gradients, after [`Activate::record`] of the same Gaussians.
-    pub fn record(&self, rec: &mut Recorder<'_>, of: &Static, forward: &Activate, grad: DrawnGradients<'_>) {
-        let buffers = activate_backward::Buffers {
-            drawn: grad.drawn,
-            seen: &forward.seen,
-            scale: &forward.scale,
-            quaternion: &of.quaternion.value.view(),
-            opacity: &forward.opacity,
-            color: &forward.color,
-            grad_seen: grad.seen,
-            grad_scale: grad.scale,
-            grad_rotation: grad.rotation,
-            grad_opacity: grad.opacity,
-            grad_color: grad.color,
-            grad_position: &self.position.view(),
-            grad_log_scale: &self.log_scale.view(),
-            grad_quaternion: &self.quaternion.view(),
-            grad_logit: &self.logit,
-            grad_harmonics: &self.harmonics.view(),
-        };
-        let push = activate_backward::Push { count: of.count, coefficients: coefficients(of.degree) as u32 };
-        rec.run(activate_backward::Kernel, buffers, push, of.count);
-    }
+/// Records the gradients of what is learnt, after [`Activate::record`] of the same Gaussians.
+///
+/// # Panics
+/// When a parameter has no buffer for its gradient.
+pub fn backward(rec: &mut Recorder<'_>, of: &Static, forward: &Activate, grad: DrawnGradients<'_>) {
+    let buffers = activate_backward::Buffers {
+        drawn: grad.drawn,
+        seen: &forward.seen,
+        scale: &forward.scale,
+        quaternion: &of.quaternion.value.view(),
+        opacity: &forward.opacity,
+        color: &forward.color,
+        grad_seen: grad.seen,
+        grad_scale: grad.scale,
+        grad_rotation: grad.rotation,
+        grad_opacity: grad.opacity,
+        grad_color: grad.color,
+        grad_position: &gradient(&of.position).view(),
+        grad_log_scale: &gradient(&of.log_scale).view(),
+        grad_quaternion: &gradient(&of.quaternion).view(),
+        grad_logit: gradient(&of.logit),
+        grad_harmonics: &gradient(&of.harmonics).view(),
+    };
+    let coefficients = coefficients(of.degree) as u32;
+    let push = activate_backward::Push { count: of.count, coefficients, higher: of.higher };
+    rec.run(activate_backward::Kernel, buffers, push, of.count);
 }
 
 #[cfg(test)]
@@ -287,6 +197,7 @@ mod tests {
     use crate::gpu::testing::{self, UNWRITTEN};
 
     const CENTER: [f64; 3] = [0.4, -1.2, 2.5];
+    const HIGHER: f32 = 0.75;
 
     fn case(rng: &mut Pcg64, n: usize, degree: u32) -> activate::Arrays {
         let each = coefficients(degree);
@@ -309,7 +220,8 @@ mod tests {
 
     fn push(n: usize, degree: u32) -> activate::Push {
         let [center, center_low] = split(CENTER);
-        activate::Push { center, center_low, count: n as u32, coefficients: coefficients(degree) as u32 }
+        let coefficients = coefficients(degree) as u32;
+        activate::Push { center, center_low, count: n as u32, coefficients, higher: HIGHER }
     }
 
     fn backward_case(rng: &mut Pcg64, forward: &activate::Arrays, degree: u32) -> activate_backward::Arrays {
@@ -353,7 +265,8 @@ mod tests {
                 backward.grad_scale[i] = [f32::NAN; 3];
                 backward.grad_color[i] = [f32::NAN; 3];
             }
-            let push = activate_backward::Push { count: n as u32, coefficients: coefficients(degree) as u32 };
+            let coefficients = coefficients(degree) as u32;
+            let push = activate_backward::Push { count: n as u32, coefficients, higher: HIGHER };
             testing::assert_twin(activate_backward::Kernel, &gpu, backward, push, n);
         }
     }
@@ -371,7 +284,7 @@ mod tests {
         let mut grad = backward_case(&mut rng, &there, degree);
         grad.drawn = vec![1; n];
         grad.grad_seen = vec![[0.0; 3]; n];
-        let push = activate_backward::Push { count: n as u32, coefficients: 16 };
+        let push = activate_backward::Push { count: n as u32, coefficients: 16, higher: HIGHER };
         let got = testing::run_twin(activate_backward::Kernel, (), grad.clone(), push);
         let value = |at: &activate::Arrays, i: usize| -> f64 {
             let out = forward(at, n, degree);

@@ -25,6 +25,7 @@ layout(binding = 15, scalar) writeonly buffer GradHarmonics { vec3 grad_harmonic
 layout(push_constant, scalar) uniform Push {
   uint count;        // N
   uint coefficients; // C: 1, 4, 9 or 16
+  float higher;      // a coefficient beyond the first is what is learnt times this
 } push;
 void main() {
   uint i = thread_index();
@@ -48,5 +49,7 @@ void main() {
   grad_logit[i] = grad_opacity[i] * o * (1.0 - o);
   // Below 0 a color was cut off.
   vec3 above = vec3(greaterThan(color[i], vec3(0.0))) * grad_color[i], d = direction(seen[i]);
-  for (uint k = 0u; k < push.coefficients; k++) grad_harmonics[first + k] = harmonic(k, d) * above;
+  grad_harmonics[first] = harmonic(0u, d) * above;
+  above *= push.higher;
+  for (uint k = 1u; k < push.coefficients; k++) grad_harmonics[first + k] = harmonic(k, d) * above;
 }

@@ -4,7 +4,7 @@
 //! then green, then blue, those beyond the cloud's degree 0; opacity as logit, scales as natural logarithms, the unit
 //! quaternion as w x y z.
 
-use super::{Cloud, Error};
+use super::gaussians::Cloud;
 use crate::math::harmonics::coefficients;
 
 /// Floats of a Gaussian.
@@ -53,12 +53,19 @@ pub fn encode(cloud: &Cloud) -> Vec<u8> {
     bytes
 }
 
+/// Whether these are the first bytes of a PLY file of Gaussians, of whatever program: it has colours as harmonics.
+pub fn is_gaussians(bytes: &[u8]) -> bool {
+    let head = &bytes[..bytes.len().min(1 << 16)];
+    let end = head.windows(10).position(|w| w == b"end_header").unwrap_or(head.len());
+    String::from_utf8_lossy(&head[..end]).lines().any(|line| line.trim_end().ends_with(" f_dc_0"))
+}
+
 /// Reads what [`encode`] wrote; harmonics have the lowest degree that holds all that are not 0.
 ///
 /// # Errors
 /// Any other file, or one that is cut off.
-pub fn decode(bytes: &[u8]) -> Result<Cloud, Error> {
-    let broken = |what: &str| Error::Format(format!("not a PLY file as `gscream-vk export` writes it: {what}"));
+pub fn decode(bytes: &[u8]) -> Result<Cloud, String> {
+    let broken = |what: &str| format!("not a PLY file as `gscream-vk export` writes it: {what}");
     let end = b"end_header\n";
     let at = bytes.windows(end.len()).position(|w| w == end).ok_or_else(|| broken("it has no header"))?;
     let (head, body) = bytes.split_at(at + end.len());
