@@ -9,7 +9,7 @@ pub enum Form {
     /// Anchors with features, from which decoders make Gaussians for each view (Scaffold-GS, GScream).
     #[default]
     Anchors,
-    /// Gaussians with colours in spherical harmonics, each learnt by itself (3DGS). A step is several times as fast.
+    /// Gaussians with colours in spherical harmonics, each learnt by itself (3DGS). Nothing is decoded in a step.
     Gaussians,
 }
 
