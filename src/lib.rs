@@ -4,7 +4,8 @@
 //! this scene needs, and then repeats one straight line of compute passes: [`render`] the anchors of the [`model`],
 //! compare with the photograph in [`losses`], walk back, and let the [`optimizer`] and [`densify`] change the model.
 //! [`multiview`] finds points where the capture has none, [`evaluate`] measures the result, [`export`] bakes it into
-//! static Gaussians for any viewer, [`view`] shows them in the browser, [`compose`] makes scenes whose truth is known.
+//! static Gaussians for any viewer, [`view`] shows them in the browser, [`compose`] makes scenes whose truth is known,
+//! [`remove`] is the page to point at an object in.
 //! Kernels live in `glsl/`, mirrored by path and stem in `src/`; each has a CPU twin in float64 beside the code that
 //! dispatches it. [`gpu`] is the only place that knows Vulkan; [`primitives`] are sorts, scans and sums that know nothing of
 //! splats. [`cli`] has one file per command.
@@ -51,6 +52,7 @@ pub mod model;
 pub mod multiview;
 pub mod optimizer;
 pub mod primitives;
+pub mod remove;
 pub mod render;
 pub mod report;
 pub mod scene;

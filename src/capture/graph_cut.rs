@@ -18,19 +18,19 @@ use crate::scene::{self, resample};
 /// The longer side of the picture that is cut, pixels.
 const SIDE: u32 = 320;
 /// Gaussians of the object's mixture and of the background's, which shows more things.
-const COMPONENTS: [usize; 2] = [5, 8];
+pub(super) const COMPONENTS: [usize; 2] = [5, 8];
 /// Rounds of mixtures and cuts.
 const ROUNDS: u32 = 6;
 /// Cost of a border between pixels of the same colour (Rother et al.: 50, for larger pictures, whose narrow parts are more
 /// pixels wide). In a box the next is tried where the object does not fill it: a thin one is mostly border.
-const SMOOTHNESS: [f64; 4] = [20.0, 8.0, 3.0, 1.0];
+pub(super) const SMOOTHNESS: [f64; 4] = [20.0, 8.0, 3.0, 1.0];
 /// An object fills its box if it reaches over this part of its width and height (Lempitsky et al. 2009: a box is drawn
 /// tightly).
 const FILLED: f64 = 0.8;
 /// A thin object covers at most this part of its box; a cut with little smoothness that covers more has found the ground.
 const THIN: f64 = 0.7;
 /// Costs are whole numbers of this fraction.
-const UNIT: f64 = 256.0;
+pub(super) const UNIT: f64 = 256.0;
 /// Pieces smaller than this share of the largest are no part of the object.
 const SPECK: f64 = 0.05;
 
@@ -50,7 +50,7 @@ pub enum Known {
 // ---------------------------------------------------------------- minimum cut
 
 /// Shifts to the neighbours of a pixel; the opposite of the `d`-th is the `d`-th from the end.
-const SHIFTS: [[isize; 2]; 8] = [[-1, -1], [0, -1], [1, -1], [-1, 0], [1, 0], [-1, 1], [0, 1], [1, 1]];
+pub(super) const SHIFTS: [[isize; 2]; 8] = [[-1, -1], [0, -1], [1, -1], [-1, 0], [1, 0], [-1, 1], [0, 1], [1, 1]];
 
 /// A graph whose nodes are pixels, each joined to its neighbours, to the object's terminal and to the background's.
 pub struct Grid<const N: usize> {
@@ -69,7 +69,7 @@ impl<const N: usize> Grid<N> {
         Self { size, shifts, edges: vec![[0; N]; n], terminal: vec![0; n] }
     }
 
-    fn neighbour(&self, node: usize, direction: usize) -> Option<usize> {
+    pub(super) fn neighbour(&self, node: usize, direction: usize) -> Option<usize> {
         let (x, y) = ((node % self.size[0]) as isize, (node / self.size[0]) as isize);
         let [u, v] = [x + self.shifts[direction][0], y + self.shifts[direction][1]];
         let inside = u >= 0 && v >= 0 && u < self.size[0] as isize && v < self.size[1] as isize;
@@ -216,12 +216,12 @@ impl Component {
     }
 }
 
-/// A mixture of Gaussians over colours.
-struct Mixture(Vec<Component>);
+/// A mixture of Gaussians over colours, or over places.
+pub(super) struct Mixture(Vec<Component>);
 
 impl Mixture {
     /// Of these colours: k-means, then a Gaussian of each cluster.
-    fn of(colors: &[[f64; 3]], components: usize, seed: u64) -> Self {
+    pub(super) fn of(colors: &[[f64; 3]], components: usize, seed: u64) -> Self {
         let mut rng = Pcg64::new(seed.into(), 31);
         let distance = |a: [f64; 3], b: [f64; 3]| (0..3).map(|c| (a[c] - b[c]).powi(2)).sum::<f64>();
         let mut centers = vec![colors[rng.random_range(0..colors.len())]];
@@ -261,8 +261,17 @@ impl Mixture {
         Self(components.map(|cluster| Component::of(cluster, colors.len())).collect())
     }
 
+    /// How far a value is from the nearest component, squared, in its standard deviations.
+    pub(super) fn distance(&self, value: [f64; 3]) -> f64 {
+        let from = |component: &Component| {
+            let d = glam::DVec3::from_array(std::array::from_fn(|c| value[c] - component.mean[c]));
+            d.dot(component.inverse * d)
+        };
+        self.0.iter().map(from).fold(f64::INFINITY, f64::min)
+    }
+
     /// Cost of a colour: that of the component it fits best.
-    fn cost(&self, color: [f64; 3]) -> f64 {
+    pub(super) fn cost(&self, color: [f64; 3]) -> f64 {
         self.0.iter().map(|component| component.cost(color)).fold(f64::INFINITY, f64::min)
     }
 }
@@ -328,11 +337,16 @@ pub fn segment(picture: &RgbImage, known: &[Known], smoothness: f64) -> Option<V
 
 /// A picture's size with the longer side at most [`SIDE`].
 fn reduced(size: [u32; 2]) -> [u32; 2] {
+    within(size, SIDE)
+}
+
+/// A picture's size with the longer side at most `side`.
+pub(super) fn within(size: [u32; 2], side: u32) -> [u32; 2] {
     let longest = size[0].max(size[1]);
-    if longest <= SIDE {
+    if longest <= side {
         size
     } else {
-        size.map(|n| (u64::from(n) * u64::from(SIDE) / u64::from(longest)).max(1) as u32)
+        size.map(|n| (u64::from(n) * u64::from(side) / u64::from(longest)).max(1) as u32)
     }
 }
 

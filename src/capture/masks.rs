@@ -72,6 +72,12 @@ impl Votes {
         Ok(())
     }
 
+    /// Adds those of other views.
+    pub fn join(&mut self, others: &Self) {
+        self.inside.iter_mut().zip(&others.inside).for_each(|(sum, votes)| *sum += votes);
+        self.all.iter_mut().zip(&others.all).for_each(|(sum, votes)| *sum += votes);
+    }
+
     /// Counts them. `positions` and `colors` are the anchors': a Gaussian that no masked view has seen votes as its anchor
     /// does, and an anchor that none has seen as those which are near it and look like it. What stands behind the object is
     /// as near to it as its own other side, but seldom of its colour.

@@ -1,5 +1,6 @@
 #![doc = include_str!("README.md")]
 
+pub mod click;
 pub mod depth;
 pub mod doctor;
 pub mod fit;
@@ -244,6 +245,21 @@ pub(crate) fn picture_size(path: &Path) -> Result<[u32; 2], Error> {
 /// # Errors
 /// See [`Error`]. What steps before have written stays.
 pub fn prepare(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<(), Error> {
+    steps(gpu, request, watch).map(drop)
+}
+
+/// The photographs at the size of the fit, and the fit: the first two steps of [`prepare`] alone, whatever the request
+/// wants, with what they leave in the scene's folder.
+///
+/// # Errors
+/// As [`prepare`].
+pub fn fitted(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<(Scene, Fit), Error> {
+    let request = Request { only: vec![Step::Poses, Step::Fit], object: vec![], ..request.clone() };
+    Ok(steps(gpu, &request, watch)?.expect("a request for the fit makes one"))
+}
+
+/// The steps that are wanted; nothing comes back where those are the poses alone.
+fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(Scene, Fit)>, Error> {
     let mut capture = poses::find(&request.photographs)?;
     capture.photographs.iter().try_for_each(|(name, path)| has_room(name, path))?;
     // In a scene that is made in its own capture's folder the masks may be the program's; `corrected` tells them apart.
@@ -271,7 +287,7 @@ pub fn prepare(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<()
     }
     preparation.depth = request.depth && !preparation.has_priors()?;
     if request.only.iter().all(|step| *step == Step::Poses) && !request.only.is_empty() {
-        return Ok(());
+        return Ok(None);
     }
     let scene = preparation.small()?;
     if scene.train.len() < 3 {
@@ -300,7 +316,7 @@ pub fn prepare(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<()
         let masks = masked(&preparation)?;
         preparation.reference(&scene, &fit, &mut splats, &masks)?;
     }
-    Ok(())
+    Ok(Some((scene, fit)))
 }
 
 /// Refuses a photograph whose name leaves no room for that of its files, of which its prior as the reference has the longest.

@@ -64,7 +64,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     }
 }
 
-fn text(report: &Report) -> String {
+/// The findings as lines, the worst first.
+pub(super) fn text(report: &Report) -> String {
     let mut text = String::new();
     for finding in &report.findings {
         let kind = if finding.severity == Severity::Problem { "problem" } else { "note" };

@@ -14,6 +14,7 @@ use super::shared::{self, DeviceArgs};
 use crate::config::{Settings, Source};
 use crate::export::{self, Cloud, Export, Observer, Options, gltf, low_pass, measure, ply, spz, up};
 use crate::folder::{self, Lock};
+use crate::gpu::Gpu;
 use crate::model::stored::Stored;
 use crate::render::widen;
 use crate::scene::{Camera, Scene, path};
@@ -213,7 +214,7 @@ const NOTE: &str = "loss: means over the views of measured_on, which took no par
 
 /// A bar for each part of the work.
 #[derive(Default)]
-struct Bars(Option<ProgressBar>);
+pub(super) struct Bars(Option<ProgressBar>);
 
 impl Observer for Bars {
     fn begin(&mut self, part: &str, turns: u64) {
@@ -229,9 +230,7 @@ impl Observer for Bars {
             bar.set_message(note.to_owned());
         }
     }
-}
 
-impl Bars {
     fn end(&mut self) {
         if let Some(bar) = self.0.take() {
             bar.finish_and_clear();
@@ -239,7 +238,67 @@ impl Bars {
     }
 }
 
+impl Drop for Bars {
+    /// Work that failed has not ended its bar.
+    fn drop(&mut self) {
+        self.end();
+    }
+}
+
+impl Args {
+    /// The export of a run into a folder: all formats, with so many steps and cameras between the training's.
+    pub fn of_run(run: &Path, out: &Path, steps: u32, views: u32) -> Self {
+        let Options { degree, screen, .. } = Options::default();
+        Self {
+            model: run.to_owned(),
+            out: Some(out.to_owned()),
+            formats: Format::value_variants().to_vec(),
+            up: Up::Auto,
+            degree,
+            views,
+            steps,
+            screen,
+            scene: None,
+            config: None,
+            set: vec![],
+            device: DeviceArgs::default(),
+        }
+    }
+}
+
+/// Names of the files that an export writes in all formats.
+pub(super) fn files() -> impl Iterator<Item = String> {
+    Format::value_variants().iter().map(|format| format.file()).chain([FIGURES.to_owned()])
+}
+
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
+    let folder = args.out.clone().unwrap_or_else(|| args.model.join(EXPORT));
+    if args.formats.is_empty() {
+        bail!("--formats: names no format");
+    }
+    // The files go into the run's own folder, or into one that is theirs.
+    let _lock = match Origin::find(&args.model)? {
+        Origin::Run { folder, .. } if args.out.is_none() => Lock::take(&folder)?,
+        _ => Lock::take(&folder)?,
+    };
+    export(args, &folder, &mut Bars::default(), |work| args.device.with_gpu(work))?;
+    // `view` reads the PLY.
+    if args.formats.contains(&Format::Ply) {
+        let shown = if args.out.is_some() { &folder } else { &args.model };
+        next::say(&[(next::command(&["view"], shown), "shows it in the browser; --html FILE makes a page to send")]);
+    } else {
+        next::say(&[(next::typed(&folder.to_string_lossy()), "has the files; any viewer of their formats opens them")]);
+    }
+    Ok(())
+}
+
+/// Writes the files into a folder of which the caller holds the lock. `on_gpu` opens the device, or has it.
+pub(super) fn export(
+    args: &Args,
+    folder: &Path,
+    observer: &mut dyn Observer,
+    on_gpu: impl FnOnce(Box<dyn FnOnce(&Gpu) -> anyhow::Result<()> + '_>) -> anyhow::Result<()>,
+) -> anyhow::Result<()> {
     let origin = Origin::find(&args.model)?;
     let file = args.config.iter().cloned().map(Source::File);
     let mut settings = origin.settings(file.chain(args.set.iter().cloned().map(Source::Set)).collect())?;
@@ -258,19 +317,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         format!("{}: a model alone does not know its cameras; name the scene with --scene", args.model.display())
     })?;
     let scene = shared::load_scene_of_model(scene, &mut settings)?;
-    let folder = args.out.clone().unwrap_or_else(|| args.model.join(EXPORT));
-    if args.formats.is_empty() {
-        bail!("--formats: names no format");
-    }
-    // The files go into the run's own folder, or into one that is theirs.
-    let _lock = match &origin {
-        Origin::Run { folder, .. } if args.out.is_none() => Lock::take(folder)?,
-        _ => Lock::take(&folder)?,
-    };
-    let all = Format::value_variants().iter().map(|format| format.file()).chain([FIGURES.to_owned()]);
-    let all: Vec<String> = all.collect();
-    folder::sweep(&folder, |name| all.iter().any(|own| own == name));
-    args.device.with_gpu(|gpu| {
+    let all: Vec<String> = files().collect();
+    folder::sweep(folder, |name| all.iter().any(|own| own == name));
+    on_gpu(Box::new(|gpu| {
         let began = Instant::now();
         let options = Options {
             upright: args.up == Up::Auto,
@@ -280,14 +329,12 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             screen: args.screen,
             seed: settings.train.seed,
         };
-        let mut bars = Bars::default();
         let made = match &model {
             Stored::Anchors(anchors, weights) => {
-                export::make(gpu, (anchors, weights), &scene, &settings, &options, &mut bars)
+                export::make(gpu, (anchors, weights), &scene, &settings, &options, observer)
             }
-            Stored::Gaussians(cloud) => export::of_gaussians(gpu, cloud, &scene, &settings, &options, &mut bars),
+            Stored::Gaussians(cloud) => export::of_gaussians(gpu, cloud, &scene, &settings, &options, observer),
         };
-        bars.end();
         let mut made = made?;
         // All files are made before the first is written.
         let mut written = vec![];
@@ -311,21 +358,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         report(&made, &figures, &args.formats);
         let names: Vec<&str> = figures.files.iter().map(|file| file.name.as_str()).collect();
         println!("wrote {}, {FIGURES} in {}", names.join(", "), folder.display());
-        // `view` reads the PLY.
-        if args.formats.contains(&Format::Ply) {
-            let shown = if args.out.is_some() { &folder } else { &args.model };
-            next::say(&[(
-                next::command(&["view"], shown),
-                "shows it in the browser; --html FILE makes a page to send",
-            )]);
-        } else {
-            next::say(&[(
-                next::typed(&folder.to_string_lossy()),
-                "has the files; any viewer of their formats opens them",
-            )]);
-        }
         Ok(())
-    })
+    }))
 }
 
 fn figures(

@@ -23,6 +23,7 @@ pub mod pictures;
 mod plan;
 mod prepare;
 mod preset;
+mod remove;
 mod render;
 mod report;
 pub mod shared;
@@ -47,6 +48,7 @@ use crate::train::run::Signal;
     max_term_width = 110,
     after_help = "\
 Start here:
+  gscream-vk remove photos                         point at an object, and it is gone
   gscream-vk train synthetic --preset demo         train on the built-in scene
   gscream-vk synth scene                           make a small scene with an object in it
   gscream-vk eval renders --truth scene/test_images --masks scene/test_masks
@@ -64,6 +66,7 @@ pub struct Arguments {
 /// What can be done.
 #[derive(Debug, clap::Subcommand)]
 enum Command {
+    Remove(remove::Args),
     Prepare(prepare::Args),
     Doctor(doctor::Args),
     Train(train::Args),
@@ -89,6 +92,7 @@ enum Command {
 /// One sentence for the user, see [`message`].
 pub fn run(arguments: Arguments) -> anyhow::Result<()> {
     match arguments.command {
+        Command::Remove(args) => remove::run(&args),
         Command::Prepare(args) => prepare::run(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Train(args) => train::run(&args),
@@ -150,7 +154,11 @@ fn signal(error: &(dyn std::error::Error + 'static)) -> Option<Signal> {
     let stopped = error.downcast_ref::<signals::Stopped>().map(|stopped| stopped.signal);
     let run = || error.downcast_ref::<crate::train::run::Error>()?.signal();
     let capture = || error.downcast_ref::<crate::capture::Error>()?.signal();
-    stopped.or_else(run).or_else(capture)
+    let export = || match error.downcast_ref::<crate::export::Error>()? {
+        crate::export::Error::Interrupted { signal } => Some(*signal),
+        _ => None,
+    };
+    stopped.or_else(run).or_else(capture).or_else(export)
 }
 
 #[cfg(test)]

@@ -30,17 +30,8 @@ pub(super) struct Args {
     /// Folder of the scene; may be PHOTOS itself
     #[arg(long, value_name = "SCENE")]
     out: PathBuf,
-    /// Mask of one view: a picture that is not black on the object; may be given many times
-    #[arg(long, value_name = "NAME=FILE", value_parser = mask)]
-    mask: Vec<(String, Evidence)>,
-    /// Box around the object in one view, in pixels of the photograph: x0,y0 and one past x1,y1; may be given many times
-    #[arg(long = "box", value_name = "NAME=x0,y0,x1,y1", value_parser = bounds)]
-    bounds: Vec<(String, Evidence)>,
-    /// Picture of strokes on one view: white or green on the object, black or red beside it, else grey or transparent
-    ///
-    /// With a --box of the same view they count within it alone: for one leaf of many.
-    #[arg(long, value_name = "NAME=FILE", value_parser = strokes)]
-    strokes: Vec<(String, Evidence)>,
+    #[command(flatten)]
+    object: ObjectArgs,
     /// View to become the reference [default: the one whose hole is seen best by others]
     #[arg(long, value_name = "NAME")]
     reference: Option<String>,
@@ -77,6 +68,29 @@ pub(super) struct Args {
     device: DeviceArgs,
 }
 
+/// What the object is, by files and numbers.
+#[derive(Debug, Clone, Default, clap::Args)]
+pub(super) struct ObjectArgs {
+    /// Mask of one view: a picture that is not black on the object; may be given many times
+    #[arg(long, value_name = "NAME=FILE", value_parser = mask)]
+    mask: Vec<(String, Evidence)>,
+    /// Box around the object in one view, in pixels of the photograph: x0,y0 and one past x1,y1; may be given many times
+    #[arg(long = "box", value_name = "NAME=x0,y0,x1,y1", value_parser = bounds)]
+    bounds: Vec<(String, Evidence)>,
+    /// Picture of strokes on one view: white or green on the object, black or red beside it, else grey or transparent
+    ///
+    /// With a --box of the same view they count within it alone: for one leaf of many.
+    #[arg(long, value_name = "NAME=FILE", value_parser = strokes)]
+    strokes: Vec<(String, Evidence)>,
+}
+
+impl ObjectArgs {
+    /// All of it, by the name of a view.
+    pub fn evidence(&self) -> Vec<(String, Evidence)> {
+        [&self.mask, &self.bounds, &self.strokes].into_iter().flatten().cloned().collect()
+    }
+}
+
 fn named(text: &str) -> Result<(String, String), String> {
     let (name, value) = text.split_once('=').ok_or("must be NAME=..., where NAME is a photograph's")?;
     if name.is_empty() || value.is_empty() {
@@ -110,9 +124,8 @@ fn step(text: &str) -> Result<Step, String> {
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let began = Instant::now();
-    let object = [&args.mask, &args.bounds, &args.strokes].into_iter().flatten().cloned().collect();
     let request = Request {
-        object,
+        object: args.object.evidence(),
         reference: args.reference.clone(),
         only: args.only.clone(),
         depth: !args.no_depth,
@@ -125,12 +138,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     };
     args.device.with_gpu(|gpu| {
         signals::listen()?;
-        let mut watch = Bars { bar: None, began: Instant::now(), step: None };
-        let result = capture::prepare(gpu, &request, &mut watch);
-        if let Some(bar) = watch.bar.take() {
-            bar.finish_and_clear();
-        }
-        Ok(result?)
+        Ok(capture::prepare(gpu, &request, &mut Bars::default())?)
     })?;
     println!("{}: ready after {:.0} s", args.out.display(), began.elapsed().as_secs_f64());
     next::say(&[
@@ -141,10 +149,19 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
 }
 
 /// A bar for each step.
-struct Bars {
+#[derive(Default)]
+pub(super) struct Bars {
     bar: Option<ProgressBar>,
-    began: Instant,
-    step: Option<Step>,
+    step: Option<(Step, Instant)>,
+}
+
+impl Drop for Bars {
+    /// A step that failed has not ended its bar.
+    fn drop(&mut self) {
+        if let Some(bar) = self.bar.take() {
+            bar.finish_and_clear();
+        }
+    }
 }
 
 impl Watch for Bars {
@@ -153,7 +170,7 @@ impl Watch for Bars {
             .unwrap_or_else(|_| ProgressStyle::default_bar());
         let bar = ProgressBar::new(units).with_style(style).with_message(step.name());
         bar.enable_steady_tick(Duration::from_millis(250));
-        (self.bar, self.began, self.step) = (Some(bar), Instant::now(), Some(step));
+        (self.bar, self.step) = (Some(bar), Some((step, Instant::now())));
     }
 
     fn at(&mut self, unit: u64) {
@@ -166,8 +183,8 @@ impl Watch for Bars {
         if let Some(bar) = self.bar.take() {
             bar.finish_and_clear();
         }
-        if let Some(step) = self.step.take() {
-            eprintln!("{}: {:.1} s", step.name(), self.began.elapsed().as_secs_f64());
+        if let Some((step, began)) = self.step.take() {
+            eprintln!("{}: {:.1} s", step.name(), began.elapsed().as_secs_f64());
         }
     }
 

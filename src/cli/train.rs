@@ -3,6 +3,7 @@
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use crate::atomic::AtomicWriteFile;
@@ -94,7 +95,7 @@ pub(super) struct Args {
 }
 
 /// A positive number of minutes.
-fn positive(text: &str) -> Result<f64, String> {
+pub(super) fn positive(text: &str) -> Result<f64, String> {
     text.parse().ok().filter(|m| (1e-3..1e6).contains(m)).ok_or_else(|| "give a positive number of minutes".into())
 }
 
@@ -178,7 +179,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             None => (settings, None),
         };
         let board = args.view.map(|address| show(address, &name, &scene, &settings)).transpose()?;
-        let manner = Manner { began: Some(began), board, go_on: begun, clock };
+        let manner = Manner { began: Some(began), board, go_on: begun, clock, stop: Stop::default() };
         eprintln!("device: {} ({})", gpu.info().name, gpu.info().driver);
         let Trained { summary, report, mut written } =
             train(gpu, &scene, &settings, &name, &folder, &manner, &Judge::default())?;
@@ -210,7 +211,7 @@ fn warn(looked: &doctor::Report) {
 
 /// Takes the lock of a run folder. `None` where it cannot be had and nothing is to be done: complete runs are left alone, and
 /// the folder holds one.
-fn held(folder: &Path, leave_complete: bool) -> Result<Option<Lock>, folder::Error> {
+pub(super) fn held(folder: &Path, leave_complete: bool) -> Result<Option<Lock>, folder::Error> {
     match Lock::take(folder) {
         Err(_) if leave_complete && Record::read(folder).is_ok_and(|record| record.complete.is_some()) => Ok(None),
         taken => taken.map(Some),
@@ -286,6 +287,16 @@ pub(super) struct Manner {
     pub go_on: bool,
     /// Ends when the time is over.
     pub clock: Option<minutes::Clock>,
+    /// Ends as by Ctrl-C once this is set.
+    pub stop: Stop,
+}
+
+/// A wish to end, of others than the terminal.
+pub(super) type Stop = Arc<AtomicBool>;
+
+/// The signal that ends the work, if there is one or a wish to end.
+pub(super) fn ends(stop: &Stop) -> Option<Signal> {
+    signals::caught().or_else(|| stop.load(Ordering::Relaxed).then_some(Signal::Interrupt))
 }
 
 /// What a finished run is.
@@ -404,7 +415,8 @@ fn finish(mut run: Run<'_>, settings: &Settings, folder: &Path, manner: &Manner)
     let host = manner.board.as_ref().map(Host::new);
     let clock = manner.clock.clone().map(|clock| (clock, folder.join(SETTINGS), settings.clone()));
     let rows = settings.model.form.rows();
-    let mut watch = Watch { bar, rows, pictures: folder.join(TEST), failed: None, began: manner.began, host, clock };
+    let (pictures, stop) = (folder.join(TEST), manner.stop.clone());
+    let mut watch = Watch { bar, rows, pictures, failed: None, began: manner.began, host, clock, stop };
     let result = run.train(folder, &mut watch);
     watch.bar.finish_and_clear();
     let mut summary = result.inspect_err(|_| index::of_stopped(folder))?;
@@ -504,7 +516,8 @@ fn write(path: &Path, text: &str) -> std::io::Result<()> {
 const METRICS: &str = "metrics.json";
 const TRACE: &str = "trace.json";
 
-fn describe(summary: &Summary, form: Form) -> String {
+/// A line on how long it took and what it came to.
+pub(super) fn describe(summary: &Summary, form: Form) -> String {
     let rows = form.rows();
     let Summary { steps, seconds, repeated, anchors, gaussians, pairs, peak_device_bytes, .. } = summary;
     let repeated = if *repeated > 0 { format!(" ({repeated} repeated as buffers grew)") } else { String::new() };
@@ -551,6 +564,7 @@ struct Watch {
     host: Option<Host>,
     /// With the file of the settings, and these as the run began with them.
     clock: Option<(minutes::Clock, PathBuf, Settings)>,
+    stop: Stop,
 }
 
 impl Observer for Watch {
@@ -613,6 +627,6 @@ impl Observer for Watch {
     }
 
     fn interrupted(&mut self) -> Option<Signal> {
-        signals::caught()
+        ends(&self.stop)
     }
 }

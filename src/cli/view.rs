@@ -25,7 +25,7 @@ use crate::view::{self, Page, Start, server};
   gscream-vk view runs/garden --camera IMG_0012 --port 9000
   gscream-vk view runs/garden --html garden.html")]
 pub(super) struct Args {
-    /// Run folder that was exported, or an export's own folder
+    /// Run folder that was exported, an export's own folder, or what remove made
     #[arg(value_name = "RUN")]
     run: PathBuf,
     /// Training view to start at [default: the most upright one]
@@ -68,6 +68,18 @@ pub(super) fn bind(address: SocketAddr, other: &str) -> anyhow::Result<TcpListen
     })
 }
 
+/// The page of an exported run, or of what `remove` has made, as without options.
+pub(super) fn page_of(run: &Path) -> anyhow::Result<Page> {
+    page(&Args {
+        run: run.to_owned(),
+        camera: None,
+        html: None,
+        port: 0,
+        host: IpAddr::V4(Ipv4Addr::LOCALHOST),
+        no_photograph: false,
+    })
+}
+
 fn page(args: &Args) -> anyhow::Result<Page> {
     let run = &args.run;
     if !run.is_dir() {
@@ -91,7 +103,8 @@ fn page(args: &Args) -> anyhow::Result<Page> {
         })?,
         None => most_upright(&cameras.cameras).with_context(|| format!("{}: names no camera", figures.display()))?,
     };
-    let origin = Origin::find(run).ok();
+    // What `remove` makes has its run in a folder of its own.
+    let origin = Origin::find(run).or_else(|_| Origin::find(&run.join(super::remove::RUN))).ok();
     let photograph = origin.filter(|_| !args.no_photograph).and_then(|origin| {
         let jpeg = photograph(&origin, pose);
         if let Err(error) = &jpeg {

@@ -26,6 +26,7 @@ pub use crate::model::ply;
 use crate::model::stored::Stored;
 use crate::render::view::Renderer;
 use crate::scene::{Camera, Scene};
+use crate::train::run::Signal;
 
 /// Why an export, or one of its files, cannot be written or read.
 #[derive(Debug, thiserror::Error)]
@@ -51,6 +52,12 @@ pub enum Error {
         gaussians: usize,
         /// Poses they were looked at from.
         poses: usize,
+    },
+    /// Somebody asked for an end.
+    #[error("stopped by {signal}; nothing was written")]
+    Interrupted {
+        /// How.
+        signal: Signal,
     },
     /// Pictures that cannot be compared.
     #[error(transparent)]
@@ -118,6 +125,17 @@ pub trait Observer {
     fn begin(&mut self, part: &str, turns: u64);
     /// A turn is done; `note` says something of it, or nothing.
     fn turn(&mut self, note: &str);
+    /// The last part has ended.
+    fn end(&mut self) {}
+    /// Whether to end; asked behind the turns of the longer parts.
+    fn interrupted(&mut self) -> Option<Signal> {
+        None
+    }
+}
+
+/// Goes on unless it is time to end.
+fn go_on(observer: &mut dyn Observer) -> Result<(), Error> {
+    observer.interrupted().map_or(Ok(()), |signal| Err(Error::Interrupted { signal }))
 }
 
 /// A finished export, before it is written.
@@ -212,6 +230,7 @@ pub fn make(
     for camera in &cameras {
         views.push((turned(camera), baker.look(camera)?));
         observer.turn("");
+        go_on(observer)?;
     }
     let mut cloud = baker.cloud(SEEN, cameras.len())?;
     let gaussians = [baker.gaussians(), cloud.len()];
@@ -227,7 +246,10 @@ pub fn make(
     losses.push(("baked".to_owned(), yardstick.of_drawer(&mut drawer)?));
     observer.begin("refining", options.steps.into());
     let config = refine::Config { steps: options.steps, seed: options.seed, radius: scene.radius.into() };
-    refine::run(&mut drawer, &views, &config, |_, loss| observer.turn(&format!("loss {loss:.4}")))?;
+    refine::run(&mut drawer, &views, &config, |_, loss| {
+        observer.turn(&format!("loss {loss:.4}"));
+        go_on(observer)
+    })?;
     losses.push(("refined".to_owned(), yardstick.of_drawer(&mut drawer)?));
 
     observer.begin("pruning", views.len() as u64);
@@ -240,6 +262,7 @@ pub fn make(
     cloud.retain(&shares.iter().map(|share| *share > SEEN).collect::<Vec<_>>());
     let larger = larger(options, &train);
     low_pass::widen(&mut cloud, &train.iter().map(turned).collect::<Vec<_>>(), larger);
+    observer.end();
     Ok(Export { cloud, turn, yardstick, losses, poses: [looked.len(), between.len()], gaussians, larger })
 }
 

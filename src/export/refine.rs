@@ -36,12 +36,12 @@ fn rates(config: &Config, step: u32) -> Rates {
 /// and the loss before it.
 ///
 /// # Errors
-/// When the device has no room, or is lost.
+/// When the device has no room, or is lost; those of `progress`.
 pub fn run(
     drawer: &mut Drawer,
     views: &[(Camera, RgbImage)],
     config: &Config,
-    mut progress: impl FnMut(u32, f32),
+    mut progress: impl FnMut(u32, f32) -> Result<(), Error>,
 ) -> Result<(), Error> {
     if views.is_empty() {
         return Ok(());
@@ -50,7 +50,7 @@ pub fn run(
     for step in 1..=config.steps {
         let (camera, picture) = &views[order.view(step)];
         let loss = drawer.step(camera, &pack(picture, None), step, rates(config, step))?;
-        progress(step, loss);
+        progress(step, loss)?;
     }
     Ok(())
 }

@@ -183,6 +183,11 @@ impl Board {
         })
     }
 
+    /// Steps that are done, and all of them.
+    pub fn steps(&self) -> [u32; 2] {
+        [self.lock().progress.step, self.iterations]
+    }
+
     /// A thread that panicked has left nothing half done that matters here.
     fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)

@@ -1,5 +1,5 @@
-//! A web server for a handful of files in memory, or what a [`Site`] makes of a request: GET and HEAD, one answer per
-//! connection.
+//! A web server for a handful of files in memory, or what a [`Site`] makes of a request: GET and HEAD, and POST of JSON for
+//! sites that take it, one answer per connection.
 //!
 //! Whatever clients send or do not send, they cost a bounded part of the machine ([`Limits`]): a connection has one deadline
 //! for its request and one for taking the answer; where there are too many, the one that has used most of its time goes;
@@ -7,7 +7,8 @@
 //!
 //! A request must name this machine as its host. Otherwise the name of any web site could be pointed at the loopback
 //! address, and its pages would read what is served here (DNS rebinding). Pages may load nothing from elsewhere
-//! ([`POLICY`]), and other sites may embed nothing from here.
+//! ([`POLICY`]), and other sites may embed nothing from here. What is posted must be JSON, which no other site's page sends
+//! unasked, must not say that it comes from another site's page, and must have the site's own token.
 
 use std::borrow::Cow;
 use std::collections::{BTreeMap, VecDeque};
@@ -47,12 +48,22 @@ pub enum Refusal {
     BadRequest,
     /// There is nothing of this name.
     NotFound,
-    /// Only GET and HEAD are answered.
+    /// What is posted lacks the site's token, or comes from another site's page.
+    Forbidden,
+    /// Only GET and HEAD are answered, and POST by sites that take it.
     Method,
     /// The request has not come to its end in time.
     Late,
+    /// Not in the state that things are in.
+    Conflict,
     /// There will be nothing more of this name.
     Gone,
+    /// What is posted does not say how long it is.
+    NoLength,
+    /// What is posted is too long.
+    TooLarge,
+    /// What is posted is no JSON.
+    NoJson,
     /// The request is for another machine.
     OtherHost,
     /// The request is too long.
@@ -65,10 +76,15 @@ impl Refusal {
     fn status(self) -> &'static str {
         match self {
             Self::BadRequest => "400 Bad Request",
+            Self::Forbidden => "403 Forbidden",
             Self::NotFound => "404 Not Found",
             Self::Method => "405 Method Not Allowed",
             Self::Late => "408 Request Timeout",
+            Self::Conflict => "409 Conflict",
             Self::Gone => "410 Gone",
+            Self::NoLength => "411 Length Required",
+            Self::TooLarge => "413 Content Too Large",
+            Self::NoJson => "415 Unsupported Media Type",
             Self::OtherHost => "421 Misdirected Request",
             Self::TooLong => "431 Request Header Fields Too Large",
             Self::Busy => "503 Service Unavailable",
@@ -83,6 +99,19 @@ pub trait Site: Send + Sync + 'static {
     /// # Errors
     /// What is said to the client instead.
     fn get(&self, path: &str, query: &str) -> Result<Answer<'_>, Refusal>;
+
+    /// The token that whoever changes something must show, in the field `X-Token`; without one nothing is taken.
+    fn token(&self) -> Option<&str> {
+        None
+    }
+
+    /// Takes what was posted to a path, with the right token.
+    ///
+    /// # Errors
+    /// What is said to the client instead: a status and a sentence.
+    fn post(&self, _path: &str, _body: &[u8]) -> Result<Answer<'_>, (Refusal, String)> {
+        Err((Refusal::Method, String::new()))
+    }
 }
 
 impl Site for Vec<Resource> {
@@ -128,6 +157,8 @@ const BURST: u32 = 32;
 const MOST_BYTES: usize = 16 << 10;
 /// Most fields of a head.
 const MOST_FIELDS: usize = 64;
+/// Longest body that is read, bytes.
+const MOST_BODY: usize = 64 << 10;
 /// What is still read of a request that was refused, bytes and time: closing a connection with unread bytes resets it, and
 /// the refusal would be lost.
 const REST: (usize, Duration) = (1 << 20, Duration::from_millis(500));
@@ -135,12 +166,12 @@ const REST: (usize, Duration) = (1 << 20, Duration::from_millis(500));
 const PIECE: usize = 64 << 10;
 
 /// What pages may do: scripts and data come from the server itself or are made by the page (`blob:`), styles may stand in
-/// elements. Nothing is loaded from or sent elsewhere, and no other page embeds them. The viewer compiles WebAssembly, and
+/// elements. Nothing is loaded from or sent elsewhere, and no other site's page embeds them. The viewer compiles WebAssembly, and
 /// the one handler that stands in its elements is named by its hash.
 pub const POLICY: &str = "default-src 'none'; script-src 'self' blob: 'wasm-unsafe-eval' 'unsafe-hashes' \
     'sha256-jHF5hTIlMDyGZRAsNK0HO/WFYrwPvI2I1q0o1xKKB6I='; style-src 'self' 'unsafe-inline'; \
     img-src 'self' blob: data:; font-src 'self' data:; connect-src 'self' blob: data:; worker-src 'self' blob:; \
-    base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+    frame-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'";
 
 /// Binds the address; port 0 is any free one.
 ///
@@ -259,16 +290,21 @@ impl<S: Site> Client<S> {
         self.stream.set_nodelay(true)?;
         let request = self.request(Instant::now() + self.limits.request)?;
         self.waits(None);
-        let (method, answer) = match request.and_then(|head| self.answered(&head)) {
+        let answered = match request {
+            Ok(head) => self.answered(&head)?,
+            Err(refused) => Err((refused, String::new())),
+        };
+        let (method, answer) = match answered {
             Ok(answered) => answered,
-            Err(refused) => {
+            Err((refused, why)) => {
                 self.waits(Some(self.limits.answer));
-                self.write(&refusal(refused), Instant::now() + self.limits.answer)?;
+                let text = if why.is_empty() { refusal(refused) } else { refusal_because(refused, &why) };
+                self.write(&text, Instant::now() + self.limits.answer)?;
                 return self.drain();
             }
         };
         let head = head("200 OK", answer.kind, answer.bytes.len(), answer.gzip);
-        let body: &[u8] = if method == Method::Get { &answer.bytes } else { &[] };
+        let body: &[u8] = if method == Method::Head { &[] } else { &answer.bytes };
         let time = self.limits.answer + Duration::from_secs_f64(body.len() as f64 / self.limits.rate);
         self.waits(Some(time));
         let until = Instant::now() + time;
@@ -309,16 +345,79 @@ impl<S: Site> Client<S> {
         }
     }
 
-    fn answered(&self, head: &[u8]) -> Result<(Method, Answer<'_>), Refusal> {
+    /// The answer to a request, of whose body `head` may have the beginning.
+    fn answered(&self, head: &[u8]) -> io::Result<Answered<'_>> {
         let mut fields = [httparse::EMPTY_HEADER; MOST_FIELDS];
-        let request = Request::parse(head, &mut fields)?;
-        // Behind some addresses there is more than one of this machine's: the client has chosen which.
-        let ours = self.stream.local_addr().map_or(Ipv4Addr::LOCALHOST.into(), |address| address.ip());
-        if !names(request.field("host")?.ok_or(Refusal::BadRequest)?, ours) {
-            return Err(Refusal::OtherHost);
+        let plain = |refused| Ok(Err((refused, String::new())));
+        let asked = Request::parse(head, &mut fields).and_then(|request| {
+            // Behind some addresses there is more than one of this machine's: the client has chosen which.
+            let ours = self.stream.local_addr().map_or(Ipv4Addr::LOCALHOST.into(), |address| address.ip());
+            if !names(request.field("host")?.ok_or(Refusal::BadRequest)?, ours) {
+                return Err(Refusal::OtherHost);
+            }
+            let method = request.method.ok_or(Refusal::Method)?;
+            let length = if method == Method::Post { Some(self.may_post(&request, ours)?) } else { None };
+            Ok((request, method, length))
+        });
+        let (request, method, length) = match asked {
+            Ok(asked) => asked,
+            Err(refused) => return plain(refused),
+        };
+        let Some(length) = length else {
+            return Ok(self.site.get(request.path, request.query).map_err(|r| (r, String::new())).map(|a| (method, a)));
+        };
+        self.waits(Some(self.limits.request));
+        let body = self.body(&head[request.length..], length, Instant::now() + self.limits.request)?;
+        self.waits(None);
+        match body {
+            Ok(body) => Ok(self.site.post(request.path, &body).map(|answer| (method, answer))),
+            Err(refused) => plain(refused),
         }
-        let method = request.method.ok_or(Refusal::Method)?;
-        Ok((method, self.site.get(request.path, request.query)?))
+    }
+
+    /// The length of a body that is taken.
+    fn may_post(&self, request: &Request<'_>, ours: IpAddr) -> Result<usize, Refusal> {
+        let token = self.site.token().ok_or(Refusal::Method)?;
+        // A browser says whose page it is.
+        let foreign = request.field("origin")?.is_some_and(|origin| {
+            let host = origin.strip_prefix("http://").or_else(|| origin.strip_prefix("https://"));
+            !host.is_some_and(|host| names(host, ours))
+        });
+        if foreign || !request.field("x-token")?.is_some_and(|shown| same(shown, token)) {
+            return Err(Refusal::Forbidden);
+        }
+        let kind = request.field("content-type")?.unwrap_or_default();
+        if !kind.split(';').next().unwrap_or_default().trim().eq_ignore_ascii_case("application/json") {
+            return Err(Refusal::NoJson);
+        }
+        if request.field("transfer-encoding")?.is_some() {
+            return Err(Refusal::NoLength);
+        }
+        let length = request.field("content-length")?.ok_or(Refusal::NoLength)?;
+        let length = Some(length).filter(|digits| digits.bytes().all(|digit| digit.is_ascii_digit()));
+        let length = length.and_then(|digits| digits.parse::<u64>().ok()).ok_or(Refusal::BadRequest)?;
+        usize::try_from(length).ok().filter(|length| *length <= MOST_BODY).ok_or(Refusal::TooLarge)
+    }
+
+    /// Reads a body of so many bytes that begins with these.
+    fn body(&self, begun: &[u8], length: usize, until: Instant) -> io::Result<Result<Vec<u8>, Refusal>> {
+        let mut body = begun[..begun.len().min(length)].to_vec();
+        let mut piece = [0; 4096];
+        while body.len() < length {
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Ok(Err(Refusal::Late));
+            }
+            self.stream.set_read_timeout(Some(left))?;
+            let most = piece.len().min(length - body.len());
+            match (&*self.stream).read(&mut piece[..most]) {
+                Ok(0) => return Err(io::ErrorKind::UnexpectedEof.into()),
+                Ok(read) => body.extend_from_slice(&piece[..read]),
+                Err(error) if is_pause(&error) => {}
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(Ok(body))
     }
 
     fn write(&self, bytes: &[u8], until: Instant) -> io::Result<()> {
@@ -364,11 +463,20 @@ fn is_pause(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut | io::ErrorKind::Interrupted)
 }
 
+/// What a request comes to: how it was asked and the answer, or a status and what is said with it.
+type Answered<'a> = Result<(Method, Answer<'a>), (Refusal, String)>;
+
+/// Whether two words are the same, in a time that does not say where they differ.
+fn same(a: &str, b: &str) -> bool {
+    a.len() == b.len() && a.bytes().zip(b.bytes()).fold(0, |sum, (a, b)| sum | (a ^ b)) == 0
+}
+
 /// What may be asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Method {
     Get,
     Head,
+    Post,
 }
 
 /// The head of a request.
@@ -377,26 +485,29 @@ struct Request<'a> {
     method: Option<Method>,
     path: &'a str,
     query: &'a str,
+    /// Bytes of the head.
+    length: usize,
     fields: &'a [httparse::Header<'a>],
 }
 
 impl<'a> Request<'a> {
     fn parse(head: &'a [u8], fields: &'a mut [httparse::Header<'a>]) -> Result<Self, Refusal> {
         let mut request = httparse::Request::new(fields);
-        match request.parse(head) {
-            Ok(httparse::Status::Complete(_)) => {}
+        let length = match request.parse(head) {
+            Ok(httparse::Status::Complete(length)) => length,
             Err(httparse::Error::TooManyHeaders) => return Err(Refusal::TooLong),
             Ok(httparse::Status::Partial) | Err(_) => return Err(Refusal::BadRequest),
-        }
+        };
         let target = request.path.filter(|path| path.starts_with('/')).ok_or(Refusal::BadRequest)?;
         let target = target.split('#').next().unwrap_or_default();
         let (path, query) = target.split_once('?').unwrap_or((target, ""));
         let method = match request.method {
             Some("GET") => Some(Method::Get),
             Some("HEAD") => Some(Method::Head),
+            Some("POST") => Some(Method::Post),
             _ => None,
         };
-        Ok(Self { method, path, query, fields: request.headers })
+        Ok(Self { method, path, query, length, fields: request.headers })
     }
 
     /// The field of this name, which is there once at most.
@@ -443,6 +554,12 @@ fn refusal(refusal: Refusal) -> Vec<u8> {
         _ => format!("{status}\n"),
     };
     (head(status, "text/plain", text.len(), false) + &text).into_bytes()
+}
+
+/// A refusal that says why, in a sentence.
+fn refusal_because(refusal: Refusal, why: &str) -> Vec<u8> {
+    let text = format!("{why}\n");
+    (head(refusal.status(), "text/plain; charset=utf-8", text.len(), false) + &text).into_bytes()
 }
 
 #[cfg(test)]

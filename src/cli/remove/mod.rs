@@ -1,0 +1,159 @@
+//! `gscream-vk remove`: point at it, and it is gone.
+
+mod page;
+mod work;
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+
+use super::prepare::ObjectArgs;
+use super::shared::DeviceArgs;
+use super::{next, signals, train};
+use crate::capture::poses;
+use crate::config::SettingsArgs;
+use crate::export;
+use crate::folder::Lock;
+use crate::remove::objects;
+use work::{Job, Places};
+
+/// The run's folder within what is made.
+pub(super) const RUN: &str = "run";
+
+/// Remove an object from photographs: point at it in the browser, and it is gone
+///
+/// Does what prepare, doctor, train and export do, one after the other. Without --mask, --box, --strokes and --yes it opens a
+/// page with the photographs: click on the object, look at what was understood in the other photographs, press Remove. With
+/// any of them it needs no browser and asks nothing.
+///
+/// PHOTOS is what prepare takes: a folder of photographs, alone or with a COLMAP model or a transforms.json. Everything goes
+/// into one folder: the masks that were clicked (objects/NAME.png), the scene (scene/), the run (run/), and the files for
+/// viewers. The same command again goes on where it was cut off, and makes again only what has changed.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  gscream-vk remove photos
+  gscream-vk remove photos --minutes 20
+  gscream-vk remove photos --out garden --mask IMG_0012=mask.png
+  gscream-vk remove photos --out garden --box IMG_0012=310,220,540,470 --yes
+  gscream-vk remove photos --out garden --yes      # with the masks in garden/objects")]
+pub(super) struct Args {
+    /// Folder of photographs
+    #[arg(value_name = "PHOTOS")]
+    photographs: PathBuf,
+    /// Folder for all that is made [default: PHOTOS-removed, here]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    #[command(flatten)]
+    object: ObjectArgs,
+    /// No page and no questions: take the masks that are there, and go on whatever doctor finds
+    #[arg(long)]
+    yes: bool,
+    /// Do not open a browser; the address of the page is printed either way
+    #[arg(long)]
+    no_open: bool,
+    /// Port of the page on this machine; 0 is any free one
+    #[arg(long, value_name = "N", default_value_t = 8644)]
+    port: u16,
+    /// View to become the reference [default: the one whose hole is seen best by others]
+    #[arg(long, value_name = "NAME")]
+    reference: Option<String>,
+    /// Train for about so many minutes: see train
+    #[arg(long, value_name = "N", conflicts_with = "iterations", value_parser = train::positive)]
+    minutes: Option<f64>,
+    /// Steps of the fit that masks, depth and reference are made with
+    #[arg(long, value_name = "N", default_value_t = 600, value_parser = clap::value_parser!(u32).range(1..))]
+    fit_steps: u32,
+    /// Steps by which the exported files are refined
+    #[arg(long, value_name = "N", default_value_t = export::Options::default().steps)]
+    export_steps: u32,
+    #[command(flatten)]
+    settings: SettingsArgs,
+    #[command(flatten)]
+    device: DeviceArgs,
+}
+
+impl Args {
+    fn job(&self) -> Job<'_> {
+        Job { args: self, places: Places::new(self.out.clone().unwrap_or_else(|| default_folder(&self.photographs))) }
+    }
+}
+
+/// The last part of the photographs' folder, and `-removed`.
+fn default_folder(photographs: &Path) -> PathBuf {
+    let absolute = photographs.canonicalize().unwrap_or_else(|_| photographs.to_owned());
+    let mut name = absolute.file_name().map_or_else(|| "photos".into(), std::ffi::OsStr::to_owned);
+    name.push("-removed");
+    name.into()
+}
+
+pub(super) fn run(args: &Args) -> anyhow::Result<()> {
+    // A mistake in the settings is said before anything is made.
+    args.settings.resolve()?;
+    let job = args.job();
+    let capture = poses::find(&args.photographs)?;
+    let _lock = Lock::take(&job.places.root)?;
+    if args.object.evidence().is_empty() && !args.yes {
+        return page::run(&job, &capture);
+    }
+    let mut object = args.object.evidence();
+    let named: Vec<String> = object.iter().map(|(name, _)| crate::scene::stem(name).to_owned()).collect();
+    let kept = objects::all(&job.places.objects, capture.photographs.iter().filter(|(name, _)| !named.contains(name)))?;
+    if !kept.is_empty() {
+        eprintln!("objects: {} masks in {} count as well", kept.len(), job.places.objects.display());
+    }
+    object.extend(work::evidence(kept));
+    args.device.with_gpu(|gpu| {
+        signals::listen()?;
+        job.work(gpu, object, args.yes, &work::Nobody)
+    })?;
+    job.say();
+    Ok(())
+}
+
+impl Job<'_> {
+    /// Says what there is now, and what can be done with it.
+    fn say(&self) {
+        let Places { root, run, .. } = &self.places;
+        println!("{}: the object is gone", root.display());
+        for (name, path) in self.places.files() {
+            let bytes = std::fs::metadata(&path).map_or(0, |file| file.len());
+            println!("  {name:10} {:8.1} MB", bytes as f64 / 1e6);
+        }
+        let page = run.join(super::index::INDEX);
+        next::say(&[
+            (next::command(&["view"], root), "shows it in the browser; --html FILE makes a page to send"),
+            (next::typed(&page.to_string_lossy()), "is the training as a page, for a browser"),
+        ]);
+    }
+}
+
+/// Opens the page in the user's browser, where there is one to ask.
+fn open_browser(url: &str) -> anyhow::Result<()> {
+    let (program, arguments): (&str, &[&str]) = if cfg!(target_os = "macos") {
+        ("open", &[])
+    } else if cfg!(windows) {
+        ("cmd", &["/C", "start", ""])
+    } else {
+        ("xdg-open", &[])
+    };
+    let mut command = std::process::Command::new(program);
+    command.args(arguments).arg(url);
+    let quiet = std::process::Stdio::null;
+    let mut child = command.stdin(quiet()).stdout(quiet()).stderr(quiet()).spawn().context(program.to_owned())?;
+    // It may stay for as long as the browser does.
+    std::thread::spawn(move || child.wait());
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_folder_is_named_after_the_photographs() {
+        assert_eq!(default_folder(Path::new("nowhere/garden")), Path::new("garden-removed"));
+        let here = std::env::current_dir().expect("a folder");
+        let name = here.file_name().expect("a name").to_string_lossy().into_owned();
+        assert_eq!(default_folder(Path::new(".")), PathBuf::from(format!("{name}-removed")));
+    }
+}

@@ -1,0 +1,241 @@
+//! The page's side of `remove`: the fit as soon as the page is open, masks carried to all views whenever one has changed, and
+//! the work when the user presses the button.
+
+use std::collections::BTreeMap;
+use std::net::{Ipv4Addr, SocketAddr};
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Context as _;
+use image::GrayImage;
+
+use super::work::{self, Audience, Job};
+use super::{open_browser, signals};
+use crate::capture::depth::DepthMap;
+use crate::capture::doctor::{Report, Severity};
+use crate::capture::fit::Fit;
+use crate::capture::masks::{self, Shares, Votes};
+use crate::capture::poses::Capture;
+use crate::capture::splats::Splats;
+use crate::cli::train::{self, Stop};
+use crate::cli::view;
+use crate::gpu::Gpu;
+use crate::remove::{Session, Wish, objects};
+use crate::scene::{self, Scene};
+use crate::view::live::Board;
+use crate::view::server;
+
+/// How long the worker waits before it looks whether a signal has come.
+const PATIENCE: Duration = Duration::from_millis(200);
+
+/// The session as the work's audience.
+struct Visitors<'a>(&'a Session);
+
+impl Audience for Visitors<'_> {
+    fn begin(&self, part: &str, units: u64) {
+        self.0.begin(part, units);
+    }
+    fn at(&self, units: u64) {
+        self.0.at(units);
+    }
+    fn board(&self, board: &Arc<Board>) {
+        self.0.show(board.clone());
+    }
+    fn examined(&self, report: &Report) {
+        let problems = report.findings.iter().filter(|finding| finding.severity == Severity::Problem);
+        let said = problems.map(|finding| {
+            let view = finding.view.as_ref().map_or_else(String::new, |view| format!("{view}: "));
+            format!("{view}{}", finding.message)
+        });
+        self.0.found(said.collect());
+    }
+    fn stop(&self) -> Stop {
+        self.0.stopping()
+    }
+    fn looks(&self) -> bool {
+        true
+    }
+}
+
+pub fn run(job: &Job<'_>, capture: &Capture) -> anyhow::Result<()> {
+    let given = delivered(capture)?;
+    let name = job.args.photographs.canonicalize().unwrap_or_else(|_| job.args.photographs.clone());
+    let title = name.file_name().map_or_else(|| "photographs".into(), |name| name.to_string_lossy());
+    let session = Session::open(&title, &capture.photographs, &job.places.objects, &given)?;
+    let address = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), job.args.port);
+    job.args.device.with_gpu(|gpu| {
+        let listener = view::bind(address, "--port 0")?;
+        let url = format!("http://{}/", listener.local_addr().unwrap_or(address));
+        println!("{url} (Ctrl-C ends it; the same command goes on)");
+        let site = session.clone();
+        std::thread::spawn(move || server::serve(&listener, &site));
+        if !job.args.no_open
+            && let Err(error) = open_browser(&url)
+        {
+            log::info!("no browser was opened: {error:#}");
+        }
+        signals::listen()?;
+        attend(job, gpu, &session, capture)
+    })
+}
+
+/// Masks that came with the photographs.
+fn delivered(capture: &Capture) -> Result<BTreeMap<String, GrayImage>, scene::Error> {
+    let mut all = BTreeMap::new();
+    for (name, (path, inverted)) in &capture.masks {
+        let Some(photograph) = capture.photographs.get(name) else { continue };
+        let mut mask = scene::mask(path, 1)?;
+        if *inverted {
+            mask.iter_mut().for_each(|v| *v = 255 - *v);
+        }
+        if scene::dimensions(photograph)? == [mask.width(), mask.height()] {
+            all.insert(name.clone(), mask);
+        }
+    }
+    Ok(all)
+}
+
+fn check(job: &Job<'_>) -> Result<(), signals::Stopped> {
+    signals::check(|| format!("what was marked lies in {}, and the same command goes on", job.places.objects.display()))
+}
+
+/// Does what the page asks for, until a signal ends it.
+fn attend(job: &Job<'_>, gpu: &Gpu, session: &Arc<Session>, capture: &Capture) -> anyhow::Result<()> {
+    let mut carrier = loop {
+        match Carrier::new(job, gpu, session) {
+            Ok(carrier) => break carrier,
+            Err(error) => {
+                check(job)?;
+                // The page says it, too; without cameras there is nothing to do but to look into it.
+                eprintln!("{}", crate::cli::message(&error));
+                session.fail(format!("{error:#}"));
+                loop {
+                    check(job)?;
+                    if let Wish::Remove(_) = session.wish(PATIENCE) {
+                        break;
+                    }
+                }
+            }
+        }
+    };
+    loop {
+        check(job)?;
+        match session.wish(PATIENCE) {
+            Wish::Nothing => {}
+            Wish::Carry(revision, given) => carrier.carry(session, revision, &given)?,
+            Wish::Remove(despite) => {
+                let result = remove(job, gpu, session, capture, despite);
+                check(job)?;
+                if let Err(error) = result {
+                    if train::ends(&session.stopping()).is_some() {
+                        eprintln!("stopped on the page; it can be gone on with there");
+                        session.stopped();
+                    } else if !despite && session.has_problems() {
+                        // The page lists them, and asks.
+                        eprintln!("{}", crate::cli::message(&error));
+                        session.stopped();
+                    } else {
+                        eprintln!("{}", crate::cli::message(&error));
+                        session.fail(format!("{error:#}"));
+                    }
+                }
+            }
+        }
+    }
+}
+
+fn remove(job: &Job<'_>, gpu: &Gpu, session: &Session, capture: &Capture, despite: bool) -> anyhow::Result<()> {
+    session.begin("masks", 0);
+    let masks = objects::all(&job.places.objects, capture.photographs.iter())?;
+    job.work(gpu, work::evidence(masks).collect(), despite, &Visitors(session))?;
+    session.begin("page", 0);
+    let page = view::page_of(&job.places.root).context("the object is gone, but it cannot be shown")?;
+    session.done(page.resources(), job.places.files());
+    job.say();
+    Ok(())
+}
+
+/// Carries masks to all views, by the fit.
+struct Carrier {
+    scene: Scene,
+    fit: Fit,
+    splats: Splats,
+    colors: Vec<[f32; 3]>,
+    /// Numbers of the scene's views among the photographs.
+    numbers: Vec<Option<usize>>,
+    /// Votes of a photograph's mask, and the mask's version.
+    votes: BTreeMap<usize, (u64, Votes)>,
+}
+
+impl Carrier {
+    fn new(job: &Job<'_>, gpu: &Gpu, session: &Session) -> anyhow::Result<Self> {
+        session.begin("poses", 0);
+        let (scene, fit) = job.fitted(gpu, &Visitors(session))?;
+        let mut splats = Splats::new(gpu, &fit.anchors, &fit.weights, &fit.settings.render)?;
+        session.begin("shape", scene.train.len() as u64);
+        let colors = masks::colors(&mut splats, &scene.train)?;
+        let numbers: Vec<Option<usize>> = scene.train.iter().map(|view| session.number(&view.name)).collect();
+        for (i, (view, number)) in scene.train.iter().zip(&numbers).enumerate() {
+            check(job)?;
+            if let Some(number) = number {
+                session.knows(*number, DepthMap::of(&mut splats, &view.camera, |_| false)?);
+            }
+            session.at(i as u64 + 1);
+        }
+        session.again();
+        session.ready();
+        session.end();
+        Ok(Self { scene, fit, splats, colors, numbers, votes: BTreeMap::new() })
+    }
+
+    /// Until they change or something else is to be done.
+    fn carry(
+        &mut self,
+        session: &Session,
+        revision: u64,
+        given: &[(usize, u64, Arc<GrayImage>)],
+    ) -> anyhow::Result<()> {
+        self.votes.retain(|of, (version, _)| given.iter().any(|(number, v, _)| number == of && v == version));
+        for (number, version, mask) in given {
+            let view = self.numbers.iter().position(|own| *own == Some(*number)).map(|i| &self.scene.train[i]);
+            let Some(view) = view.filter(|_| !self.votes.contains_key(number)) else { continue };
+            let mut votes = Votes::new(&self.splats);
+            votes.add(&mut self.splats, &view.camera, &masks::parts(mask, view.camera.size))?;
+            self.votes.insert(*number, (*version, votes));
+        }
+        let count = |without: Option<usize>| {
+            let mut sum = Votes::new(&self.splats);
+            let others = self.votes.iter().filter(|(number, _)| Some(**number) != without);
+            others.for_each(|(_, (_, votes))| sum.join(votes));
+            sum.count(&self.fit.anchors.position, &self.colors)
+        };
+        if self.votes.is_empty() {
+            session.carried(revision);
+            return Ok(());
+        }
+        let all = count(None);
+        // What is marked in a view is no evidence of what others say of it.
+        let others: BTreeMap<usize, Shares> = match self.votes.len() {
+            1 => BTreeMap::new(),
+            _ => self.votes.keys().map(|number| (*number, count(Some(*number)))).collect(),
+        };
+        session.begin("carry", self.scene.train.len() as u64);
+        for (i, number) in self.numbers.iter().enumerate() {
+            let Some(number) = number else { continue };
+            if session.is_stale(revision) || signals::caught().is_some() {
+                session.end();
+                return Ok(());
+            }
+            let camera = self.scene.train[i].camera;
+            let of_others = others.get(number);
+            if of_others.is_some() || !self.votes.contains_key(number) {
+                let carried = of_others.unwrap_or(&all).carry(&mut self.splats, &camera)?;
+                session.carry(revision, *number, carried, camera.size);
+            }
+            session.at(i as u64 + 1);
+        }
+        session.carried(revision);
+        session.end();
+        Ok(())
+    }
+}

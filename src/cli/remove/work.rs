@@ -1,0 +1,300 @@
+//! From photographs and their object to files for viewers: what prepare, doctor, train and export do, one after the other.
+//! A part whose inputs have not changed since it ended is not done again; one that was cut off is gone on with.
+
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+
+use anyhow::{Context as _, bail};
+use serde::{Deserialize, Serialize};
+
+use super::Args;
+use crate::atomic::AtomicWriteFile;
+use crate::capture::doctor::{self, Report};
+use crate::capture::record::{self, Inputs};
+use crate::capture::{self, Evidence, Request, Step, Watch};
+use crate::cli::folders::{MODEL, Record as RunRecord};
+use crate::cli::shared::{SceneArgs, add_dense};
+use crate::cli::train::{self, Manner, Stop, Trained};
+use crate::cli::{doctor as findings, export, minutes, prepare, preset};
+use crate::evaluate::Judge;
+use crate::export::{Observer, Options};
+use crate::gpu::Gpu;
+use crate::model::files::{POINT_CLOUD, WEIGHTS};
+use crate::train::checkpoint::{self, Fingerprint};
+use crate::train::run::Signal;
+use crate::view::live::Board;
+
+/// What lies where.
+pub struct Places {
+    /// The folder of all.
+    pub root: PathBuf,
+    /// The scene as `prepare` makes it.
+    pub scene: PathBuf,
+    /// The run.
+    pub run: PathBuf,
+    /// The masks that were clicked.
+    pub objects: PathBuf,
+}
+
+impl Places {
+    /// Below this folder.
+    pub fn new(root: PathBuf) -> Self {
+        let [scene, run, objects] = ["scene", super::RUN, "objects"].map(|name| root.join(name));
+        Self { root, scene, run, objects }
+    }
+
+    /// The files for viewers, by name.
+    pub fn files(&self) -> Vec<(String, PathBuf)> {
+        let figures = |name: &String| name.as_str() != export::FIGURES;
+        export::files().filter(figures).map(|name| (name.clone(), self.root.join(name))).collect()
+    }
+}
+
+/// What to do.
+pub struct Job<'a> {
+    /// As the user asked for it.
+    pub args: &'a Args,
+    /// Where to.
+    pub places: Places,
+}
+
+/// Hears how far the work is, and may end it.
+pub trait Audience {
+    /// A part begins, of so many units.
+    fn begin(&self, _part: &str, _units: u64) {}
+    /// So many units of it are done.
+    fn at(&self, _units: u64) {}
+    /// Training can be looked at.
+    fn board(&self, _board: &Arc<Board>) {}
+    /// What doctor says.
+    fn examined(&self, _report: &Report) {}
+    /// The wish to end.
+    fn stop(&self) -> Stop {
+        Stop::default()
+    }
+    /// Whether somebody looks at the training.
+    fn looks(&self) -> bool {
+        false
+    }
+}
+
+/// Hears nothing.
+pub struct Nobody;
+impl Audience for Nobody {}
+
+/// What `remove.json` holds: hashes of what was made of what.
+#[derive(Default, Serialize, Deserialize)]
+struct Record {
+    version: String,
+    /// What the run was begun with.
+    train: String,
+    /// What the files for viewers were made of.
+    export: String,
+}
+
+const RECORD: &str = "remove.json";
+
+impl Record {
+    /// An unreadable one says nothing: all is made again.
+    fn read(root: &Path) -> Self {
+        let text = std::fs::read(root.join(RECORD)).unwrap_or_default();
+        serde_json::from_slice(&text).unwrap_or_default()
+    }
+
+    fn write(&mut self, root: &Path) -> anyhow::Result<()> {
+        env!("CARGO_PKG_VERSION").clone_into(&mut self.version);
+        let path = root.join(RECORD);
+        let write = || {
+            let mut file = AtomicWriteFile::open(&path)?;
+            file.write_all((serde_json::to_string_pretty(self)? + "\n").as_bytes())?;
+            file.commit()
+        };
+        write().with_context(|| format!("{}: cannot be written", path.display()))
+    }
+}
+
+/// Masks in files as `prepare` takes them.
+pub fn evidence(masks: Vec<(String, PathBuf)>) -> impl Iterator<Item = (String, Evidence)> {
+    // A name may have a dot in it, where an extension would begin.
+    masks.into_iter().map(|(name, path)| (format!("{name}.png"), Evidence::Mask(path)))
+}
+
+/// Bars on the terminal, and an audience.
+struct Watched<'a, B> {
+    bars: B,
+    audience: &'a dyn Audience,
+    stop: Stop,
+    done: u64,
+}
+
+impl<'a, B: Default> Watched<'a, B> {
+    fn new(audience: &'a dyn Audience) -> Self {
+        Self { bars: B::default(), audience, stop: audience.stop(), done: 0 }
+    }
+}
+
+impl Watch for Watched<'_, prepare::Bars> {
+    fn begin(&mut self, step: Step, units: u64) {
+        self.audience.begin(step.name(), units);
+        self.bars.begin(step, units);
+    }
+    fn at(&mut self, unit: u64) {
+        self.audience.at(unit);
+        self.bars.at(unit);
+    }
+    fn end(&mut self) {
+        self.bars.end();
+    }
+    fn say(&mut self, line: &str) {
+        self.bars.say(line);
+    }
+    fn interrupted(&mut self) -> Option<Signal> {
+        train::ends(&self.stop)
+    }
+}
+
+impl Observer for Watched<'_, export::Bars> {
+    fn begin(&mut self, part: &str, turns: u64) {
+        self.done = 0;
+        self.audience.begin("export", turns);
+        self.bars.begin(part, turns);
+    }
+    fn turn(&mut self, note: &str) {
+        self.done += 1;
+        self.audience.at(self.done);
+        self.bars.turn(note);
+    }
+    fn end(&mut self) {
+        self.bars.end();
+    }
+    fn interrupted(&mut self) -> Option<Signal> {
+        train::ends(&self.stop)
+    }
+}
+
+impl Job<'_> {
+    /// What `prepare` is asked for.
+    pub fn request(&self, object: Vec<(String, Evidence)>) -> Request {
+        let Args { photographs, reference, fit_steps, .. } = self.args;
+        Request {
+            object,
+            reference: reference.clone(),
+            fit_steps: *fit_steps,
+            ..Request::new(photographs, &self.places.scene)
+        }
+    }
+
+    /// The photographs and the short fit to them: where the work begins.
+    ///
+    /// # Errors
+    /// As [`capture::fitted`].
+    pub fn fitted(
+        &self,
+        gpu: &Gpu,
+        audience: &dyn Audience,
+    ) -> Result<(crate::scene::Scene, capture::fit::Fit), capture::Error> {
+        capture::fitted(gpu, &self.request(vec![]), &mut Watched::<prepare::Bars>::new(audience))
+    }
+
+    /// Everything. With `despite` also where doctor finds problems.
+    ///
+    /// # Errors
+    /// Those of the parts; problems that doctor finds; an end that somebody wished.
+    pub fn work(
+        &self,
+        gpu: &Gpu,
+        object: Vec<(String, Evidence)>,
+        despite: bool,
+        audience: &dyn Audience,
+    ) -> anyhow::Result<()> {
+        let Places { root, scene, run, .. } = &self.places;
+        capture::prepare(gpu, &self.request(object), &mut Watched::<prepare::Bars>::new(audience))?;
+        let (report, _) = doctor::examine(scene, None)?;
+        eprint!("{}", findings::text(&report));
+        audience.examined(&report);
+        match report.problems() {
+            0 => {}
+            problems if despite => eprintln!("doctor: going on in spite of {problems} problems"),
+            problems => bail!(
+                "{}: doctor has {problems} {} (see above); mend what it names, or go on in spite of it with --yes",
+                scene.display(),
+                if problems == 1 { "problem" } else { "problems" }
+            ),
+        }
+        let mut record = Record::read(root);
+        self.train(gpu, &mut record, audience)?;
+        let mut inputs = Inputs::default().with(self.args.export_steps.to_le_bytes());
+        // Plain Gaussians have no decoders.
+        for name in [POINT_CLOUD, WEIGHTS].into_iter().filter(|name| run.join(MODEL).join(name).is_file()) {
+            inputs = inputs.with(record::hash(&run.join(MODEL).join(name))?);
+        }
+        let inputs = inputs.finish();
+        if record.export == inputs && export::files().all(|name| root.join(name).is_file()) {
+            eprintln!("export: nothing has changed");
+            return Ok(());
+        }
+        let args = export::Args::of_run(run, root, self.args.export_steps, Options::default().views);
+        export::export(&args, root, &mut Watched::<export::Bars>::new(audience), |work| work(gpu))?;
+        record.export = inputs;
+        record.write(root)
+    }
+
+    fn train(&self, gpu: &Gpu, record: &mut Record, audience: &dyn Audience) -> anyhow::Result<()> {
+        let Args { settings, device, minutes, .. } = self.args;
+        let Places { root, scene: folder, run, .. } = &self.places;
+        let began = Instant::now();
+        let given = SceneArgs { scene: folder.clone(), settings: settings.clone() };
+        let name = given.name();
+        let lock = train::held(run, false)?;
+        let (mut scene, mut settings) = preset::load(&given, device)?;
+        let fingerprint = serde_json::to_string(&Fingerprint::of(&scene)).context("names and hashes")?;
+        let time = minutes.unwrap_or(0.0).to_le_bytes();
+        let inputs = Inputs::default().with(fingerprint).with(settings.to_toml()).with(time).finish();
+        let there = RunRecord::read(run).ok();
+        let same = record.train == inputs;
+        if let Some(there) = &there {
+            match there.complete {
+                Some(steps) if same => {
+                    eprintln!("train: nothing has changed ({steps} steps)");
+                    return Ok(());
+                }
+                _ if !same => {
+                    eprintln!("train: the masks, the photographs or the settings have changed; trained again")
+                }
+                _ => {}
+            }
+        }
+        record.train = inputs;
+        record.write(root)?;
+        let begun = same && there.is_some();
+        if begun {
+            train::go_on_without(run, folder, &mut scene, &mut settings)?;
+        }
+        if !begun || checkpoint::list(run).is_empty() {
+            audience.begin("points", 0);
+            add_dense(gpu, folder, &mut scene, &mut settings)?;
+        }
+        let (settings, clock) = match minutes {
+            Some(time) if !begun => {
+                let (settings, clock) = minutes::fitted(gpu, &scene, &settings, *time, began)?;
+                (settings, Some(clock))
+            }
+            _ => (settings, None),
+        };
+        let iterations = settings.train.iterations;
+        let board = audience.looks().then(|| Board::new("training", &scene, iterations));
+        board.iter().for_each(|board| audience.board(board));
+        audience.begin("train", iterations.into());
+        let manner = Manner { began: Some(began), board, go_on: begun, clock, stop: audience.stop() };
+        let Trained { summary, report, .. } =
+            train::train(gpu, &scene, &settings, &name, run, &manner, &Judge::default())?;
+        if let Some(report) = report {
+            println!("{}", report.table());
+        }
+        println!("{}", train::describe(&summary, settings.model.form));
+        drop(lock);
+        Ok(())
+    }
+}

@@ -1,0 +1,519 @@
+//! The page of `gscream-vk remove`: photographs to point at an object in, and what becomes of them.
+//!
+//! The page's visitors and the worker, who has the device, meet at a [`Session`]. Marks become masks in the visitors' own
+//! threads ([`crate::capture::click`]), with what the worker has laid down so far: the fit's depth, and the masks of other
+//! views as the fit carries them. All that is to be kept lies in a folder: `NAME.png`, the mask of a photograph, as `prepare
+//! --mask` takes it, and `NAME.json`, the marks it was made of ([`objects`]). The last of two writers wins, view by view; a
+//! revision counts the changes.
+
+pub mod objects;
+pub mod site;
+
+use std::collections::{BTreeMap, VecDeque};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError, RwLock};
+use std::time::Duration;
+
+use image::{GrayImage, RgbImage};
+use serde::Serialize;
+
+use crate::capture::click::{self, Cues, Mark};
+use crate::capture::depth::DepthMap;
+use crate::capture::masks::{self, Carried};
+use crate::scene::{self, resample};
+use crate::view::live::Board;
+use crate::view::server::{Refusal, Resource};
+
+/// The longer side of the pictures that are marked, pixels.
+const SIDE: u32 = 1024;
+/// Marks of a view at most.
+const MOST_MARKS: usize = 400;
+/// Masks of a view that are kept for a step back.
+const KEPT_MASKS: usize = 10;
+/// A view with so many marks at most gets its mask anew when the depth is known.
+const FEW: usize = 3;
+/// Pictures of that size that are kept.
+const KEPT: usize = 6;
+/// Pieces of a carried mask smaller than this share of its largest piece are none of it.
+const SPECK: f64 = 0.02;
+/// A view is worth a look if more than this part of the object there is not known from the marked ones.
+pub const THIN: f64 = 0.15;
+
+/// A photograph.
+#[derive(Debug)]
+pub struct Photo {
+    /// Its name.
+    pub name: String,
+    /// Its file.
+    pub path: PathBuf,
+    /// Width and height, pixels.
+    pub size: [u32; 2],
+}
+
+/// Where the mask of a photograph is from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Origin {
+    /// There is none.
+    #[default]
+    None,
+    /// Marks on the page.
+    Marks,
+    /// A file that was put there, or came with the photographs.
+    File,
+}
+
+/// What is known of a photograph.
+#[derive(Clone, Default)]
+struct View {
+    marks: Vec<Mark>,
+    origin: Origin,
+    mask: Option<Arc<GrayImage>>,
+    /// Counts what was said of this view.
+    version: u64,
+    /// The version that the mask is of.
+    drawn: u64,
+    /// Masks of marks, the latest last, and whether the depth was known to them: what one more mark begins with.
+    made: Vec<(Vec<Mark>, bool, Arc<GrayImage>)>,
+    carried: Option<Arc<Shown>>,
+}
+
+/// What other views' masks make of a photograph.
+struct Shown {
+    parts: Vec<f32>,
+    size: [u32; 2],
+    mask: GrayImage,
+    doubt: f64,
+    /// The revision of the masks that it was carried from.
+    revision: u64,
+}
+
+/// What is going on.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Phase {
+    /// The user points.
+    #[default]
+    Choosing,
+    /// The object is being removed.
+    Working,
+    /// It is gone.
+    Done,
+}
+
+/// A part of the work.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Part {
+    /// What is done, in words.
+    pub name: String,
+    /// How much of it is done.
+    pub done: u64,
+    /// How much there is.
+    pub all: u64,
+}
+
+#[derive(Default)]
+struct State {
+    /// Counts changes of masks.
+    revision: u64,
+    views: Vec<View>,
+    phase: Phase,
+    part: Option<Part>,
+    /// Whether the fit is there.
+    ready: bool,
+    /// The revision that masks were carried from, to all views.
+    carried: u64,
+    /// The user wants it removed; whether in spite of what was found.
+    wanted: Option<bool>,
+    problems: Vec<String>,
+    error: Option<String>,
+}
+
+/// What the worker is to do next.
+pub enum Wish {
+    /// Nothing has changed for a while.
+    Nothing,
+    /// Masks of this revision are to be carried to all views: view, version and mask.
+    Carry(u64, Vec<(usize, u64, Arc<GrayImage>)>),
+    /// The object is to be removed; whether in spite of what is found.
+    Remove(bool),
+}
+
+/// What can be had when the work is done.
+#[derive(Default)]
+struct Results {
+    page: Vec<Resource>,
+    files: Vec<(String, PathBuf)>,
+}
+
+/// What the page and the worker know of each other.
+pub struct Session {
+    title: String,
+    token: String,
+    folder: PathBuf,
+    photos: Vec<Photo>,
+    numbers: BTreeMap<String, usize>,
+    state: Mutex<State>,
+    changed: Condvar,
+    depths: RwLock<BTreeMap<usize, Arc<DepthMap>>>,
+    /// One mask is cut at a time, and its files are written.
+    cutting: Mutex<()>,
+    thumbs: Vec<OnceLock<Vec<u8>>>,
+    pictures: Mutex<VecDeque<(usize, Arc<RgbImage>)>>,
+    live: RwLock<Option<Arc<Board>>>,
+    results: RwLock<Results>,
+    stop: Arc<AtomicBool>,
+}
+
+/// What was said is refused: a status and a sentence.
+pub type Refused = (Refusal, String);
+
+fn read<T>(lock: &RwLock<T>) -> std::sync::RwLockReadGuard<'_, T> {
+    lock.read().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn write<T>(lock: &RwLock<T>) -> std::sync::RwLockWriteGuard<'_, T> {
+    lock.write().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// A size with the longer side at most [`SIDE`].
+fn working(size: [u32; 2]) -> [u32; 2] {
+    let longest = size[0].max(size[1]).max(1);
+    if longest <= SIDE {
+        return size;
+    }
+    size.map(|n| (u64::from(n) * u64::from(SIDE) / u64::from(longest)).max(1) as u32)
+}
+
+impl Session {
+    /// The session of these photographs, with what the folder has of earlier ones. `given` are masks that came with the
+    /// photographs, by name; those in the folder win.
+    ///
+    /// # Errors
+    /// A photograph or a mask that cannot be read.
+    pub fn open(
+        title: &str,
+        photographs: &BTreeMap<String, PathBuf>,
+        folder: &Path,
+        given: &BTreeMap<String, GrayImage>,
+    ) -> Result<Arc<Self>, scene::Error> {
+        let photo = |(name, path): (&String, &PathBuf)| {
+            Ok(Photo { name: name.clone(), path: path.clone(), size: scene::dimensions(path)? })
+        };
+        let photos: Vec<Photo> = photographs.iter().map(photo).collect::<Result<_, scene::Error>>()?;
+        let mut state = State { revision: 1, ..State::default() };
+        for photo in &photos {
+            let mut view = View { version: 1, drawn: 1, ..View::default() };
+            let kept = objects::read(folder, &photo.name, photo.size)?;
+            let own = given.get(&photo.name).map(|mask| (vec![], mask.clone()));
+            if let Some((marks, mask)) = kept.or(own) {
+                view.origin = if marks.is_empty() { Origin::File } else { Origin::Marks };
+                view.marks = marks;
+                view.mask = Some(Arc::new(resample::nearest(&mask, working(photo.size))));
+            }
+            state.views.push(view);
+        }
+        let numbers = photos.iter().enumerate().map(|(i, photo)| (photo.name.clone(), i)).collect();
+        Ok(Arc::new(Self {
+            title: title.to_owned(),
+            token: token(),
+            folder: folder.to_owned(),
+            numbers,
+            thumbs: photos.iter().map(|_| OnceLock::new()).collect(),
+            photos,
+            state: Mutex::new(state),
+            changed: Condvar::new(),
+            depths: RwLock::default(),
+            cutting: Mutex::default(),
+            pictures: Mutex::default(),
+            live: RwLock::default(),
+            results: RwLock::default(),
+            stop: Arc::default(),
+        }))
+    }
+
+    /// What a thread that panicked has left is whole: every change is one assignment.
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The photographs, in the order of their names.
+    pub fn photos(&self) -> &[Photo] {
+        &self.photos
+    }
+
+    /// The number of the photograph of this name.
+    pub fn number(&self, name: &str) -> Option<usize> {
+        self.numbers.get(name).copied()
+    }
+
+    /// A photograph at the size in which it is marked.
+    ///
+    /// # Errors
+    /// A file that cannot be read.
+    pub fn picture(&self, number: usize) -> Result<Arc<RgbImage>, scene::Error> {
+        let kept = || self.pictures.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, picture)) = kept().iter().find(|(of, _)| *of == number) {
+            return Ok(picture.clone());
+        }
+        let Photo { path, size, .. } = &self.photos[number];
+        let picture = Arc::new(resample::photograph(&scene::photograph(path, 1)?, working(*size)));
+        let mut all = kept();
+        all.retain(|(of, _)| *of != number);
+        all.push_front((number, picture.clone()));
+        all.truncate(KEPT);
+        Ok(picture)
+    }
+
+    /// Replaces what is marked in a view, and makes its mask. No marks are none: the view gets what other views say.
+    ///
+    /// # Errors
+    /// Marks that make no sense; a time at which nothing can be marked; files that cannot be read or written.
+    pub fn mark(&self, number: usize, marks: Vec<Mark>) -> Result<u64, Refused> {
+        if marks.len() > MOST_MARKS || !marks.iter().all(Mark::is_sound) {
+            let why = "a mark lies outside the photograph, or there are too many";
+            return Err((Refusal::BadRequest, why.into()));
+        }
+        self.cut(number, Some(marks))
+    }
+
+    /// Makes the masks of views with a few marks again, now that more is known than when they were made.
+    pub fn again(&self) {
+        let few = |view: &View| (1..=FEW).contains(&view.marks.len()) && view.version == view.drawn;
+        let numbers: Vec<usize> = (0..self.photos.len()).filter(|i| few(&self.lock().views[*i])).collect();
+        for number in numbers {
+            if let Err((_, why)) = self.cut(number, None) {
+                log::info!("{}: {why}", self.photos[number].name);
+            }
+        }
+    }
+
+    /// Makes the mask of a view of these marks, or of those that it has.
+    fn cut(&self, number: usize, marks: Option<Vec<Mark>>) -> Result<u64, Refused> {
+        let working = || (Refusal::Conflict, "the object is being removed; stop that first to change it".to_owned());
+        let (version, marks) = {
+            let mut state = self.lock();
+            if state.phase == Phase::Working {
+                return Err(working());
+            }
+            let view = &mut state.views[number];
+            view.version += 1;
+            view.marks = marks.unwrap_or_else(|| view.marks.clone());
+            (view.version, view.marks.clone())
+        };
+        let _turn = self.cutting.lock().unwrap_or_else(PoisonError::into_inner);
+        let (carried, made) = {
+            let state = self.lock();
+            // Somebody was faster: the last one wins.
+            if state.views[number].version != version {
+                return Ok(state.revision);
+            }
+            (state.views[number].carried.clone(), state.views[number].made.clone())
+        };
+        let depth = read(&self.depths).get(&number).cloned();
+        let mask = if marks.is_empty() {
+            None
+        } else {
+            let picture = self.picture(number).map_err(|error| (Refusal::Busy, error.to_string()))?;
+            let cues = Cues {
+                depth: depth.as_deref(),
+                carried: carried.as_ref().map(|shown| (shown.parts.as_slice(), shown.size)),
+            };
+            // From the longest beginning of the marks that was made already.
+            let begun = made.iter().filter(|(own, with, _)| *with == depth.is_some() && marks.starts_with(own));
+            Some(match begun.max_by_key(|(own, ..)| own.len()) {
+                Some((own, _, mask)) => (own.len() + 1..=marks.len()).fold(mask.clone(), |before, count| {
+                    Arc::new(click::next(&picture, &marks[..count], &before, &cues))
+                }),
+                None => Arc::new(click::mask(&picture, &marks, &cues)),
+            })
+        };
+        let mut state = self.lock();
+        if state.phase == Phase::Working {
+            return Err(working());
+        }
+        if state.views[number].version == version {
+            let Photo { name, size, .. } = &self.photos[number];
+            objects::write(&self.folder, name, *size, &marks, mask.as_deref())
+                .map_err(|error| (Refusal::Busy, format!("{}: cannot be written: {error}", self.folder.display())))?;
+            state.revision += 1;
+            state.error = None;
+            let view = &mut state.views[number];
+            view.origin = if mask.is_some() { Origin::Marks } else { Origin::None };
+            if let Some(mask) = &mask {
+                view.made.retain(|(own, ..)| *own != marks);
+                view.made.push((marks, depth.is_some(), mask.clone()));
+                let many = view.made.len().saturating_sub(KEPT_MASKS);
+                view.made.drain(..many);
+            }
+            (view.mask, view.drawn) = (mask, version);
+            self.changed.notify_all();
+        }
+        Ok(state.revision)
+    }
+
+    /// Whether some view has a mask of something.
+    fn has_object(state: &State) -> bool {
+        state.views.iter().filter_map(|view| view.mask.as_ref()).any(|mask| mask.as_raw().iter().any(|v| *v != 0))
+    }
+
+    /// Asks for the object to be removed, also in spite of what was found.
+    ///
+    /// # Errors
+    /// Nothing is marked; it is being done already.
+    pub fn remove(&self, despite: bool) -> Result<(), Refused> {
+        let _turn = self.cutting.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut state = self.lock();
+        if !Self::has_object(&state) {
+            return Err((Refusal::Conflict, "nothing is marked yet; click on what is to be removed".into()));
+        }
+        if state.phase == Phase::Working {
+            return Err((Refusal::Conflict, "the object is being removed already".into()));
+        }
+        self.stop.store(false, Ordering::Relaxed);
+        // That of an earlier training.
+        *write(&self.live) = None;
+        state.phase = Phase::Working;
+        state.wanted = Some(despite);
+        (state.error, state.problems) = (None, vec![]);
+        self.changed.notify_all();
+        Ok(())
+    }
+
+    /// Asks for an end of the work.
+    pub fn stop(&self) {
+        let mut state = self.lock();
+        if state.phase == Phase::Working {
+            self.stop.store(true, Ordering::Relaxed);
+            // What has not begun yet does not begin.
+            if state.wanted.take().is_some() {
+                state.phase = Phase::Choosing;
+            }
+            self.changed.notify_all();
+        }
+    }
+
+    // ------------------------------------------------------------ the worker's side
+
+    /// The wish to end what is being worked at.
+    pub fn stopping(&self) -> Arc<AtomicBool> {
+        self.stop.clone()
+    }
+
+    /// A part of the work begins.
+    pub fn begin(&self, name: &str, all: u64) {
+        self.lock().part = Some(Part { name: name.to_owned(), done: 0, all });
+    }
+
+    /// So much of it is done.
+    pub fn at(&self, done: u64) {
+        if let Some(part) = &mut self.lock().part {
+            part.done = done;
+        }
+    }
+
+    /// The part has ended.
+    pub fn end(&self) {
+        self.lock().part = None;
+    }
+
+    /// Something has gone wrong: a sentence for the page. The user points again.
+    pub fn fail(&self, why: impl Into<String>) {
+        let mut state = self.lock();
+        (state.phase, state.part, state.error) = (Phase::Choosing, None, Some(why.into()));
+    }
+
+    /// The work was stopped. The user points again.
+    pub fn stopped(&self) {
+        let mut state = self.lock();
+        (state.phase, state.part) = (Phase::Choosing, None);
+        self.stop.store(false, Ordering::Relaxed);
+    }
+
+    /// What speaks against going on, sentence by sentence: the user decides, once the work has ended for it.
+    pub fn found(&self, problems: Vec<String>) {
+        self.lock().problems = problems;
+    }
+
+    /// Whether something was found that speaks against going on.
+    pub fn has_problems(&self) -> bool {
+        !self.lock().problems.is_empty()
+    }
+
+    /// The training can be looked at.
+    pub fn show(&self, board: Arc<Board>) {
+        *write(&self.live) = Some(board);
+    }
+
+    /// The object is gone: the page that shows it, and the files to take away.
+    pub fn done(&self, page: Vec<Resource>, files: Vec<(String, PathBuf)>) {
+        *write(&self.results) = Results { page, files };
+        let mut state = self.lock();
+        (state.phase, state.part) = (Phase::Done, None);
+    }
+
+    /// The fit is there.
+    pub fn ready(&self) {
+        self.lock().ready = true;
+    }
+
+    /// What the fit says of a view's depth.
+    pub fn knows(&self, number: usize, depth: DepthMap) {
+        write(&self.depths).insert(number, Arc::new(depth));
+    }
+
+    /// What the masks of this revision make of a view; nothing of it is kept where they have changed since.
+    pub fn carry(&self, revision: u64, number: usize, carried: Carried, size: [u32; 2]) -> bool {
+        let mask = masks::threshold(&carried.object, size, working(self.photos[number].size), masks::OBJECT);
+        let doubt = carried.thinness().unwrap_or(0.0);
+        let mask = masks::without_specks(&mask, SPECK);
+        let mut state = self.lock();
+        if state.revision != revision || state.phase == Phase::Working {
+            return false;
+        }
+        let shown = Shown { parts: carried.object, size, mask, doubt, revision };
+        state.views[number].carried = Some(Arc::new(shown));
+        true
+    }
+
+    /// The masks of this revision were carried to all views.
+    pub fn carried(&self, revision: u64) {
+        let mut state = self.lock();
+        state.carried = revision;
+        if state.revision == revision && !Self::has_object(&state) {
+            state.views.iter_mut().for_each(|view| view.carried = None);
+        }
+    }
+
+    /// Whether there is something to do that is not what is being done for this revision.
+    pub fn is_stale(&self, revision: u64) -> bool {
+        let state = self.lock();
+        state.revision != revision || state.wanted.is_some()
+    }
+
+    /// What is to be done, waiting for it for a while.
+    pub fn wish(&self, patience: Duration) -> Wish {
+        let state = self.lock();
+        let idle = |state: &mut State| state.wanted.is_none() && (state.carried == state.revision || !state.ready);
+        let (mut state, _) =
+            self.changed.wait_timeout_while(state, patience, idle).unwrap_or_else(PoisonError::into_inner);
+        if let Some(despite) = state.wanted.take() {
+            return Wish::Remove(despite);
+        }
+        if !state.ready || state.carried == state.revision {
+            return Wish::Nothing;
+        }
+        let of = |(i, view): (usize, &View)| Some((i, view.drawn, view.mask.clone()?));
+        Wish::Carry(state.revision, state.views.iter().enumerate().filter_map(of).collect())
+    }
+}
+
+/// 128 random bits as hexadecimal digits.
+fn token() -> String {
+    use rand::RngExt as _;
+    format!("{:032x}", rand::rng().random::<u128>())
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,512 @@
+'use strict';
+const $ = (id) => document.getElementById(id);
+const touch = matchMedia('(pointer: coarse)').matches;
+const much = touch ? 'with “Not object” on what is too much' : 'with Shift on what is too much';
+const token = document.querySelector('meta[name=token]').content;
+const stage = $('stage');
+const PARTS = {
+  poses: 'Finding out where the photographs were taken from',
+  fit: 'Learning the shape of the scene',
+  shape: 'Measuring how far everything is',
+  carry: 'Looking for the object in the other photographs',
+  masks: 'Marking the object in every photograph',
+  depth: 'Measuring how far everything is',
+  reference: 'Finding out what was behind it',
+  points: 'Looking for more points',
+  train: 'Training the scene without it',
+  export: 'Writing the files',
+  page: 'Making the page',
+};
+// What the server says, and what was marked here and is not there yet: marks by view.
+let state, current, sorted = true, order = [];
+const waiting = new Map(), sending = new Set();
+// Marks of a view before and after each change.
+let past = [], future = [];
+// The photograph's place on the stage: zoom is 1 when all of it is shown.
+let zoom = 1, shift = [0, 0], cross, corner, changing = false;
+
+const view = (name = current) => state?.views.find((v) => v.name === name);
+const marksOf = (name = current) => waiting.get(name) ?? view(name)?.marks ?? [];
+const percent = (v) => `${Math.round(100 * v)} %`;
+const clock = (s) => s < 90 ? `${Math.max(1, Math.round(s))} s` : s < 5400 ? `${Math.round(s / 60)} min` : `${(s / 3600).toFixed(1)} h`;
+const size = (bytes) => bytes > 1e6 ? `${(bytes / 1e6).toFixed(1)} MB` : `${Math.ceil(bytes / 1e3)} kB`;
+const url = (path, name, more = '') => `${path}?view=${encodeURIComponent(name)}${more}`;
+
+// ---------------------------------------------------------------- what is said to the server
+
+async function post(path, body) {
+  const answer = await fetch(path, {
+    method: 'POST', headers: { 'Content-Type': 'application/json', 'X-Token': token }, body: JSON.stringify(body),
+  });
+  if (!answer.ok) throw new Error((await answer.text()).trim());
+  take(await answer.json());
+}
+
+function say(error) {
+  $('error').textContent = error;
+  $('error').hidden = !error;
+}
+
+async function send(name) {
+  if (sending.has(name)) return;
+  sending.add(name);
+  while (waiting.has(name)) {
+    const marks = waiting.get(name);
+    try {
+      await post('api/marks', { view: name, marks });
+      say('');
+    } catch (error) {
+      say(`This could not be marked: ${error.message}`);
+    }
+    if (waiting.get(name) === marks) waiting.delete(name);
+  }
+  sending.delete(name);
+  draw();
+}
+
+function mark(marks, name = current, remember = true) {
+  if (!state || state.phase === 'working') return;
+  if (remember) {
+    past.push([name, marksOf(name), marks]);
+    future = [];
+  }
+  waiting.set(name, marks);
+  send(name);
+  draw();
+}
+
+const add = (one) => mark([...marksOf(), one]);
+
+function undo() {
+  const change = past.pop();
+  if (change) {
+    future.push(change);
+    show(change[0]);
+    mark(change[1], change[0], false);
+  } else if (marksOf().length) {
+    // Marks of an earlier visit.
+    future.push([current, marksOf().slice(0, -1), marksOf()]);
+    mark(marksOf().slice(0, -1), current, false);
+  }
+}
+
+function redo() {
+  const change = future.pop();
+  if (!change) return;
+  past.push(change);
+  show(change[0]);
+  mark(change[2], change[0], false);
+}
+
+// ---------------------------------------------------------------- the photograph
+
+function place() {
+  const v = view();
+  if (!v) return;
+  const [w, h] = v.size;
+  const fits = Math.min(stage.clientWidth / w, stage.clientHeight / h);
+  const [width, height] = [w * fits, h * fits];
+  const room = [stage.clientWidth - width * zoom, stage.clientHeight - height * zoom];
+  shift = shift.map((s, i) => room[i] >= 0 ? room[i] / 2 : Math.min(0, Math.max(room[i], s)));
+  const picture = $('picture');
+  picture.style.width = `${width}px`;
+  picture.style.height = `${height}px`;
+  picture.style.setProperty('--zoom', zoom);
+  picture.style.transform = `translate(${shift[0]}px, ${shift[1]}px) scale(${zoom})`;
+}
+
+function magnify(by, x = stage.clientWidth / 2, y = stage.clientHeight / 2) {
+  const next = Math.min(12, Math.max(1, zoom * by));
+  shift = [x - (x - shift[0]) * next / zoom, y - (y - shift[1]) * next / zoom];
+  zoom = next;
+  place();
+}
+
+// Where in the photograph, 0 to 1.
+function at(event) {
+  const box = $('picture').getBoundingClientRect();
+  const v = [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
+  return v.map((x) => Math.round(x * 1e5) / 1e5);
+}
+const within = (p) => p.every((v) => v >= 0 && v <= 1);
+const clip = (p) => p.map((v) => Math.min(1, Math.max(0, v)));
+const bounds = (a, b) => [Math.min(a[0], b[0]), Math.min(a[1], b[1]), Math.max(a[0], b[0]), Math.max(a[1], b[1])];
+const large = (b) => b[2] - b[0] > 0.005 && b[3] - b[1] > 0.005;
+
+function lay(element, [x0, y0, x1, y1]) {
+  Object.assign(element.style, { left: `${100 * x0}%`, top: `${100 * y0}%`, width: `${100 * (x1 - x0)}%`, height: `${100 * (y1 - y0)}%` });
+}
+
+const mode = () => document.querySelector('input[name=mode]:checked').value;
+const pointers = new Map();
+let drag, pinch;
+
+stage.addEventListener('pointerdown', (e) => {
+  if (state?.phase === 'working' || (state?.phase === 'done' && !changing)) return;
+  stage.focus();
+  stage.setPointerCapture(e.pointerId);
+  pointers.set(e.pointerId, [e.clientX, e.clientY]);
+  if (pointers.size === 2) {
+    drag = undefined;
+    $('rubber').hidden = true;
+    const [a, b] = [...pointers.values()];
+    pinch = { far: Math.hypot(a[0] - b[0], a[1] - b[1]), middle: [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2] };
+  } else if (pointers.size === 1) {
+    const pans = e.button === 1 || (e.pointerType === 'touch' && mode() !== 'box');
+    drag = { from: at(e), start: [e.clientX, e.clientY], last: [e.clientX, e.clientY], pans, other: e.button === 2 || e.shiftKey, moved: false };
+  }
+  e.preventDefault();
+});
+stage.addEventListener('pointermove', (e) => {
+  if (!pointers.has(e.pointerId)) return;
+  pointers.set(e.pointerId, [e.clientX, e.clientY]);
+  if (pinch && pointers.size === 2) {
+    const [a, b] = [...pointers.values()];
+    const far = Math.hypot(a[0] - b[0], a[1] - b[1]);
+    const middle = [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2];
+    const box = stage.getBoundingClientRect();
+    shift = [shift[0] + middle[0] - pinch.middle[0], shift[1] + middle[1] - pinch.middle[1]];
+    magnify(far / Math.max(1, pinch.far), middle[0] - box.left, middle[1] - box.top);
+    pinch = { far, middle };
+    return;
+  }
+  if (!drag) return;
+  if (Math.hypot(e.clientX - drag.start[0], e.clientY - drag.start[1]) > 6) drag.moved = true;
+  if (!drag.moved) return;
+  if (drag.pans) {
+    shift = [shift[0] + e.clientX - drag.last[0], shift[1] + e.clientY - drag.last[1]];
+    drag.last = [e.clientX, e.clientY];
+    place();
+  } else {
+    $('rubber').hidden = false;
+    lay($('rubber'), bounds(clip(drag.from), clip(at(e))));
+  }
+});
+function lifted(e, counts) {
+  pointers.delete(e.pointerId);
+  if (pinch) {
+    if (pointers.size === 0) pinch = undefined;
+    return;
+  }
+  const done = drag;
+  drag = undefined;
+  $('rubber').hidden = true;
+  if (!done || !counts) return;
+  if (done.moved && !done.pans) {
+    const box = bounds(clip(done.from), clip(at(e)));
+    if (large(box)) add({ kind: 'box', bounds: box });
+  } else if (!done.moved && within(done.from) && e.button !== 1) {
+    const not = (mode() === 'background') !== done.other;
+    add({ kind: not ? 'background' : 'object', at: done.from });
+  }
+}
+stage.addEventListener('pointerup', (e) => lifted(e, true));
+stage.addEventListener('pointercancel', (e) => lifted(e, false));
+stage.addEventListener('contextmenu', (e) => e.preventDefault());
+stage.addEventListener('wheel', (e) => {
+  e.preventDefault();
+  const box = stage.getBoundingClientRect();
+  magnify(Math.exp(-e.deltaY * 0.0015), e.clientX - box.left, e.clientY - box.top);
+}, { passive: false });
+new ResizeObserver(place).observe(stage);
+
+// ---------------------------------------------------------------- keys
+
+function crosshair() {
+  $('cross').hidden = !cross;
+  if (!cross) return;
+  $('cross').style.left = `${100 * cross[0]}%`;
+  $('cross').style.top = `${100 * cross[1]}%`;
+  $('rubber').hidden = !corner;
+  if (corner) lay($('rubber'), bounds(corner, cross));
+}
+
+function step(by) {
+  const i = order.indexOf(current);
+  if (order.length) show(order[(i + by + order.length) % order.length], true);
+}
+
+addEventListener('keydown', (e) => {
+  if (!state || e.target.closest?.('input, summary, a')) return;
+  const command = e.ctrlKey || e.metaKey;
+  const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[e.key];
+  const onButton = e.target.closest?.('button') && !e.target.closest('.thumb');
+  if (command && e.key.toLowerCase() === 'z') (e.shiftKey ? redo : undo)();
+  else if (command && e.key.toLowerCase() === 'y') redo();
+  else if (command) return;
+  else if (arrows && e.shiftKey) {
+    const [w, h] = view().size;
+    const far = (e.altKey ? 0.002 : 0.02) * Math.max(w, h);
+    cross = clip((cross ?? [0.5, 0.5]).map((v, i) => v + arrows[i] * far / (i ? h : w)));
+    crosshair();
+  } else if (arrows && arrows[0]) step(arrows[0]);
+  else if (e.key === 'Enter' && cross && !onButton && document.activeElement === stage) add({ kind: e.shiftKey ? 'background' : 'object', at: cross });
+  else if ((e.key === 'Backspace' || e.key === 'Delete') && cross) add({ kind: 'background', at: cross });
+  else if (e.key.toLowerCase() === 'b' && cross) {
+    if (corner && large(bounds(corner, cross))) add({ kind: 'box', bounds: bounds(corner, cross) });
+    corner = corner ? undefined : cross;
+    crosshair();
+  } else if (e.key === 'Escape') { cross = corner = undefined; $('rubber').hidden = true; crosshair(); }
+  else if (e.key === '+' || e.key === '=') magnify(1.4);
+  else if (e.key === '-') magnify(1 / 1.4);
+  else if (e.key === '0') { zoom = 1; place(); }
+  else return;
+  e.preventDefault();
+});
+
+$('undo').onclick = undo;
+$('redo').onclick = redo;
+$('clear').onclick = () => marksOf().length || view()?.origin === 'file' ? mark([]) : undefined;
+$('in').onclick = () => magnify(1.4);
+$('out').onclick = () => magnify(1 / 1.4);
+$('fit').onclick = () => { zoom = 1; place(); };
+$('sort').onclick = () => { sorted = !sorted; arrange(); draw(); };
+$('next').onclick = () => state.next && show(state.next, true);
+$('again').onclick = () => { changing = true; draw(); stage.focus(); };
+$('remove').onclick = async () => {
+  changing = false;
+  $('remove').disabled = true;
+  try {
+    await post('api/remove', { despite: state.problems.length > 0 });
+    say('');
+  } catch (error) {
+    say(error.message);
+  }
+};
+$('stop').onclick = () => post('api/stop', {}).catch((error) => say(error.message));
+
+// ---------------------------------------------------------------- what is shown
+
+const thumbs = new Map();
+
+function thumbnail(v) {
+  const button = document.createElement('button');
+  button.type = 'button';
+  button.className = 'thumb';
+  button.style.aspectRatio = `${v.size[0]} / ${v.size[1]}`;
+  const picture = new Image();
+  picture.loading = 'lazy';
+  picture.alt = v.name;
+  picture.src = url('thumb.jpg', v.name);
+  button.append(picture, document.createElement('em'));
+  button.onclick = () => show(v.name);
+  return { button, picture, badge: button.lastChild, overlay: undefined, key: undefined };
+}
+
+// The order changes when masks were carried anew, not under the user's hands.
+function arrange() {
+  const rank = (v) => v.doubt ?? -1;
+  const views = [...state.views];
+  if (sorted) views.sort((a, b) => rank(b) - rank(a));
+  order = views.map((v) => v.name);
+  const strip = $('strip');
+  for (const v of views) {
+    if (!thumbs.has(v.name)) thumbs.set(v.name, thumbnail(v));
+    strip.append(thumbs.get(v.name).button);
+  }
+}
+
+function show(name, focus) {
+  if (!view(name)) return;
+  if (name !== current) {
+    current = name;
+    zoom = 1;
+    cross = corner = undefined;
+    crosshair();
+    $('photo').src = url('photo.jpg', name);
+    $('photo').alt = `Photograph ${name}`;
+    $('overlay').hidden = true;
+    $('overlay').dataset.key = '';
+    place();
+  }
+  draw();
+  if (focus) thumbs.get(name).button.scrollIntoView({ block: 'nearest', inline: 'nearest' });
+}
+
+// A new overlay takes the old one's place when it is there.
+function overlay(image, source, key) {
+  if (image.dataset.key === key) return;
+  image.dataset.key = key;
+  if (!key) {
+    image.hidden = true;
+    return;
+  }
+  const next = new Image();
+  next.onload = () => {
+    if (image.dataset.key !== key) return;
+    image.src = next.src;
+    image.hidden = false;
+  };
+  next.src = source;
+}
+
+function draw() {
+  if (!state) return;
+  const v = view();
+  const working = state.phase === 'working', done = state.phase === 'done' && !changing;
+  document.body.dataset.phase = done ? 'done' : working ? 'working' : 'choosing';
+  $('title').textContent = done ? 'It is gone' : `Remove an object from ${state.title}`;
+  document.title = `${state.title}: ${done ? 'it is gone' : 'remove an object'}`;
+  const busy = waiting.has(current) || v?.busy;
+  $('thinking').hidden = !busy || working || done;
+  $('name').textContent = current ?? '';
+  $('name').hidden = done;
+  if (v) {
+    const key = v.overlay ? `${v.name} ${v.overlay}` : '';
+    overlay($('overlay'), url('overlay.png', v.name, `&v=${v.overlay}`), working ? '' : key);
+    $('marks').replaceChildren(...(working ? [] : marksOf()).map((m) => {
+      const element = document.createElement(m.kind === 'box' ? 'b' : 'i');
+      if (m.kind === 'box') lay(element, m.bounds);
+      else {
+        element.style.left = `${100 * m.at[0]}%`;
+        element.style.top = `${100 * m.at[1]}%`;
+        if (m.kind === 'background') element.className = 'not';
+      }
+      return element;
+    }));
+  }
+  $('undo').disabled = !past.length && !marksOf().length;
+  $('redo').disabled = !future.length;
+  $('clear').disabled = !marksOf().length && v?.origin !== 'file';
+
+  const marked = state.views.some((o) => o.origin !== 'none') || waiting.size > 0;
+  const empty = marksOf().length && !busy && !(v?.share > 0);
+  const advice = working ? 'You can leave this page open or close it: the work goes on, and this page finds it again.'
+    : done ? 'Look around: drag turns, the wheel goes nearer, the slider shows the photograph.'
+    : state.problems.length ? 'Something speaks against going on. Mend what is named, or go on anyway.'
+    : empty ? 'Nothing was found there. Click in the middle of the object, or draw a box around it.'
+    : !marked ? 'Click on what is to be removed. Drag a box around it if that is easier.'
+    : !state.ready ? `Click again where the outline is wrong: on what is missing, or ${much}. Soon the object will be looked for in the other photographs as well.`
+    : state.carrying ? 'The object is being looked for in the other photographs.'
+    : state.next ? `${percent(state.doubt)} of the object in ${state.next} is not known from what is marked so far. Click on it there, too.`
+    : `Look through the photographs. Where an outline is wrong, click on what is missing, or ${much}.`;
+  $('advice').textContent = advice;
+  $('next').hidden = working || done || !state.next || state.carrying || state.next === current;
+  $('next').textContent = `Show ${state.next}`;
+  $('problems').hidden = working || done || !state.problems.length;
+  $('problems').replaceChildren(...state.problems.map((text) => {
+    const item = document.createElement('li');
+    item.textContent = text;
+    return item;
+  }));
+  if (state.error) say(state.error);
+  $('remove').hidden = working || done;
+  $('remove').disabled = !marked || waiting.size > 0;
+  $('remove').textContent = state.problems.length ? 'Remove anyway' : 'Remove';
+  $('remove').classList.add('primary');
+  $('stop').hidden = !working;
+  $('again').hidden = !done;
+
+  const part = state.part;
+  $('progress').hidden = !part || done;
+  if (part) {
+    $('part').textContent = `${PARTS[part.name] ?? part.name}${left(part)}`;
+    if (part.all) [$('bar').max, $('bar').value] = [part.all, part.done];
+    else $('bar').removeAttribute('value');
+  }
+  $('around').hidden = !state.live;
+  $('drawn').hidden = !(working && state.live && $('drawn').src);
+  if (done && $('viewer').hidden) $('viewer').src = 'result/?noui';
+  if (!done && !$('viewer').hidden) $('viewer').removeAttribute('src');
+  $('viewer').hidden = !done;
+  $('files').hidden = !done;
+  if (done && $('files').childElementCount !== state.files.length) {
+    $('files').replaceChildren(...state.files.map((file) => {
+      const link = document.createElement('a');
+      link.href = `download/${encodeURIComponent(file.name)}`;
+      link.download = `${state.title}-${file.name}`;
+      for (const text of [`Download ${file.name.split('.').pop().toUpperCase()}`, size(file.bytes)]) link.append(Object.assign(document.createElement('span'), { textContent: text }));
+      return link;
+    }));
+  }
+
+  $('count').textContent = `${state.views.length} photographs, ${state.marked} marked`;
+  for (const o of state.views) {
+    const thumb = thumbs.get(o.name);
+    thumb.button.setAttribute('aria-current', o.name === current);
+    const key = o.overlay ?? '';
+    if (key !== thumb.key) {
+      thumb.key = key;
+      if (!thumb.overlay && key) {
+        thumb.overlay = new Image();
+        thumb.overlay.loading = 'lazy';
+        thumb.overlay.alt = '';
+        thumb.picture.after(thumb.overlay);
+      }
+      if (key) thumb.overlay.src = url('overlay.png', o.name, `&small=1&v=${key}`);
+      if (thumb.overlay) thumb.overlay.hidden = !key;
+    }
+    const doubtful = o.doubt != null && o.doubt > 0.15;
+    thumb.button.classList.toggle('doubtful', doubtful);
+    thumb.badge.textContent = o.origin !== 'none' ? 'marked' : doubtful ? `? ${percent(o.doubt)}` : '';
+    thumb.badge.hidden = !thumb.badge.textContent;
+  }
+}
+
+let began;
+function left(part) {
+  if (!began || began.name !== part.name || part.done < began.done) began = { name: part.name, done: part.done, time: performance.now() };
+  const done = part.done - began.done, took = (performance.now() - began.time) / 1000;
+  return part.all && done > 0 && took > 4 ? `, ${clock(took / done * (part.all - part.done))} left` : '';
+}
+
+let arranged;
+function take(next) {
+  const first = !state;
+  state = next;
+  if (state.phase !== 'done') changing = false;
+  const key = state.carrying ? arranged : `${state.revision} ${state.ready} ${state.marked > 0}`;
+  if (first || key !== arranged) {
+    arranged = key;
+    arrange();
+  }
+  if (!current) show(state.views.find((v) => v.origin !== 'none')?.name ?? state.views[Math.floor(state.views.length / 2)]?.name);
+  draw();
+  document.documentElement.dataset.revision = state.revision;
+}
+
+let lost = false;
+async function poll() {
+  if (!document.hidden) {
+    try {
+      const answer = await fetch('api/state', { signal: AbortSignal.timeout(15000) });
+      const next = await answer.json();
+      // What was posted meanwhile is newer.
+      if (!sending.size) take(next);
+      if (lost) say('');
+      lost = false;
+    } catch {
+      lost = true;
+      say('gscream-vk does not answer: it has ended, or the connection is gone. The same command opens this page again, with all that was marked.');
+    }
+  }
+  setTimeout(poll, state?.part || state?.carrying ? 500 : 1200);
+}
+
+// The scene as it is being trained, from where the photograph was taken.
+let cameras;
+async function watch() {
+  if (!document.hidden && state?.live) {
+    try {
+      cameras ??= (await (await fetch('live/scene.json')).json()).cameras;
+      const camera = cameras.find((c) => c.name === current) ?? cameras[0];
+      const width = Math.max(16, Math.round(Math.min(640, 640 / camera.aspect)));
+      const sides = [width, Math.max(16, Math.round(width * camera.aspect))];
+      const query = `c=${camera.center}&r=${camera.rotation.flat()}&f=${camera.focal}&s=${sides}`;
+      const answer = await fetch(`live/picture.jpg?${query}`);
+      if (answer.ok) {
+        const old = $('drawn').src;
+        $('drawn').src = URL.createObjectURL(await answer.blob());
+        if (old) URL.revokeObjectURL(old);
+        draw();
+      }
+    } catch { /* The next one may come. */ }
+  } else if (!state?.live) {
+    cameras = undefined;
+    if ($('drawn').src) { URL.revokeObjectURL($('drawn').src); $('drawn').removeAttribute('src'); }
+  }
+  setTimeout(watch, 1000);
+}
+
+poll();
+watch();

@@ -1,0 +1,249 @@
+//! The page over HTTP: what is asked for, and what is said.
+
+use std::borrow::Cow;
+use std::io::Cursor;
+
+use image::codecs::jpeg::JpegEncoder;
+use image::{GrayImage, ImageFormat, Rgba, RgbaImage};
+use serde::Deserialize;
+use serde_json::json;
+
+use super::{Origin, Phase, Refused, Session, THIN, View, read};
+use crate::capture::click::Mark;
+use crate::scene::{self, resample};
+use crate::view::server::{Answer, Refusal, Site};
+
+const PAGE: &str = include_str!("page.html");
+const STYLE: &str = include_str!("page.css");
+const PROGRAM: &str = include_str!("page.js");
+/// Width of a thumbnail, pixels.
+const THUMB: u32 = 240;
+/// Colours of a mask's inside and rim: of one that was marked, and of one that was carried.
+const COLORS: [[[u8; 4]; 2]; 2] =
+    [[[255, 80, 60, 105], [255, 240, 235, 255]], [[255, 170, 30, 95], [255, 235, 190, 235]]];
+
+/// What is posted to `/api/marks`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Marked {
+    view: String,
+    marks: Vec<Mark>,
+}
+
+/// What is posted to `/api/remove`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Removed {
+    #[serde(default)]
+    despite: bool,
+}
+
+fn text(kind: &'static str, text: &'static str) -> Answer<'static> {
+    Answer { kind, gzip: false, bytes: Cow::Borrowed(text.as_bytes()) }
+}
+
+fn owned(kind: &'static str, bytes: Vec<u8>) -> Answer<'static> {
+    Answer { kind, gzip: false, bytes: Cow::Owned(bytes) }
+}
+
+fn answer(value: &serde_json::Value) -> Answer<'static> {
+    owned("application/json", value.to_string().into_bytes())
+}
+
+/// The value of a field of a query, its escapes undone; nothing where it is not there or is no text.
+fn field(query: &str, name: &str) -> Option<String> {
+    let value = query.split('&').find_map(|field| field.split_once('=').filter(|(key, _)| *key == name))?.1;
+    let mut bytes = vec![];
+    let mut rest = value.bytes();
+    while let Some(byte) = rest.next() {
+        bytes.push(if byte == b'%' {
+            let digits = [rest.next()?, rest.next()?];
+            u8::from_str_radix(std::str::from_utf8(&digits).ok()?, 16).ok()?
+        } else {
+            byte
+        });
+    }
+    String::from_utf8(bytes).ok()
+}
+
+fn jpeg(picture: &image::RgbImage, quality: u8) -> Result<Vec<u8>, Refusal> {
+    let mut bytes = vec![];
+    picture.write_with_encoder(JpegEncoder::new_with_quality(&mut bytes, quality)).map_err(|_| Refusal::Busy)?;
+    Ok(bytes)
+}
+
+/// A mask as a picture to lay over its photograph.
+fn overlay(mask: &GrayImage, [inside, rim]: [[u8; 4]; 2]) -> Result<Vec<u8>, Refusal> {
+    let (w, h) = mask.dimensions();
+    let on = |x: i64, y: i64| {
+        let there = x >= 0 && y >= 0 && x < i64::from(w) && y < i64::from(h);
+        !there || mask.get_pixel(x as u32, y as u32).0[0] != 0
+    };
+    let picture = RgbaImage::from_fn(w, h, |x, y| {
+        let (x, y) = (i64::from(x), i64::from(y));
+        if !on(x, y) {
+            return Rgba([0; 4]);
+        }
+        // The rim of a large picture is two pixels wide.
+        let reach = 1 + i64::from(w.max(h) > 600);
+        let inner = on(x - reach, y) && on(x + reach, y) && on(x, y - reach) && on(x, y + reach);
+        Rgba(if inner { inside } else { rim })
+    });
+    let mut bytes = Cursor::new(vec![]);
+    picture.write_to(&mut bytes, ImageFormat::Png).map_err(|_| Refusal::Busy)?;
+    Ok(bytes.into_inner())
+}
+
+impl View {
+    /// The mask that counts, and which of the two kinds it is.
+    fn shown(&self) -> Option<(&GrayImage, usize)> {
+        match (&self.mask, &self.carried) {
+            (Some(mask), _) => Some((mask, 0)),
+            (None, Some(carried)) => Some((&carried.mask, 1)),
+            (None, None) => None,
+        }
+    }
+}
+
+impl Session {
+    /// The photograph that a query names.
+    fn named(&self, query: &str) -> Result<usize, Refusal> {
+        field(query, "view").and_then(|name| self.number(&name)).ok_or(Refusal::NotFound)
+    }
+
+    fn thumbnail(&self, number: usize) -> Result<Vec<u8>, Refusal> {
+        if let Some(made) = self.thumbs[number].get() {
+            return Ok(made.clone());
+        }
+        let photo = &self.photos[number];
+        let picture = scene::photograph(&photo.path, 1).map_err(|_| Refusal::NotFound)?;
+        let made = jpeg(&resample::photograph(&picture, thumb(photo.size)), 80)?;
+        Ok(self.thumbs[number].get_or_init(|| made).clone())
+    }
+
+    fn overlaid(&self, number: usize, small: bool) -> Result<Vec<u8>, Refusal> {
+        let view = self.lock().views[number].clone();
+        let (mask, kind) = view.shown().ok_or(Refusal::NotFound)?;
+        if small {
+            return overlay(&resample::mask(mask, thumb(self.photos[number].size)), COLORS[kind]);
+        }
+        overlay(mask, COLORS[kind])
+    }
+
+    /// What the page is told.
+    fn status(&self) -> serde_json::Value {
+        let files: Vec<_> = {
+            let results = read(&self.results);
+            let size = |path: &std::path::Path| std::fs::metadata(path).map_or(0, |file| file.len());
+            results.files.iter().map(|(name, path)| json!({ "name": name, "bytes": size(path) })).collect()
+        };
+        let steps = read(&self.live).as_ref().map(|board| board.steps().map(u64::from));
+        let state = self.lock();
+        let mut part = state.part.clone();
+        if let (Some(part), Some([done, all])) = (part.as_mut().filter(|part| part.name == "train"), steps) {
+            (part.done, part.all) = (done, all);
+        }
+        let views: Vec<_> = self
+            .photos
+            .iter()
+            .zip(&state.views)
+            .map(|(photo, view)| {
+                let carried = view.carried.as_ref().filter(|_| view.mask.is_none());
+                let shown = view.shown();
+                let pixels = |mask: &GrayImage| mask.as_raw().iter().filter(|v| **v != 0).count() as f64;
+                let share = shown.map(|(mask, _)| pixels(mask) / mask.as_raw().len().max(1) as f64);
+                json!({
+                    "name": photo.name, "size": photo.size, "marks": view.marks, "origin": view.origin,
+                    "busy": view.version != view.drawn,
+                    // Changes with the overlay.
+                    "overlay": shown.map(|_| format!("{}-{}", view.drawn, carried.map_or(0, |c| c.revision))),
+                    "doubt": carried.map(|c| c.doubt), "share": share,
+                })
+            })
+            .collect();
+        let unsure = |(photo, view): (&super::Photo, &View)| {
+            let carried = view.carried.as_ref().filter(|carried| view.mask.is_none() && carried.doubt > THIN)?;
+            Some((carried.doubt, photo.name.clone()))
+        };
+        let next = self.photos.iter().zip(&state.views).filter_map(unsure).max_by(|a, b| a.0.total_cmp(&b.0));
+        json!({
+            "title": self.title, "revision": state.revision, "phase": state.phase, "part": part,
+            "ready": state.ready, "carrying": state.ready && state.carried != state.revision,
+            "marked": state.views.iter().filter(|view| view.origin != Origin::None).count(),
+            "next": next.as_ref().map(|(_, name)| name), "doubt": next.as_ref().map(|(doubt, _)| doubt),
+            "problems": state.problems, "error": state.error, "live": steps.is_some() && state.phase == Phase::Working,
+            "files": files, "views": views,
+        })
+    }
+}
+
+/// The size of a thumbnail.
+fn thumb(size: [u32; 2]) -> [u32; 2] {
+    let width = THUMB.min(size[0]);
+    [width, (u64::from(size[1]) * u64::from(width) / u64::from(size[0].max(1))).max(1) as u32]
+}
+
+impl Site for Session {
+    fn get(&self, path: &str, query: &str) -> Result<Answer<'_>, Refusal> {
+        if let Some(rest) = path.strip_prefix("/live/") {
+            let board = read(&self.live).clone().ok_or(Refusal::NotFound)?;
+            let Answer { kind, gzip, bytes } = board.get(&format!("/{rest}"), query)?;
+            return Ok(Answer { kind, gzip, bytes: Cow::Owned(bytes.into_owned()) });
+        }
+        if let Some(rest) = path.strip_prefix("/result") {
+            let results = read(&self.results);
+            let resource = results.page.iter().find(|resource| resource.path == rest).ok_or(Refusal::NotFound)?;
+            return Ok(Answer { kind: resource.kind, gzip: resource.gzip, bytes: Cow::Owned(resource.bytes.clone()) });
+        }
+        if let Some(name) = path.strip_prefix("/download/") {
+            let results = read(&self.results);
+            let (_, path) = results.files.iter().find(|(own, _)| own == name).ok_or(Refusal::NotFound)?;
+            let bytes = std::fs::read(path).map_err(|_| Refusal::NotFound)?;
+            return Ok(owned("application/octet-stream", bytes));
+        }
+        match path {
+            "/" => Ok(owned("text/html; charset=utf-8", PAGE.replace("<!--token-->", &self.token).into_bytes())),
+            "/page.css" => Ok(text("text/css", STYLE)),
+            "/page.js" => Ok(text("text/javascript", PROGRAM)),
+            "/api/state" => Ok(answer(&self.status())),
+            "/photo.jpg" => {
+                let number = self.named(query)?;
+                let picture = self.picture(number).map_err(|_| Refusal::NotFound)?;
+                Ok(owned("image/jpeg", jpeg(&picture, 90)?))
+            }
+            "/thumb.jpg" => Ok(owned("image/jpeg", self.thumbnail(self.named(query)?)?)),
+            "/overlay.png" => {
+                let small = field(query, "small").is_some();
+                Ok(owned("image/png", self.overlaid(self.named(query)?, small)?))
+            }
+            _ => Err(Refusal::NotFound),
+        }
+    }
+
+    fn token(&self) -> Option<&str> {
+        Some(&self.token)
+    }
+
+    fn post(&self, path: &str, body: &[u8]) -> Result<Answer<'_>, Refused> {
+        fn parsed<'a, T: Deserialize<'a>>(body: &'a [u8]) -> Result<T, Refused> {
+            serde_json::from_slice(body)
+                .map_err(|error| (Refusal::BadRequest, format!("not what is meant here: {error}")))
+        }
+        match path {
+            "/api/marks" => {
+                let Marked { view, marks } = parsed(body)?;
+                let number = self
+                    .number(&view)
+                    .ok_or_else(|| (Refusal::NotFound, format!("no photograph is called {view:?}")))?;
+                self.mark(number, marks)?;
+            }
+            "/api/remove" => self.remove(parsed::<Removed>(body)?.despite)?,
+            "/api/stop" => {
+                parsed::<serde_json::Map<String, serde_json::Value>>(body)?;
+                self.stop();
+            }
+            _ => return Err((Refusal::NotFound, "there is nothing of this name".into())),
+        }
+        Ok(answer(&self.status()))
+    }
+}

@@ -1,0 +1,289 @@
+use std::io::{Read as _, Write as _};
+use std::net::{SocketAddr, TcpStream};
+
+use image::{Luma, Rgb};
+use serde_json::{Value, json};
+
+use super::*;
+use crate::capture::masks::iou;
+use crate::view::server;
+
+const SIZE: [u32; 2] = [160, 120];
+
+/// A textured disc on a textured ground.
+fn is_object(x: u32, y: u32) -> bool {
+    (f64::from(x) - 70.0).powi(2) + (f64::from(y) - 60.0).powi(2) < 26.0f64.powi(2)
+}
+
+fn photograph() -> RgbImage {
+    RgbImage::from_fn(SIZE[0], SIZE[1], |x, y| {
+        let noise = ((x * 7 + y * 13) % 17) as u8;
+        Rgb(if is_object(x, y) { [170 + noise, 60 + noise, 40] } else { [60 + noise, 90 + noise, 120] })
+    })
+}
+
+fn truth() -> GrayImage {
+    GrayImage::from_fn(SIZE[0], SIZE[1], |x, y| Luma([if is_object(x, y) { 255 } else { 0 }]))
+}
+
+struct Place {
+    folder: tempfile::TempDir,
+    photographs: BTreeMap<String, PathBuf>,
+}
+
+impl Place {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let mut photographs = BTreeMap::new();
+        for name in ["a", "b", "c & <d>"] {
+            let path = folder.path().join(format!("{name}.png"));
+            photograph().save(&path).unwrap();
+            photographs.insert(name.to_owned(), path);
+        }
+        Self { folder, photographs }
+    }
+
+    fn objects(&self) -> PathBuf {
+        self.folder.path().join("objects")
+    }
+
+    fn open(&self) -> Arc<Session> {
+        Session::open("place", &self.photographs, &self.objects(), &BTreeMap::new()).unwrap()
+    }
+}
+
+fn serve(session: &Arc<Session>) -> SocketAddr {
+    let listener = server::bind(([127, 0, 0, 1], 0).into()).unwrap();
+    let address = listener.local_addr().unwrap();
+    let site = session.clone();
+    std::thread::spawn(move || server::serve(&listener, &site));
+    address
+}
+
+/// Status and body of what comes back.
+fn ask(address: SocketAddr, request: &[u8]) -> (u32, Vec<u8>) {
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
+    stream.write_all(request).unwrap();
+    let mut answer = vec![];
+    stream.read_to_end(&mut answer).unwrap();
+    let status = std::str::from_utf8(&answer[9..12]).unwrap().parse().unwrap();
+    let body = answer.windows(4).position(|window| window == b"\r\n\r\n").unwrap() + 4;
+    (status, answer[body..].to_vec())
+}
+
+fn get(address: SocketAddr, path: &str) -> (u32, Vec<u8>) {
+    ask(address, format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n").as_bytes())
+}
+
+fn post_as(address: SocketAddr, path: &str, fields: &str, body: &str) -> (u32, String) {
+    let head = format!("POST {path} HTTP/1.1\r\nHost: localhost\r\n{fields}Content-Length: {}\r\n\r\n", body.len());
+    let (status, text) = ask(address, &[head.as_bytes(), body.as_bytes()].concat());
+    (status, String::from_utf8(text).unwrap())
+}
+
+fn post(address: SocketAddr, session: &Session, path: &str, body: &str) -> (u32, String) {
+    post_as(address, path, &format!("X-Token: {}\r\nContent-Type: application/json\r\n", session.token), body)
+}
+
+fn state(address: SocketAddr) -> Value {
+    serde_json::from_slice(&get(address, "/api/state").1).unwrap()
+}
+
+const CLICK: &str = r#"{"view":"a","marks":[{"kind":"object","at":[0.44,0.5]}]}"#;
+
+#[test]
+fn the_page_and_its_pictures_are_there_and_name_nothing_but_views() {
+    let place = Place::new();
+    let session = place.open();
+    let address = serve(&session);
+    let (status, page) = get(address, "/");
+    let page = String::from_utf8(page).unwrap();
+    assert!(status == 200 && page.contains(&session.token) && !page.contains("<!--token-->"));
+    for path in ["/page.js", "/page.css", "/photo.jpg?view=a", "/thumb.jpg?view=c%20%26%20%3Cd%3E"] {
+        assert_eq!(get(address, path).0, 200, "{path}");
+    }
+    // Nothing is looked up by a path, and there is nothing yet to download or to look at.
+    for path in [
+        "/photo.jpg?view=../a",
+        "/photo.jpg?view=..%2Fa",
+        "/photo.jpg?view=%2Fetc%2Fpasswd",
+        "/photo.jpg?view=a%00",
+        "/photo.jpg?view=%",
+        "/photo.jpg",
+        "/overlay.png?view=a",
+        "/download/../a.png",
+        "/download/scene.ply",
+        "/live/state.json",
+        "/result/",
+        "/a.png",
+    ] {
+        assert_eq!(get(address, path).0, 404, "{path}");
+    }
+    assert_eq!(ask(address, b"GET / HTTP/1.1\r\nHost: evil.example\r\n\r\n").0, 421);
+    let names: Vec<_> = state(address)["views"].as_array().unwrap().iter().map(|view| view["name"].clone()).collect();
+    assert_eq!(names, ["a", "b", "c & <d>"]);
+}
+
+#[test]
+fn nothing_changes_without_the_token_or_for_another_sites_page() {
+    let place = Place::new();
+    let session = place.open();
+    let address = serve(&session);
+    let token = format!("X-Token: {}\r\n", session.token);
+    let json = "Content-Type: application/json\r\n";
+    let send = |fields: &str| post_as(address, "/api/marks", fields, CLICK).0;
+    assert_eq!(send(json), 403);
+    assert_eq!(send(&format!("{json}X-Token: \r\n")), 403);
+    assert_eq!(send(&format!("{json}X-Token: {:032x}\r\n", 0)), 403);
+    assert_eq!(send(&format!("{token}{json}Origin: http://evil.example\r\n")), 403);
+    assert_eq!(send(&format!("{token}{json}Origin: null\r\n")), 403);
+    // What a form of another site can send.
+    assert_eq!(send(&format!("{token}Content-Type: text/plain\r\n")), 415);
+    assert_eq!(send(&token), 415);
+    let foreign = format!("POST /api/marks HTTP/1.1\r\nHost: evil.example\r\n{token}{json}Content-Length: 0\r\n\r\n");
+    assert_eq!(ask(address, foreign.as_bytes()).0, 421);
+    let endless = format!("POST /api/marks HTTP/1.1\r\nHost: localhost\r\n{token}{json}\r\n");
+    assert_eq!(ask(address, endless.as_bytes()).0, 411);
+    assert_eq!(get(address, "/api/remove").0, 404);
+    assert_eq!(ask(address, b"PUT / HTTP/1.1\r\nHost: localhost\r\n\r\n").0, 405);
+    assert_eq!(state(address)["revision"], 1);
+    assert!(!place.objects().exists());
+    assert_eq!(send(&format!("{token}{json}Origin: http://localhost:{}\r\n", address.port())), 200);
+    assert_eq!(state(address)["revision"], 2);
+}
+
+#[test]
+fn nonsense_is_refused_in_a_sentence() {
+    let place = Place::new();
+    let session = place.open();
+    let address = serve(&session);
+    let send = |path: &str, body: &str| post(address, &session, path, body);
+    let (status, said) = send("/api/marks", &CLICK.replace("\"a\"", "\"../a\""));
+    assert_eq!((status, said.as_str()), (404, "no photograph is called \"../a\"\n"));
+    for body in [
+        "",
+        "{",
+        "[]",
+        r#"{"view":"a"}"#,
+        r#"{"view":"a","marks":[{"kind":"object","at":[0.5]}]}"#,
+        r#"{"view":"a","marks":[{"kind":"object","at":[0.5,2]}]}"#,
+        r#"{"view":"a","marks":[{"kind":"object","at":[0.5,-1e-9]}]}"#,
+        r#"{"view":"a","marks":[{"kind":"box","bounds":[0.5,0.5,0.5,0.9]}]}"#,
+        r#"{"view":"a","marks":[{"kind":"thing","at":[0.5,0.5]}]}"#,
+        r#"{"view":"a","marks":[],"path":"/etc"}"#,
+        &format!(r#"{{"view":"a","marks":[{}]}}"#, [r#"{"kind":"object","at":[0.5,0.5]}"#; 401].join(",")),
+    ] {
+        let (status, said) = send("/api/marks", body);
+        assert!(status == 400 && said.lines().count() == 1, "{body}: {status} {said}");
+    }
+    let (status, _) = send("/api/marks", &format!("{}{}", " ".repeat(1 << 17), CLICK));
+    assert_eq!(status, 413);
+    assert_eq!(send("/api/other", "{}").0, 404);
+    let (status, said) = send("/api/remove", "{}");
+    assert_eq!((status, said.as_str()), (409, "nothing is marked yet; click on what is to be removed\n"));
+    assert_eq!(state(address)["revision"], 1);
+}
+
+/// One click, then none: files come and go, and another session has what this one had.
+#[test]
+fn what_is_marked_is_kept_and_found_again() {
+    let place = Place::new();
+    let session = place.open();
+    let address = serve(&session);
+    let (status, said) = post(address, &session, "/api/marks", CLICK);
+    let said: Value = serde_json::from_str(&said).unwrap();
+    assert_eq!((status, &said["views"][0]["origin"]), (200, &json!("marks")), "{said}");
+    let [png, kept] = ["a.png", "a.json"].map(|name| place.objects().join(name));
+    let mask = scene::mask(&png, 1).unwrap();
+    assert!(iou(&mask, &truth()) > 0.9, "{}", iou(&mask, &truth()));
+    assert_eq!(get(address, "/overlay.png?view=a").0, 200);
+    assert_eq!(objects::all(&place.objects(), place.photographs.iter()).unwrap(), [("a".to_owned(), png.clone())]);
+
+    let again = place.open();
+    let view = again.lock().views[0].clone();
+    assert_eq!((view.marks.len(), view.origin), (1, Origin::Marks));
+    assert!(view.mask.is_some_and(|kept| *kept == mask));
+    // Changed by hand: the marks are of another mask.
+    GrayImage::from_fn(SIZE[0], SIZE[1], |x, y| Luma([if x < 40 && y < 30 { 255 } else { 0 }])).save(&png).unwrap();
+    let view = place.open().lock().views[0].clone();
+    assert_eq!((view.marks.len(), view.origin), (0, Origin::File));
+    GrayImage::new(3, 3).save(&png).unwrap();
+    assert!(Session::open("place", &place.photographs, &place.objects(), &BTreeMap::new()).is_err());
+
+    let (status, _) = post(address, &session, "/api/marks", r#"{"view":"a","marks":[]}"#);
+    assert_eq!(status, 200);
+    assert!(!png.exists() && !kept.exists());
+    assert_eq!(get(address, "/overlay.png?view=a").0, 404);
+}
+
+/// Two pages at once: whatever they do, the files are of one of them, and the mask is that of its marks.
+#[test]
+fn the_last_of_two_pages_wins() {
+    let place = Place::new();
+    let session = place.open();
+    let address = serve(&session);
+    std::thread::scope(|scope| {
+        for page in 0..2 {
+            let session = &session;
+            scope.spawn(move || {
+                for turn in 0..6 {
+                    let x = 0.36 + 0.01 * f64::from(turn + 6 * page);
+                    let body = CLICK.replace("0.44", &x.to_string());
+                    assert_eq!(post(address, session, "/api/marks", &body).0, 200);
+                }
+            });
+        }
+    });
+    let view = session.lock().views[0].clone();
+    assert_eq!((view.version, view.drawn), (13, 13));
+    let (marks, mask) = objects::read(&place.objects(), "a", SIZE).unwrap().unwrap();
+    assert_eq!(marks, view.marks);
+    assert!(view.mask.is_some_and(|own| *own == mask));
+    let revision = session.lock().revision;
+    assert!((2..=13).contains(&revision), "{revision}");
+}
+
+#[test]
+fn work_is_asked_for_once_and_can_be_stopped() {
+    let place = Place::new();
+    let session = place.open();
+    let address = serve(&session);
+    let send = |path: &str, body: &str| post(address, &session, path, body).0;
+    assert!(matches!(session.wish(Duration::ZERO), Wish::Nothing), "nothing is carried without a fit");
+    assert_eq!(send("/api/marks", CLICK), 200);
+    session.ready();
+    let Wish::Carry(2, given) = session.wish(Duration::ZERO) else { panic!("masks are carried") };
+    assert_eq!(given.iter().map(|(view, ..)| *view).collect::<Vec<_>>(), [0]);
+    let carried = |part: f32| Carried { object: vec![part; 12], evidence: vec![0.2; 12] };
+    assert!(session.carry(2, 1, carried(0.9), [4, 3]));
+    session.carried(2);
+    assert!(matches!(session.wish(Duration::ZERO), Wish::Nothing));
+    let said = state(address);
+    assert_eq!((&said["next"], &said["views"][1]["doubt"]), (&json!("b"), &json!(1.0)));
+    // Masks of before are not shown.
+    assert_eq!(send("/api/marks", &CLICK.replace("0.44", "0.45")), 200);
+    assert!(!session.carry(2, 1, carried(0.1), [4, 3]));
+
+    assert_eq!(send("/api/remove", "{}"), 200);
+    assert_eq!(send("/api/remove", "{}"), 409);
+    assert_eq!(send("/api/marks", CLICK), 409);
+    assert_eq!(state(address)["phase"], "working");
+    // Before it has begun, stopping is all there is to it.
+    assert_eq!(send("/api/stop", "{}"), 200);
+    assert_eq!(state(address)["phase"], "choosing");
+    assert_eq!(send("/api/remove", r#"{"despite":true}"#), 200);
+    assert!(matches!(session.wish(Duration::ZERO), Wish::Remove(true)));
+    session.found(vec![]);
+    assert_eq!(state(address)["phase"], "working");
+    assert_eq!(send("/api/stop", "{}"), 200);
+    assert!(session.stopping().load(Ordering::Relaxed));
+    session.stopped();
+    session.fail("there is no device");
+    assert_eq!(state(address)["error"], "there is no device");
+    let file = place.folder.path().join("scene.ply");
+    std::fs::write(&file, b"ply").unwrap();
+    session.done(vec![], vec![("scene.ply".into(), file)]);
+    assert_eq!(get(address, "/download/scene.ply"), (200, b"ply".to_vec()));
+    assert_eq!(get(address, "/download/%2e%2e/a.png").0, 404);
+}

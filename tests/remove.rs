@@ -1,0 +1,160 @@
+//! `gscream-vk remove`: by files alone, and on its page in a browser.
+
+#[allow(dead_code)]
+#[path = "common/skip.rs"]
+mod skip;
+
+use std::fs;
+use std::io::{BufRead as _, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use assert_cmd::cargo::cargo_bin;
+use gscream_vk::scene::synthetic;
+use serde_json::Value;
+use skip::{Lack, skip};
+use tempfile::TempDir;
+
+const VIEWER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/viewer");
+/// A training of seconds.
+const SHORT: &str = "--preset demo --iterations 30 --fit-steps 150 --export-steps 10 --set train.eval_interval=0";
+
+/// Photographs with their cameras in `photos/`, and their true masks in `truth/`.
+fn photographs() -> TempDir {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let options = synthetic::Options { width: 160, height: 120, train_views: 10, test_views: 0, points: 1500, seed: 2 };
+    synthetic::write(&folder.path().join("all"), &options).expect("a writable folder");
+    fs::create_dir(folder.path().join("photos")).expect("writable");
+    for (from, to) in [("all/images", "photos/images"), ("all/sparse", "photos/sparse"), ("all/masks", "truth")] {
+        fs::rename(folder.path().join(from), folder.path().join(to)).expect("a scene");
+    }
+    folder
+}
+
+fn program(folder: &Path, arguments: &str) -> Command {
+    let mut command = Command::new(cargo_bin!("gscream-vk"));
+    command.args(arguments.split_whitespace()).current_dir(folder);
+    command.env("XDG_CACHE_HOME", env!("CARGO_TARGET_TMPDIR")).env_remove("RUST_LOG");
+    command
+}
+
+fn names(folder: &Path) -> Vec<PathBuf> {
+    let mut all: Vec<PathBuf> =
+        fs::read_dir(folder).expect("a folder").map(|entry| entry.expect("a file").path()).collect();
+    all.sort();
+    all
+}
+
+/// One command from photographs and a mask to files; the same again does nothing; another seed trains again.
+#[test]
+fn one_command_removes_an_object_and_is_not_repeated() {
+    let folder = photographs();
+    let folder = folder.path();
+    let mask = names(&folder.join("truth"))[4].clone();
+    let name = mask.file_stem().expect("a name").to_string_lossy().into_owned();
+    let command = format!("remove photos --mask {name}={} --yes {SHORT}", mask.display());
+    let run = |command: &str| {
+        let output = program(folder, command).output().expect("the program starts");
+        let [out, err] = [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
+        assert!(output.status.success(), "{err}");
+        (out, err)
+    };
+    let (said, _) = run(&command);
+    assert!(said.contains("photos-removed: the object is gone"), "{said}");
+    let out = folder.join("photos-removed");
+    for file in ["scene.ply", "scene.spz", "scene.glb", "export.json", "run/run.json", "scene/prepare.json"] {
+        assert!(out.join(file).is_file(), "{file}");
+    }
+    let made = fs::metadata(out.join("scene.ply")).and_then(|file| file.modified()).expect("a file");
+    let (_, said) = run(&command);
+    assert!(said.contains("train: nothing has changed") && said.contains("export: nothing has changed"), "{said}");
+    assert_eq!(fs::metadata(out.join("scene.ply")).and_then(|file| file.modified()).expect("a file"), made);
+    let (_, said) = run(&format!("{command} --seed 5"));
+    assert!(said.contains("trained again"), "{said}");
+    // What it made can be looked at, with a photograph.
+    let (said, notes) = run("view photos-removed --html page.html");
+    assert!(said.contains("page.html") && !notes.contains("without a photograph"), "{notes}");
+    // Without an object there is nothing to do.
+    let output = program(folder, &format!("remove photos --out other --yes {SHORT}")).output().expect("it starts");
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.code() == Some(1) && said.contains("what is to be removed?"), "{said}");
+}
+
+fn chromium() -> Option<PathBuf> {
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let all = ["chromium", "chromium-browser", "google-chrome"];
+    let found = std::env::split_paths(&path).flat_map(|folder| all.map(|name| folder.join(name))).find(|p| p.is_file());
+    if found.is_none() {
+        skip(Lack::Browser, "no Chromium: install Debian's package `chromium`");
+    }
+    found
+}
+
+/// Where the object is in the middle photograph, which the page shows first: its middle and two places beside it.
+fn clicks(folder: &Path) -> Vec<String> {
+    let all = names(&folder.join("truth"));
+    let mask = image::open(&all[all.len() / 2]).expect("a mask").to_luma8();
+    let on: Vec<[f64; 2]> = mask
+        .enumerate_pixels()
+        .filter(|(_, _, v)| v.0[0] != 0)
+        .map(|(x, y, _)| {
+            [(f64::from(x) + 0.5) / f64::from(mask.width()), (f64::from(y) + 0.5) / f64::from(mask.height())]
+        })
+        .collect();
+    let mean: [f64; 2] = std::array::from_fn(|k| on.iter().map(|p| p[k]).sum::<f64>() / on.len() as f64);
+    // A ball on a post, of other colours: something of each.
+    let [high, low] = [on.iter().map(|p| p[1]).fold(1.0, f64::min), on.iter().map(|p| p[1]).fold(0.0, f64::max)];
+    let down = |part: f64| [mean[0], high + part * (low - high)];
+    [down(0.3), down(0.9), down(0.7)].map(|[x, y]| format!("{x:.4},{y:.4}")).to_vec()
+}
+
+#[test]
+fn an_object_is_removed_on_the_page() {
+    let there = Path::new(VIEWER).join("node_modules/puppeteer-core").is_dir();
+    if !there {
+        return skip(Lack::Node, "puppeteer-core is not installed: run `npm ci --ignore-scripts` in tests/viewer");
+    }
+    let Some(chromium) = chromium() else { return };
+    let folder = photographs();
+    let folder = folder.path();
+    let mut server = program(folder, &format!("remove photos --out out --no-open --port 0 {SHORT}"))
+        .stdout(Stdio::piped())
+        .spawn()
+        .expect("the program starts");
+    let mut line = String::new();
+    // Kept open: a program whose output nobody takes any more ends.
+    let mut said = BufReader::new(server.stdout.take().expect("piped"));
+    said.read_line(&mut line).expect("its first line");
+    let url = line.split_whitespace().next().expect("an address").to_owned();
+    let pictures = std::env::var_os("GSCREAM_KEEP").map_or_else(|| folder.to_owned(), PathBuf::from);
+    let arguments = [chromium.to_string_lossy().into_owned(), url, pictures.to_string_lossy().into_owned()];
+    let output = Command::new("node")
+        .arg("remove.mjs")
+        .args(arguments.into_iter().chain(clicks(folder)))
+        .current_dir(VIEWER)
+        .output()
+        .expect("node starts");
+    server.kill().expect("it serves until it is stopped");
+    server.wait().expect("it is gone");
+    drop(said);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let found: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    println!("{found}");
+    let truth = |name: &Value| {
+        let name = name.as_str().expect("a name");
+        let mask = image::open(folder.join(format!("truth/{name}.png"))).expect("a mask").to_luma8();
+        mask.as_raw().iter().filter(|v| **v != 0).count() as f64 / mask.as_raw().len() as f64
+    };
+    for (view, share) in [("marked", 0), ("other", 1)] {
+        let (share, truth) = (found["shares"][share].as_f64().expect("a share"), truth(&found[view]));
+        assert!(share > 0.6 * truth && share < 1.6 * truth, "{view}: {share} of {truth}");
+    }
+    let files: Vec<(String, u64)> = serde_json::from_value(found["files"].clone()).expect("names and sizes");
+    assert_eq!(files.len(), 3);
+    for (name, bytes) in files {
+        let own = name.strip_prefix("photos-").expect("the photographs' folder");
+        assert_eq!(fs::metadata(folder.join("out").join(own)).expect(own).len(), bytes);
+    }
+    // What was clicked is there for the form without a browser.
+    assert_eq!(names(&folder.join("out/objects")).len(), 2);
+}
