@@ -91,8 +91,10 @@ const ROUGH: f64 = 0.01;
 const JUMP: f64 = 0.04;
 /// The window of the second cut is larger than what the first one found by this part on every side.
 const AROUND: f64 = 0.35;
-/// Marks that are taken together where colours are all that is known.
+/// The first so many marks are taken together.
 const TOGETHER: usize = 3;
+/// With a depth, a click nearer to the outline than this part of the root of the mask's area is about the outline.
+const AFAR: f64 = 0.1;
 /// A click changes what lies within so many times its distance from the outline.
 const REACH: f64 = 6.0;
 /// What being nearer to it than to what says otherwise says then.
@@ -144,8 +146,10 @@ fn voted(picture: &RgbImage, cues: &Cues<'_>) -> GrayImage {
 pub fn next(picture: &RgbImage, marks: &[Mark], before: &GrayImage, cues: &Cues<'_>) -> GrayImage {
     let there = before.as_raw().iter().any(|v| *v != 0);
     match marks.last() {
-        // Colours alone seldom find it at once: the first clicks are then better taken together.
-        Some(_) if cues.depth.is_none() && cues.carried.is_none() && marks.len() <= TOGETHER => {
+        // One click seldom finds it at once: the first ones are better taken together, unless all but the rim is there.
+        Some(last)
+            if cues.carried.is_none() && marks.len() <= TOGETHER && (cues.depth.is_none() || is_afar(before, last)) =>
+        {
             found(picture, marks, cues)
         }
         Some(Mark::Object { .. } | Mark::Background { .. }) if there => {
@@ -153,6 +157,20 @@ pub fn next(picture: &RgbImage, marks: &[Mark], before: &GrayImage, cues: &Cues<
         }
         _ => found(picture, marks, cues),
     }
+}
+
+/// Whether a click is too far from a mask's outline to be about the outline alone.
+fn is_afar(before: &GrayImage, click: &Mark) -> bool {
+    let (at, adds) = match click {
+        Mark::Object { at } => (*at, true),
+        Mark::Background { at } => (*at, false),
+        Mark::Box { .. } => return true,
+    };
+    let [x, y] = [at[0] * f64::from(before.width()), at[1] * f64::from(before.height())];
+    let on = || before.enumerate_pixels().filter(|pixel| (pixel.2.0[0] != 0) == adds);
+    let nearest = on().map(|(u, v, _)| f64::hypot(f64::from(u) + 0.5 - x, f64::from(v) + 0.5 - y));
+    let area = before.as_raw().iter().filter(|v| **v != 0).count() as f64;
+    nearest.fold(f64::INFINITY, f64::min) > AFAR * area.sqrt()
 }
 
 /// The object that the marks mean, from the beginning.
