@@ -21,7 +21,7 @@ use super::graph_cut::{self, COMPONENTS, Grid, Mixture, SHIFTS, SMOOTHNESS, UNIT
 use super::masks;
 use crate::scene::resample;
 
-/// What a user has said of a photograph. Positions are parts of its width and height, 0 to 1.
+/// A user's mark in a photograph. Positions are parts of its width and height, 0 to 1.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
 pub enum Mark {
@@ -58,12 +58,12 @@ impl Mark {
 /// Least side of a box, of the photograph's.
 const SMALLEST: f64 = 0.004;
 
-/// What is known of a photograph besides its colours.
+/// Knowledge of a photograph besides its colours.
 #[derive(Clone, Copy, Default)]
 pub struct Cues<'a> {
-    /// What the fit says of its depth.
+    /// The fit's depth.
     pub depth: Option<&'a DepthMap>,
-    /// What masks of other views say: the object's part of each pixel, 0 to 1, and width and height.
+    /// The votes of other views' masks: the object's part of each pixel, 0 to 1, and width and height.
     pub carried: Option<(&'a [f32], [u32; 2])>,
 }
 
@@ -77,9 +77,9 @@ const ROUNDS: [u32; 2] = [4, 2];
 const SIDES: [u32; 2] = [192, 288];
 /// Pixels that a mixture is made of at most.
 const SAMPLES: usize = 3000;
-/// What colours and places may say of a pixel at most, in nats.
+/// The most that colours and that places may say of a pixel, in nats.
 const MOST: [f64; 2] = [8.0, 8.0];
-/// What being nearer to a click than to anything else says.
+/// The weight of being nearer to a click than to anything else, in nats.
 const NEAR: f64 = 4.0;
 /// Nearer than this to a click, from -1 to 1, is the object to begin with.
 const NEARER: f64 = 0.33;
@@ -97,11 +97,11 @@ const TOGETHER: usize = 3;
 const AFAR: f64 = 0.1;
 /// A click changes what lies within so many times its distance from the outline.
 const REACH: f64 = 6.0;
-/// What being nearer to it than to what says otherwise says then.
+/// The weight of being nearer to it than to what says otherwise, in nats.
 const AGAIN: f64 = 8.0;
 /// Nearer than this is certain.
 const SURE: f64 = 0.6;
-/// What speaks for leaving the rest as it is.
+/// The weight of leaving the rest as it is, in nats.
 const STAYS: f64 = 16.0;
 /// Votes of other views beyond this are the object.
 const VOTED: f32 = masks::OBJECT;
@@ -135,7 +135,7 @@ pub fn mask(picture: &RgbImage, marks: &[Mark], cues: &Cues<'_>) -> GrayImage {
     (1..=marks.len()).fold(before, |before, count| next(picture, &marks[..count], &before, cues))
 }
 
-/// What other views say of a picture.
+/// The mask that other views' votes make of a picture.
 fn voted(picture: &RgbImage, cues: &Cues<'_>) -> GrayImage {
     let to = [picture.width(), picture.height()];
     cues.carried.map_or_else(|| GrayImage::new(to[0], to[1]), |(parts, from)| masks::threshold(parts, from, to, VOTED))
@@ -218,7 +218,7 @@ fn bounds_of(mask: &GrayImage) -> Option<[f64; 4]> {
     Some([x0, y0, x1 + 1, y1 + 1].map(f64::from))
 }
 
-/// What a cut has to go by, pixel by pixel of its small picture.
+/// The evidence of a cut, pixel by pixel of its small picture.
 struct Pixels {
     size: [usize; 2],
     colors: Vec<[f64; 3]>,

@@ -38,7 +38,7 @@ pub struct Placed {
     pub object: Object,
     /// Where it stands.
     pub stand: Stand,
-    /// Its axes in the world, by column.
+    /// The object's axes in the world, by column.
     axes: DMat3,
 }
 
@@ -107,7 +107,7 @@ pub struct Drawn {
     pub shadow: Option<GrayImage>,
 }
 
-/// What is known of a photograph.
+/// A photograph with its depths.
 struct View<'a> {
     placed: &'a Placed,
     camera: &'a Camera,
@@ -241,7 +241,7 @@ impl View<'_> {
         (t.is_finite() && t > 0.0).then(|| self.eye + ray * t)
     }
 
-    /// What is left of the brightness at each pixel.
+    /// The share of the brightness that is left at each pixel.
     fn shadow(&self) -> GrayImage {
         let [w, h] = self.camera.size;
         let mut left = GrayImage::from_pixel(w, h, Luma([255]));

@@ -33,7 +33,7 @@ use crate::scene::{self, Camera, Scene, colmap, stem};
 const SIDE: u32 = 512;
 /// Files of a model that are copied: stems and extensions.
 const MODEL: ([&str; 5], [&str; 3]) = (["cameras", "images", "points3D", "rigs", "frames"], ["bin", "txt", "ply"]);
-/// What the object and its place are written to.
+/// The file of the object and its place.
 pub const RECORD: &str = "compose.json";
 /// Folder of the shadows: how bright the surface still is, of 255.
 pub const SHADOWS: &str = "shadows";
@@ -50,7 +50,7 @@ pub enum Error {
     /// No photograph has this name.
     #[error("{option} {name}: no photograph of {} has this name{hint}", scene.display())]
     NoView {
-        /// What named it.
+        /// The option that named it.
         option: &'static str,
         /// The name.
         name: String,
@@ -68,9 +68,9 @@ pub enum Error {
         x: f64,
         /// The pixel's row.
         y: f64,
-        /// Of the photograph.
+        /// The photograph's size or name.
         width: u32,
-        /// Of the photograph.
+        /// The photograph's size or name.
         height: u32,
     },
     /// No view agrees with another on the depth there.
@@ -91,7 +91,7 @@ pub enum Error {
     Unseen {
         /// The view.
         view: String,
-        /// What to do.
+        /// The remedy.
         what: &'static str,
     },
     /// Too few photographs for the request.
@@ -121,7 +121,7 @@ pub enum Error {
     },
 }
 
-/// What to compose.
+/// A composition that is asked for.
 #[derive(Clone, Debug)]
 pub struct Request {
     /// Folder of the capture: photographs and a COLMAP model.
@@ -134,7 +134,7 @@ pub struct Request {
     pub pixel: [f64; 2],
     /// Height of the object as a share of that photograph's height.
     pub size: f64,
-    /// What it is.
+    /// The kind of object.
     pub kind: Kind,
     /// Seed of shape, texture, turn and light.
     pub seed: u64,
@@ -147,7 +147,7 @@ pub struct Request {
     pub test_every: u32,
 }
 
-/// What was composed.
+/// A composed scene.
 #[derive(Clone, Debug)]
 pub struct Outcome {
     /// Photographs to train on.

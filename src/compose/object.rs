@@ -183,7 +183,7 @@ pub struct Object {
     base: DVec3,
     second: DVec3,
     waves: Vec<Wave>,
-    /// Its light.
+    /// The light that it stands in.
     pub light: Light,
 }
 

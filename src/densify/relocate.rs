@@ -13,7 +13,7 @@ use super::Config;
 use crate::gpu::{Error, Gpu};
 use crate::model::gaussians::{Static, sigmoid};
 
-/// What a round's random numbers depend on.
+/// The seed of a round's random numbers.
 #[derive(Clone, Copy, Debug)]
 pub struct Round {
     /// The run's seed.
@@ -27,7 +27,7 @@ pub struct Round {
 struct Shared {
     /// The Gaussian.
     source: usize,
-    /// Those that become copies of it.
+    /// The Gaussians that become copies of it.
     copies: Vec<usize>,
     /// Logit of the opacity that each has then.
     logit: f32,
@@ -106,7 +106,7 @@ fn apply(shared: &[Shared], tensors: &mut [Vec<f32>; 3], width: usize) {
 /// `config.max_gaussians` and the room there is. Returns how many moved. Nothing may be in flight.
 ///
 /// # Errors
-/// Whatever the copies meet.
+/// Errors of the copies.
 pub fn run(gpu: &Gpu, gaussians: &mut Static, config: &Config, round: Round) -> Result<u32, Error> {
     let count = gaussians.count as usize;
     let opacity: Vec<f64> = gaussians.logit.read(gpu, gaussians.count)?.into_iter().map(sigmoid).collect();

@@ -14,7 +14,7 @@ pub enum Form {
 }
 
 impl Form {
-    /// What the model consists of, in the plural.
+    /// The word for the model's elements, in the plural.
     pub fn rows(self) -> &'static str {
         match self {
             Self::Anchors => "anchors",

@@ -44,7 +44,7 @@ impl Cloud {
         &self.harmonics[i * each..(i + 1) * each]
     }
 
-    /// Those for which `keep` says so, in their order.
+    /// Keeps the Gaussians for which `keep` says so, in their order.
     pub fn retain(&mut self, keep: &[bool]) {
         fn kept<T: Copy>(from: &mut Vec<T>, keep: &[bool], each: usize) {
             let mut flags = keep.iter().flat_map(|k| std::iter::repeat_n(*k, each));
@@ -83,7 +83,7 @@ impl Cloud {
         })
     }
 
-    /// The same Gaussians in axes turned by a rotation matrix.
+    /// Turns the Gaussians into other axes by a rotation matrix.
     pub fn turn(&mut self, by: DMat3) {
         let each = coefficients(self.degree);
         if each > 1 {
@@ -130,7 +130,7 @@ fn scale_higher(harmonics: &mut [[f32; 3]], each: usize, by: f64) {
 pub(crate) const NAMES: [Names; 5] =
     [names!("position"), names!("log_scale"), names!("quaternion"), names!("logit"), names!("harmonics")];
 
-/// What is learnt of static Gaussians, with Adam's moments.
+/// The learnt arrays of static Gaussians, with Adam's moments.
 #[derive(Debug)]
 pub struct Static {
     /// Gaussians in use.
@@ -190,7 +190,7 @@ impl Static {
         })
     }
 
-    /// As many Gaussians of this degree as one binding of the device holds of every array, and a `u32` counts.
+    /// The most Gaussians of this degree that one binding of the device holds of every array, and a `u32` counts.
     pub fn most(gpu: &Gpu, degree: u32) -> u32 {
         // The widest array, less what rounding to whole vectors may add.
         let widest = 4 * (3 * coefficients(degree) as u64).max(4);
@@ -210,7 +210,7 @@ impl Static {
     /// The Gaussians as they are now, quaternions normalised.
     ///
     /// # Errors
-    /// Whatever the copies meet.
+    /// Errors of the copies.
     pub fn read(&self, gpu: &Gpu) -> Result<Cloud, Error> {
         let read = |parameter: &Parameter| parameter.read(gpu, self.count);
         let triples = |flat: Vec<f32>| -> Vec<[f32; 3]> { flat.as_chunks().0.to_vec() };

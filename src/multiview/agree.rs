@@ -52,7 +52,7 @@ fn has_texture(picture: &Picture, site: usize) -> bool {
     high.saturating_sub(low) >= CONTRAST
 }
 
-/// Whose shares are those of wrong cameras.
+/// The views whose shares are those of wrong cameras.
 pub(super) fn wrong(shares: &[Option<f64>]) -> Vec<bool> {
     let mut judged: Vec<f64> = shares.iter().flatten().copied().collect();
     judged.sort_unstable_by(f64::total_cmp);

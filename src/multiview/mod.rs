@@ -97,7 +97,7 @@ struct Round {
     spread: f32,
 }
 
-/// What multi-view stereo found.
+/// The result of multi-view stereo.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Stereo {
     /// Points that the photographs add to those of the sparse model; none where no view has neighbours.

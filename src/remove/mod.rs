@@ -43,9 +43,9 @@ pub const THIN: f64 = 0.15;
 /// A photograph.
 #[derive(Debug)]
 pub struct Photo {
-    /// Its name.
+    /// The photograph's name.
     pub name: String,
-    /// Its file.
+    /// The photograph's file.
     pub path: PathBuf,
     /// Width and height, pixels.
     pub size: [u32; 2],
@@ -64,7 +64,7 @@ pub enum Origin {
     File,
 }
 
-/// What is known of a photograph.
+/// The state of a photograph.
 #[derive(Clone, Default)]
 struct View {
     marks: Vec<Mark>,
@@ -79,7 +79,7 @@ struct View {
     carried: Option<Arc<Shown>>,
 }
 
-/// What other views' masks make of a photograph.
+/// The mask that other views' masks make of a photograph.
 struct Shown {
     parts: Vec<f32>,
     size: [u32; 2],
@@ -89,7 +89,7 @@ struct Shown {
     revision: u64,
 }
 
-/// What is going on.
+/// The part of the work that is going on.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Phase {
@@ -105,7 +105,7 @@ pub enum Phase {
 /// A part of the work.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Part {
-    /// What is done, in words.
+    /// The name of the part, in words.
     pub name: String,
     /// How much of it is done.
     pub done: u64,
@@ -130,7 +130,7 @@ struct State {
     error: Option<String>,
 }
 
-/// What the worker is to do next.
+/// The worker's next task.
 pub enum Wish {
     /// Nothing has changed for a while.
     Nothing,
@@ -140,14 +140,14 @@ pub enum Wish {
     Remove(bool),
 }
 
-/// What can be had when the work is done.
+/// The results of the work.
 #[derive(Default)]
 struct Results {
     page: Vec<Resource>,
     files: Vec<(String, PathBuf)>,
 }
 
-/// What the page and the worker know of each other.
+/// The state that the page and the worker share.
 pub struct Session {
     title: String,
     token: String,
@@ -166,7 +166,7 @@ pub struct Session {
     stop: Arc<AtomicBool>,
 }
 
-/// What was said is refused: a status and a sentence.
+/// A refusal of what was said: a status and a sentence.
 pub type Refused = (Refusal, String);
 
 fn read<T>(lock: &RwLock<T>) -> std::sync::RwLockReadGuard<'_, T> {
@@ -458,12 +458,12 @@ impl Session {
         self.lock().ready = true;
     }
 
-    /// What the fit says of a view's depth.
+    /// The fit's depth of a view.
     pub fn knows(&self, number: usize, depth: DepthMap) {
         write(&self.depths).insert(number, Arc::new(depth));
     }
 
-    /// What the masks of this revision make of a view; nothing of it is kept where they have changed since.
+    /// Keeps what the masks of this revision make of a view; nothing of it is kept where they have changed since.
     pub fn carry(&self, revision: u64, number: usize, carried: Carried, size: [u32; 2]) -> bool {
         let mask = masks::threshold(&carried.object, size, working(self.photos[number].size), masks::OBJECT);
         let doubt = carried.thinness().unwrap_or(0.0);
@@ -492,7 +492,7 @@ impl Session {
         state.revision != revision || state.wanted.is_some()
     }
 
-    /// What is to be done, waiting for it for a while.
+    /// The next task, waiting for it for a while.
     pub fn wish(&self, patience: Duration) -> Wish {
         let state = self.lock();
         let idle = |state: &mut State| state.wanted.is_none() && (state.carried == state.revision || !state.ready);

@@ -12,7 +12,7 @@ use crate::capture::click::Mark;
 use crate::capture::masks;
 use crate::scene;
 
-/// What `NAME.json` holds.
+/// The contents of `NAME.json`.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Kept {

@@ -22,7 +22,7 @@ const THUMB: u32 = 240;
 const COLORS: [[[u8; 4]; 2]; 2] =
     [[[255, 80, 60, 105], [255, 240, 235, 255]], [[255, 170, 30, 95], [255, 235, 190, 235]]];
 
-/// What is posted to `/api/marks`.
+/// The body of a POST to `/api/marks`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Marked {
@@ -30,7 +30,7 @@ struct Marked {
     marks: Vec<Mark>,
 }
 
-/// What is posted to `/api/remove`.
+/// The body of a POST to `/api/remove`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Removed {
@@ -130,7 +130,7 @@ impl Session {
         overlay(mask, COLORS[kind])
     }
 
-    /// What the page is told.
+    /// The state as the page reads it.
     fn status(&self) -> serde_json::Value {
         let files: Vec<_> = {
             let results = read(&self.results);

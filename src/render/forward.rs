@@ -70,14 +70,14 @@ fn most_pairs(gpu: &Gpu) -> u32 {
 /// The stages between what is learnt and the Gaussians of a view.
 #[expect(clippy::large_enum_variant, reason = "a step has one")]
 pub enum Front {
-    /// Of anchors.
+    /// Stages of anchors.
     Anchors {
-        /// What is in view.
+        /// The anchors in view.
         visible: Visible,
         /// Neural Gaussians.
         decode: Decode,
     },
-    /// Of plain Gaussians.
+    /// Stages of plain Gaussians.
     Gaussians {
         /// All of them, as they are drawn.
         activate: Activate,

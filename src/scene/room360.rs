@@ -17,7 +17,7 @@ use rand_pcg::Pcg64;
 use super::Error;
 use super::synthetic::{Material, Pattern, Room, Shape, Shot, checked, to_rgb8, write_room};
 
-/// What to make. The same options give the same files.
+/// Options of the scene. The same options give the same files.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {
     /// Seed of textures, cameras, points, noise and exposure.

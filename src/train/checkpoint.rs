@@ -112,7 +112,7 @@ fn counts(step: &Step) -> Vec<(Buffer<u32>, usize)> {
     step.statistics.iter().flat_map(of).collect()
 }
 
-/// What stands for Gaussians per anchor where there are none.
+/// The number that stands for Gaussians per anchor where there are none.
 const PLAIN: u32 = 0;
 
 /// Projections of an attention whose time has not come.

@@ -68,7 +68,7 @@ pub fn initial(scene: &Scene, settings: &Settings) -> Result<Initial, init::Erro
     init::from_points(&scene.starts(), &settings.fitted(scene).model, settings.train.seed)
 }
 
-/// What a run starts from, in either form of the model.
+/// The start of a run, in either form of the model.
 #[derive(Clone, Debug)]
 pub enum Beginning {
     /// Anchors.

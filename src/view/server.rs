@@ -48,7 +48,7 @@ pub enum Refusal {
     BadRequest,
     /// There is nothing of this name.
     NotFound,
-    /// What is posted lacks the site's token, or comes from another site's page.
+    /// A POST lacks the site's token, or comes from another site's page.
     Forbidden,
     /// Only GET and HEAD are answered, and POST by sites that take it.
     Method,
@@ -58,11 +58,11 @@ pub enum Refusal {
     Conflict,
     /// There will be nothing more of this name.
     Gone,
-    /// What is posted does not say how long it is.
+    /// A POST does not say how long it is.
     NoLength,
-    /// What is posted is too long.
+    /// The body of a POST is too long.
     TooLarge,
-    /// What is posted is no JSON.
+    /// The body of a POST is no JSON.
     NoJson,
     /// The request is for another machine.
     OtherHost,
@@ -463,7 +463,7 @@ fn is_pause(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut | io::ErrorKind::Interrupted)
 }
 
-/// What a request comes to: how it was asked and the answer, or a status and what is said with it.
+/// The outcome of a request: how it was asked and the answer, or a status and what is said with it.
 type Answered<'a> = Result<(Method, Answer<'a>), (Refusal, String)>;
 
 /// Whether two words are the same, in a time that does not say where they differ.

@@ -78,7 +78,7 @@ fn small(path: &Path) -> RgbImage {
     resample::photograph(&picture, size)
 }
 
-/// What was found, means over the views: after 1, 2 and 3 clicks and in a box, without the fit and with it; and carried to
+/// Figures of a capture, means over the views: after 1, 2 and 3 clicks and in a box, without the fit and with it; and carried to
 /// the other views after 1, 2 and 3 clicks.
 struct Found {
     alone: [f64; 3],

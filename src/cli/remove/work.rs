@@ -26,7 +26,7 @@ use crate::train::checkpoint::{self, Fingerprint};
 use crate::train::run::Signal;
 use crate::view::live::Board;
 
-/// What lies where.
+/// The folders of a removal.
 pub struct Places {
     /// The folder of all.
     pub root: PathBuf,
@@ -52,7 +52,7 @@ impl Places {
     }
 }
 
-/// What to do.
+/// A removal and where it goes.
 pub struct Job<'a> {
     /// As the user asked for it.
     pub args: &'a Args,
@@ -64,11 +64,11 @@ pub struct Job<'a> {
 pub trait Audience {
     /// A part begins, of so many units.
     fn begin(&self, _part: &str, _units: u64) {}
-    /// So many units of it are done.
+    /// The units of the part that are done.
     fn at(&self, _units: u64) {}
     /// Training can be looked at.
     fn board(&self, _board: &Arc<Board>) {}
-    /// What doctor says.
+    /// The doctor's report.
     fn examined(&self, _report: &Report) {}
     /// The wish to end.
     fn stop(&self) -> Stop {
@@ -84,13 +84,13 @@ pub trait Audience {
 pub struct Nobody;
 impl Audience for Nobody {}
 
-/// What `remove.json` holds: hashes of what was made of what.
+/// The contents of `remove.json`: hashes of what was made of what.
 #[derive(Default, Serialize, Deserialize)]
 struct Record {
     version: String,
-    /// What the run was begun with.
+    /// The hash of what the run was begun with.
     train: String,
-    /// What the files for viewers were made of.
+    /// The hash of what the files for viewers were made of.
     export: String,
 }
 
@@ -175,7 +175,7 @@ impl Observer for Watched<'_, export::Bars> {
 }
 
 impl Job<'_> {
-    /// What `prepare` is asked for.
+    /// The request to `prepare`.
     pub fn request(&self, object: Vec<(String, Evidence)>) -> Request {
         let Args { photographs, reference, fit_steps, .. } = self.args;
         Request {
@@ -201,7 +201,7 @@ impl Job<'_> {
     /// Everything. With `despite` also where doctor finds problems.
     ///
     /// # Errors
-    /// Those of the parts; problems that doctor finds; an end that somebody wished.
+    /// Errors of the parts; problems that doctor finds; an end that somebody wished.
     pub fn work(
         &self,
         gpu: &Gpu,

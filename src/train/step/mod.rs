@@ -40,7 +40,7 @@ struct Stages {
     forward: Forward,
     rasterize: Backward,
     project: ProjectBackward,
-    /// Of anchors.
+    /// Stages of anchors.
     decode: Option<DecodeBackward>,
 }
 
@@ -70,7 +70,7 @@ impl Stages {
     }
 }
 
-/// What a step draws, with what its way back needs.
+/// The Gaussians that a step draws, with what its way back needs.
 enum Drawable<'a> {
     Anchors {
         anchors: &'a Anchors,
@@ -130,7 +130,7 @@ pub struct Step {
     gpu: Gpu,
     /// The plan the stages were made for.
     pub plan: Plan,
-    /// What is learnt, but for the attention.
+    /// The learnt arrays, but for the attention's.
     pub learnt: Learnt,
     /// Overflow flag and counters.
     pub limits: Limits,

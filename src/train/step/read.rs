@@ -54,7 +54,7 @@ impl Step {
     /// The gradients of the last recorded step by PyTorch's names, of what is trained: for tests.
     ///
     /// # Errors
-    /// Whatever the copies meet.
+    /// Errors of the copies.
     pub fn gradients(&self) -> Result<std::collections::BTreeMap<String, Vec<f32>>, Error> {
         let mut all = std::collections::BTreeMap::new();
         let read = |parameter: &Parameter, rows: u32| {
@@ -81,7 +81,7 @@ impl Step {
     /// The model as it is now.
     ///
     /// # Errors
-    /// Whatever the copies meet.
+    /// Errors of the copies.
     pub fn stored(&self) -> Result<Stored, Error> {
         let (anchors, weights) = match &self.learnt {
             Learnt::Anchors { anchors, weights } => (anchors, weights),
@@ -99,7 +99,7 @@ impl Step {
     /// The anchors and networks as they are now.
     ///
     /// # Errors
-    /// Whatever the copies meet.
+    /// Errors of the copies.
     ///
     /// # Panics
     /// For a step of plain Gaussians.
