@@ -68,7 +68,7 @@ pub(super) struct Args {
     device: DeviceArgs,
 }
 
-/// What the object is, by files and numbers.
+/// The object, by files and numbers.
 #[derive(Debug, Clone, Default, clap::Args)]
 pub(super) struct ObjectArgs {
     /// Mask of one view: a picture that is not black on the object; may be given many times

@@ -555,7 +555,7 @@ fn bar(steps: u32, done: u32) -> ProgressBar {
 /// Shows progress and keeps the test views.
 struct Watch {
     bar: ProgressBar,
-    /// What the model consists of.
+    /// The word for the elements of the model.
     rows: &'static str,
     pictures: PathBuf,
     failed: Option<pictures::Error>,

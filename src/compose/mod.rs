@@ -1,6 +1,6 @@
 //! Truth on any capture: a made object in a real scene, and the scene as it was.
 //!
-//! What an object's removal should leave can be measured where photographs without the object exist. Here they do: the
+//! A removal can be measured where photographs without the object exist. Here they do: the
 //! capture's own. [`compose`] stands a made object on the surface that a pixel of one photograph shows, draws it into every
 //! photograph, and writes a scene in the plain layout (see [`scene`]) whose test views are the photographs as they were.
 //!
