@@ -36,7 +36,6 @@ mod print;
 
 pub mod atomic;
 pub mod bench;
-pub mod capture;
 pub mod cli;
 pub mod compose;
 pub mod config;
@@ -51,6 +50,7 @@ pub mod math;
 pub mod model;
 pub mod multiview;
 pub mod optimizer;
+pub mod prepare;
 pub mod primitives;
 pub mod remove;
 pub mod render;

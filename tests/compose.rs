@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use glam::{DVec3, dvec3};
-use gscream_vk::capture::doctor;
+use gscream_vk::prepare::doctor;
 use gscream_vk::compose::{self, Drawn, Kind, Object, Placed, Request, Stand};
 use gscream_vk::gpu::testing;
 use gscream_vk::multiview::DepthGrid;

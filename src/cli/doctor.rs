@@ -5,9 +5,9 @@ use crate::atomic::AtomicWriteFile;
 use anyhow::{Context as _, bail};
 
 use super::{next, pictures};
-use crate::capture::doctor::{self, Report, Severity};
-use crate::capture::reference::PROVENANCE;
-use crate::capture::sheet;
+use crate::prepare::doctor::{self, Report, Severity};
+use crate::prepare::reference::PROVENANCE;
+use crate::prepare::sheet;
 
 /// Look over a scene before training: masks, names, sizes, poses, depth, reference, exposure
 ///

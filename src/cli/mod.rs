@@ -153,7 +153,7 @@ pub fn exit_code(error: &anyhow::Error) -> ExitCode {
 fn signal(error: &(dyn std::error::Error + 'static)) -> Option<Signal> {
     let stopped = error.downcast_ref::<signals::Stopped>().map(|stopped| stopped.signal);
     let run = || error.downcast_ref::<crate::train::run::Error>()?.signal();
-    let capture = || error.downcast_ref::<crate::capture::Error>()?.signal();
+    let capture = || error.downcast_ref::<crate::prepare::Error>()?.signal();
     let export = || match error.downcast_ref::<crate::export::Error>()? {
         crate::export::Error::Interrupted { signal } => Some(*signal),
         _ => None,

@@ -5,7 +5,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::shared::DeviceArgs;
 use super::{next, signals};
-use crate::capture::{self, Evidence, Request, Step, Watch};
+use crate::prepare::{self, Evidence, Request, Step, Watch};
 use crate::train::run::Signal;
 
 /// Make a scene of photographs and one mask: cameras, masks for all views, depth, a reference view without the object
@@ -138,7 +138,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     };
     args.device.with_gpu(|gpu| {
         signals::listen()?;
-        Ok(capture::prepare(gpu, &request, &mut Bars::default())?)
+        Ok(prepare::prepare(gpu, &request, &mut Bars::default())?)
     })?;
     println!("{}: ready after {:.0} s", args.out.display(), began.elapsed().as_secs_f64());
     next::say(&[

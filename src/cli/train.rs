@@ -13,7 +13,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::folders::{Asked, MODEL, RECORD, Record, SEEN, SETTINGS, TEST};
 use super::shared::{DeviceArgs, SceneArgs, add_dense, load_scene, with_gpu};
 use super::{index, instruments, minutes, next, pictures, preset, signals};
-use crate::capture::doctor::{self, Severity};
+use crate::prepare::doctor::{self, Severity};
 use crate::config::{Settings, SettingsArgs, Source};
 use crate::evaluate::{Judge, Report};
 use crate::folder::{self, Lock};

@@ -1,7 +1,7 @@
 //! The page of `gscream-vk remove`: photographs to point at an object in, and what becomes of them.
 //!
 //! The page's visitors and the worker, who has the device, meet at a [`Session`]. Marks become masks in the visitors' own
-//! threads ([`crate::capture::click`]), with what the worker has laid down so far: the fit's depth, and the masks of other
+//! threads ([`crate::prepare::click`]), with what the worker has laid down so far: the fit's depth, and the masks of other
 //! views as the fit carries them. All that is to be kept lies in a folder: `NAME.png`, the mask of a photograph, as `prepare
 //! --mask` takes it, and `NAME.json`, the marks it was made of ([`objects`]). The last of two writers wins, view by view; a
 //! revision counts the changes.
@@ -18,9 +18,9 @@ use std::time::Duration;
 use image::{GrayImage, RgbImage};
 use serde::Serialize;
 
-use crate::capture::click::{self, Cues, Mark};
-use crate::capture::depth::DepthMap;
-use crate::capture::masks::{self, Carried};
+use crate::prepare::click::{self, Cues, Mark};
+use crate::prepare::depth::DepthMap;
+use crate::prepare::masks::{self, Carried};
 use crate::scene::{self, resample};
 use crate::view::live::Board;
 use crate::view::server::{Refusal, Resource};

@@ -8,8 +8,8 @@ use image::{GrayImage, ImageFormat};
 use serde::{Deserialize, Serialize};
 
 use crate::atomic::AtomicWriteFile;
-use crate::capture::click::Mark;
-use crate::capture::masks;
+use crate::prepare::click::Mark;
+use crate::prepare::masks;
 use crate::scene;
 
 /// The contents of `NAME.json`.

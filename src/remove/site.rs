@@ -9,7 +9,7 @@ use serde::Deserialize;
 use serde_json::json;
 
 use super::{Origin, Phase, Refused, Session, THIN, View, read};
-use crate::capture::click::Mark;
+use crate::prepare::click::Mark;
 use crate::scene::{self, resample};
 use crate::view::server::{Answer, Refusal, Site};
 

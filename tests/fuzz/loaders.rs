@@ -3,9 +3,9 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use gscream_vk::capture::graph_cut::Strokes;
-use gscream_vk::capture::lens::Pinhole;
-use gscream_vk::capture::{Silent, doctor, poses, record};
+use gscream_vk::prepare::graph_cut::Strokes;
+use gscream_vk::prepare::lens::Pinhole;
+use gscream_vk::prepare::{Silent, doctor, poses, record};
 use gscream_vk::config::{Settings, Source};
 use gscream_vk::evaluate::network::Weights;
 use gscream_vk::export::{gltf, ply, spz};

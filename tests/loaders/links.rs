@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use gscream_vk::capture::{self, Request, Silent, Step, Watch};
+use gscream_vk::prepare::{self, Request, Silent, Step, Watch};
 use gscream_vk::gpu::testing;
 use serde_json::json;
 
@@ -29,11 +29,11 @@ fn a_link_that_points_up_multiplies_nothing() {
         let says = format!("{} is not looked into: it leads to ", at.join(link).display());
         assert!(scene.notes.iter().any(|note| note.starts_with(&says)), "{:?}", scene.notes);
     }
-    let (report, _) = capture::doctor::examine(&at, None).expect("a folder");
+    let (report, _) = prepare::doctor::examine(&at, None).expect("a folder");
     let named = report.findings.iter().filter(|finding| finding.message.contains("is not looked into"));
     assert!(
         named.clone().count() == 3
-            && named.clone().all(|finding| finding.severity == capture::doctor::Severity::Problem)
+            && named.clone().all(|finding| finding.severity == prepare::doctor::Severity::Problem)
     );
 }
 
@@ -115,7 +115,7 @@ fn frames_from_elsewhere_become_views_of_the_scene() {
     let mut request = Request::new(at.join("nerf"), &out);
     request.only = vec![Step::Poses];
     let mut lines = Lines::default();
-    capture::prepare(&testing::gpu(), &request, &mut lines).expect("poses");
+    prepare::prepare(&testing::gpu(), &request, &mut lines).expect("poses");
     let new: Vec<String> = files(at).into_iter().filter(|file| !before.contains(file)).collect();
     assert!(new.iter().all(|file| file.starts_with("out/scene/")), "{new:?}");
     let scene = load(&out).expect("a scene");
@@ -128,7 +128,7 @@ fn frames_from_elsewhere_become_views_of_the_scene() {
     assert!(lines.0.iter().any(|line| line.contains("3 photographs lie elsewhere")), "{:?}", lines.0);
     // The names are those of last time.
     let mut lines = Lines::default();
-    capture::prepare(&testing::gpu(), &request, &mut lines).expect("poses");
+    prepare::prepare(&testing::gpu(), &request, &mut lines).expect("poses");
     assert_eq!(lines.0, ["poses: nothing has changed"]);
 }
 
@@ -145,6 +145,6 @@ fn points_must_be_points() {
     fs::write(at.join("scene/transforms.json"), text).expect("a writable folder");
     let mut request = Request::new(at.join("scene"), at.join("out"));
     request.only = vec![Step::Poses];
-    let error = capture::prepare(&testing::gpu(), &request, &mut Silent).expect_err("no points").to_string();
+    let error = prepare::prepare(&testing::gpu(), &request, &mut Silent).expect_err("no points").to_string();
     assert!(error.contains("ply_file_path is \"../secret\", which is no PLY file"), "{error}");
 }

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use assert_cmd::cargo::cargo_bin;
-use gscream_vk::capture::{self, Request, Silent};
+use gscream_vk::prepare::{self, Request, Silent};
 use gscream_vk::gpu::testing;
 use gscream_vk::scene::synthetic;
 
@@ -101,7 +101,7 @@ fn odd_names_go_the_whole_way() {
     let scene = at.join("a scene");
     let mut request = Request::new(&photos, &scene);
     (request.fit_steps, request.fit_side, request.reference) = (30, 48, Some(odd[1].clone()));
-    capture::prepare(&testing::gpu(), &request, &mut Silent).expect("a scene");
+    prepare::prepare(&testing::gpu(), &request, &mut Silent).expect("a scene");
 
     // In a scene names may be as long as files' names can be.
     let last = odd.len();
@@ -153,8 +153,8 @@ fn names_without_room_are_refused_first() {
     let long = "n".repeat(242);
     fs::rename(at.join("scene/images/train_000.png"), at.join(format!("scene/images/{long}.png"))).expect("a folder");
     let mut request = Request::new(at.join("scene"), at.join("out"));
-    request.object = vec![("train_001".into(), capture::Evidence::Box([10, 10, 20, 20]))];
-    let error = capture::prepare(&testing::gpu(), &request, &mut Silent).expect_err("no room").to_string();
+    request.object = vec![("train_001".into(), prepare::Evidence::Box([10, 10, 20, 20]))];
+    let error = prepare::prepare(&testing::gpu(), &request, &mut Silent).expect_err("no room").to_string();
     assert!(error.contains("its name has 242 bytes without extension") && error.contains("at most 241"), "{error}");
     assert!(!at.join("out").exists());
 }

@@ -10,7 +10,7 @@ use anyhow::Context as _;
 use super::prepare::ObjectArgs;
 use super::shared::DeviceArgs;
 use super::{next, signals, train};
-use crate::capture::poses;
+use crate::prepare::poses;
 use crate::config::SettingsArgs;
 use crate::export;
 use crate::folder::Lock;

@@ -11,12 +11,12 @@ use image::GrayImage;
 
 use super::work::{self, Audience, Job};
 use super::{open_browser, signals};
-use crate::capture::depth::DepthMap;
-use crate::capture::doctor::{Report, Severity};
-use crate::capture::fit::Fit;
-use crate::capture::masks::{self, Shares, Votes};
-use crate::capture::poses::Capture;
-use crate::capture::splats::Splats;
+use crate::prepare::depth::DepthMap;
+use crate::prepare::doctor::{Report, Severity};
+use crate::prepare::fit::Fit;
+use crate::prepare::masks::{self, Shares, Votes};
+use crate::prepare::poses::Capture;
+use crate::prepare::splats::Splats;
 use crate::cli::train::{self, Stop};
 use crate::cli::view;
 use crate::gpu::Gpu;

@@ -11,13 +11,14 @@ use serde::{Deserialize, Serialize};
 
 use super::Args;
 use crate::atomic::AtomicWriteFile;
-use crate::capture::doctor::{self, Report};
-use crate::capture::record::{self, Inputs};
-use crate::capture::{self, Evidence, Request, Step, Watch};
+use crate::prepare::doctor::{self, Report};
+use crate::prepare::record::{self, Inputs};
+use crate::prepare::{self, Evidence, Request, Step, Watch};
 use crate::cli::folders::{MODEL, Record as RunRecord};
 use crate::cli::shared::{SceneArgs, add_dense};
 use crate::cli::train::{self, Manner, Stop, Trained};
-use crate::cli::{doctor as findings, export, minutes, prepare, preset};
+use crate::cli::prepare::Bars;
+use crate::cli::{doctor as findings, export, minutes, preset};
 use crate::evaluate::Judge;
 use crate::export::{Observer, Options};
 use crate::gpu::Gpu;
@@ -135,7 +136,7 @@ impl<'a, B: Default> Watched<'a, B> {
     }
 }
 
-impl Watch for Watched<'_, prepare::Bars> {
+impl Watch for Watched<'_, Bars> {
     fn begin(&mut self, step: Step, units: u64) {
         self.audience.begin(step.name(), units);
         self.bars.begin(step, units);
@@ -189,13 +190,13 @@ impl Job<'_> {
     /// The photographs and the short fit to them: where the work begins.
     ///
     /// # Errors
-    /// As [`capture::fitted`].
+    /// As [`prepare::fitted`].
     pub fn fitted(
         &self,
         gpu: &Gpu,
         audience: &dyn Audience,
-    ) -> Result<(crate::scene::Scene, capture::fit::Fit), capture::Error> {
-        capture::fitted(gpu, &self.request(vec![]), &mut Watched::<prepare::Bars>::new(audience))
+    ) -> Result<(crate::scene::Scene, prepare::fit::Fit), prepare::Error> {
+        prepare::fitted(gpu, &self.request(vec![]), &mut Watched::<Bars>::new(audience))
     }
 
     /// Everything. With `despite` also where doctor finds problems.
@@ -210,7 +211,7 @@ impl Job<'_> {
         audience: &dyn Audience,
     ) -> anyhow::Result<()> {
         let Places { root, scene, run, .. } = &self.places;
-        capture::prepare(gpu, &self.request(object), &mut Watched::<prepare::Bars>::new(audience))?;
+        prepare::prepare(gpu, &self.request(object), &mut Watched::<Bars>::new(audience))?;
         let (report, _) = doctor::examine(scene, None)?;
         eprint!("{}", findings::text(&report));
         audience.examined(&report);

@@ -6,10 +6,10 @@ use std::time::Instant;
 use image::{GrayImage, Luma, RgbImage};
 
 use super::{Cues, Mark, mask, next};
-use crate::capture::depth::DepthMap;
-use crate::capture::masks::{self, Votes, iou};
-use crate::capture::splats::Splats;
-use crate::capture::{self, Request, Silent};
+use crate::prepare::depth::DepthMap;
+use crate::prepare::masks::{self, Votes, iou};
+use crate::prepare::splats::Splats;
+use crate::prepare::{self, Request, Silent};
 use crate::gpu::testing;
 use crate::scene::{self, resample, synthetic};
 
@@ -92,7 +92,7 @@ struct Found {
 /// Measures on every so many-th view. `photographs` is what `prepare` takes, `out` where its fit is or goes.
 fn measure(request: &Request, truth: &Path, every: usize) -> Found {
     let gpu = testing::gpu();
-    let (scene, fit) = capture::fitted(&gpu, request, &mut Silent).expect("a fit");
+    let (scene, fit) = prepare::fitted(&gpu, request, &mut Silent).expect("a fit");
     let mut splats = Splats::new(&gpu, &fit.anchors, &fit.weights, &fit.settings.render).expect("room");
     let files = scene::pictures(&request.out.join("images")).expect("photographs");
     let truths = scene::pictures(truth).expect("masks");

@@ -8,8 +8,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use assert_cmd::cargo::cargo_bin_cmd;
-use gscream_vk::capture::doctor::{self, Severity};
-use gscream_vk::capture::{self, Evidence, Request, Step, Watch};
+use gscream_vk::prepare::doctor::{self, Severity};
+use gscream_vk::prepare::{self, Evidence, Request, Step, Watch};
 use gscream_vk::gpu::testing;
 use gscream_vk::scene::{self, Camera, Scene, synthetic};
 use image::{GrayImage, Luma, Rgb, RgbImage};
@@ -70,7 +70,7 @@ fn ious(folder: &TempDir, scene: &Path, given: &[u32]) -> Vec<f64> {
     let others = (0..VIEWS).filter(|view| !given.contains(view));
     let of = |view| {
         let carried = mask(&scene.join("masks").join(name(view) + ".png"));
-        capture::masks::iou(&carried, &mask(&truth(folder, view)))
+        prepare::masks::iou(&carried, &mask(&truth(folder, view)))
     };
     others.map(of).collect()
 }
@@ -98,10 +98,10 @@ fn one_box_becomes_a_scene() {
     // The view of which the built-in scene knows what is behind the object.
     request.reference = Some(name(given));
     let mut lines = Lines::default();
-    capture::prepare(&gpu, &request, &mut lines).expect("a scene");
+    prepare::prepare(&gpu, &request, &mut lines).expect("a scene");
 
     // The cut at the object's own edge, a line of about 100 pixels around some 800.
-    let own = capture::masks::iou(&mask(&out.join("masks").join(name(given) + ".png")), &mask(&truth(&folder, given)));
+    let own = prepare::masks::iou(&mask(&out.join("masks").join(name(given) + ".png")), &mask(&truth(&folder, given)));
     let others = ious(&folder, &out, &[given]);
     let mean = others.iter().sum::<f64>() / others.len() as f64;
     println!("the cut's IoU {own:.3}, carried {mean:.3}: {others:.3?}; {:?}", lines.0);
@@ -147,7 +147,7 @@ fn one_box_becomes_a_scene() {
     let written = |path: &str| fs::metadata(out.join(path)).and_then(|m| m.modified()).expect("a file");
     let before = written("masks/train_000.png");
     let mut lines = Lines::default();
-    capture::prepare(&gpu, &request, &mut lines).expect("the same scene");
+    prepare::prepare(&gpu, &request, &mut lines).expect("the same scene");
     let fresh = Step::ALL.map(|step| format!("{}: nothing has changed", step.name()));
     assert_eq!(lines.0, fresh);
     assert_eq!(written("masks/train_000.png"), before);
@@ -156,7 +156,7 @@ fn one_box_becomes_a_scene() {
     let corrected = out.join("masks").join(name(0) + ".png");
     fs::copy(truth(&folder, 0), &corrected).expect("a writable folder");
     request.only = vec![Step::Masks];
-    capture::prepare(&gpu, &request, &mut Lines::default()).expect("the masks alone");
+    prepare::prepare(&gpu, &request, &mut Lines::default()).expect("the masks alone");
     assert_eq!(fs::read(&corrected).expect("a mask"), fs::read(truth(&folder, 0)).expect("a mask"));
     let record = fs::read_to_string(out.join("prepare.json")).expect("a record");
     assert!(record.contains("carried from train_000, train_005"), "{record}");
@@ -166,7 +166,7 @@ fn one_box_becomes_a_scene() {
     // Priors that the user brings are the only ones; those made before go when none are wanted.
     request.only.clear();
     request.depth = false;
-    capture::prepare(&gpu, &request, &mut Lines::default()).expect("a scene without priors");
+    prepare::prepare(&gpu, &request, &mut Lines::default()).expect("a scene without priors");
     assert!(!out.join("depth").exists());
     fs::create_dir(out.join("depth")).expect("a writable folder");
     assert!(!out.join("reference").join(name(given) + "_depth.npy").exists());
@@ -174,7 +174,7 @@ fn one_box_becomes_a_scene() {
     fs::copy(folder.path().join("full/depth").join(name(3) + ".npy"), &own).expect("a writable folder");
     request.depth = true;
     let mut lines = Lines::default();
-    capture::prepare(&gpu, &request, &mut lines).expect("a scene with one prior");
+    prepare::prepare(&gpu, &request, &mut lines).expect("a scene with one prior");
     assert!(
         lines.0.iter().any(|line| line == "depth: the scene has priors of its own, none are made"),
         "{:?}",
@@ -218,7 +218,7 @@ fn cameras_of_nerfstudio_are_the_same() {
     let mut request = Request::new(&photos, folder.path().join("scene"));
     request.only = vec![Step::Poses];
     let mut lines = Lines::default();
-    capture::prepare(&testing::gpu(), &request, &mut lines).expect("poses");
+    prepare::prepare(&testing::gpu(), &request, &mut lines).expect("poses");
     assert!(lines.0.iter().any(|line| line.contains("random points")), "{:?}", lines.0);
     let scene = scene::load(&request.out, &scene::Config::default()).expect("a scene");
     assert_eq!(scene.train.len(), views.len());
@@ -249,12 +249,12 @@ fn fisheyes_of_nerfstudio_become_pinholes() {
     let mut request = Request::new(&photos, folder.path().join("scene"));
     request.only = vec![Step::Poses];
     let mut lines = Lines::default();
-    capture::prepare(&testing::gpu(), &request, &mut lines).expect("poses");
+    prepare::prepare(&testing::gpu(), &request, &mut lines).expect("poses");
     let said = "poses: 10 photographs were resampled from OPENCV_FISHEYE to pinholes";
     assert!(lines.0.iter().any(|line| line == said), "{:?}", lines.0);
     let scene = scene::load(&request.out, &scene::Config { unit: 1.0, ..Default::default() }).expect("a scene");
     let camera = full.train[0].camera;
-    let lens = capture::lens::Pinhole::of(scene::colmap::Lens {
+    let lens = prepare::lens::Pinhole::of(scene::colmap::Lens {
         model: "OPENCV_FISHEYE",
         focal: camera.focal.map(f64::from),
         principal: camera.principal.map(f64::from),
@@ -269,7 +269,7 @@ fn fisheyes_of_nerfstudio_become_pinholes() {
     }
     json["camera_model"] = "EQUIRECTANGULAR".into();
     fs::write(photos.join("transforms.json"), json.to_string()).expect("a writable folder");
-    let refused = capture::prepare(&testing::gpu(), &request, &mut Lines::default()).expect_err("no lens").to_string();
+    let refused = prepare::prepare(&testing::gpu(), &request, &mut Lines::default()).expect_err("no lens").to_string();
     assert!(refused.contains("camera_model is EQUIRECTANGULAR; undistort the photographs"), "{refused}");
 }
 
@@ -286,7 +286,7 @@ fn prepared_with_masks(of: impl Fn(u32, &GrayImage) -> GrayImage) -> (TempDir, V
     let mut request = Request::new(folder.path().join("photos"), folder.path().join("scene"));
     (request.fit_steps, request.fit_side, request.depth) = (30, 56, false);
     let mut lines = Lines::default();
-    capture::prepare(&testing::gpu(), &request, &mut lines).expect("a scene");
+    prepare::prepare(&testing::gpu(), &request, &mut lines).expect("a scene");
     (folder, lines.0)
 }
 
@@ -351,14 +351,14 @@ fn fisheyes_become_pinholes() {
     let mut request = Request::new(&photos, folder.path().join("scene"));
     request.only = vec![Step::Poses];
     let mut lines = Lines::default();
-    capture::prepare(&testing::gpu(), &request, &mut lines).expect("poses");
+    prepare::prepare(&testing::gpu(), &request, &mut lines).expect("poses");
     let said = "poses: 1 photographs were resampled from OPENCV_FISHEYE to pinholes";
     assert!(lines.0.iter().any(|line| line == said), "{:?}", lines.0);
     let scene = scene::load(&request.out, &scene::Config { unit: 1.0, ..Default::default() }).expect("a scene");
     let original =
         scene::load(&folder.path().join("full"), &scene::Config { unit: 1.0, ..Default::default() }).expect("a scene");
     assert_eq!(scene.train.len(), VIEWS as usize);
-    let lens = capture::lens::Pinhole::of(scene::colmap::Lens {
+    let lens = prepare::lens::Pinhole::of(scene::colmap::Lens {
         model: "OPENCV_FISHEYE",
         focal: [fx, fy].map(f64::from),
         principal: [cx, cy].map(f64::from),
@@ -380,7 +380,7 @@ fn fisheyes_become_pinholes() {
     }
     // In its own folder the photographs would be written over.
     request.out = photos;
-    let refused = capture::prepare(&testing::gpu(), &request, &mut Lines::default()).expect_err("in place").to_string();
+    let refused = prepare::prepare(&testing::gpu(), &request, &mut Lines::default()).expect_err("in place").to_string();
     assert!(refused.contains("make the scene in another folder"), "{refused}");
 }
 
@@ -445,7 +445,7 @@ fn strokes_count_within_the_box() {
     let beyond =
         cut.enumerate_pixels().filter(|(x, y, v)| v.0[0] != 0 && !((x0..x1).contains(x) && (y0..y1).contains(y)));
     assert_eq!(beyond.count(), 0, "pixels beyond the box");
-    assert!(capture::masks::iou(&cut, &object) > 0.8);
+    assert!(prepare::masks::iou(&cut, &object) > 0.8);
     let record = fs::read_to_string(folder.path().join("scene/prepare.json")).expect("a record");
     assert!(record.contains(&format!("--strokes strokes.png within --box {x0},{y0},{x1},{y1}")), "{record}");
 }
