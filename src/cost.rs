@@ -1,4 +1,4 @@
-//! What a pass has to do, as the file of its kernel declares it or the table in [`crate::bench::cost`].
+//! What a pass has to do, as the file of its kernel declares it or the table in [`crate::lab::bench::cost`].
 
 use serde::{Deserialize, Serialize};
 

@@ -5,7 +5,8 @@
 //! compare with the photograph in [`losses`], walk back, and let the [`optimizer`] and [`densify`] change the model.
 //! [`multiview`] finds points where the capture has none, [`evaluate`] measures the result, [`export`] bakes it into
 //! static Gaussians for any viewer, [`view`] shows them in the browser, [`compose`] makes scenes whose truth is known,
-//! [`remove`] is the page to point at an object in.
+//! [`prepare`] makes a scene of photographs and one mask, [`remove`] is the page to point at an object in, and [`lab`] holds
+//! the instruments: speed, error against run time.
 //! Kernels live in `glsl/`, mirrored by path and stem in `src/`; each has a CPU twin in float64 beside the code that
 //! dispatches it. [`gpu`] is the only place that knows Vulkan; [`primitives`] are sorts, scans and sums that know nothing of
 //! splats. [`cli`] has one file per command.
@@ -35,7 +36,6 @@
 mod print;
 
 pub mod atomic;
-pub mod bench;
 pub mod cli;
 pub mod compose;
 pub mod config;
@@ -45,6 +45,7 @@ pub mod evaluate;
 pub mod export;
 pub mod folder;
 pub mod gpu;
+pub mod lab;
 pub mod losses;
 pub mod math;
 pub mod model;
@@ -54,7 +55,6 @@ pub mod prepare;
 pub mod primitives;
 pub mod remove;
 pub mod render;
-pub mod report;
 pub mod scene;
 mod sentence;
 #[cfg(test)]

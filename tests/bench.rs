@@ -63,7 +63,7 @@ fn a_step_is_measured_and_compared() {
     let passes = step["passes"].as_array().expect("passes");
     for pass in passes {
         let name = pass["pass"].as_str().expect("a name");
-        assert!(pass["work"].is_object(), "{name} has no formula in src/bench/cost.rs");
+        assert!(pass["work"].is_object(), "{name} has no formula in src/lab/bench/cost.rs");
         let (floor, ratio) = (number(&pass["floor"]), number(&pass["ratio"]));
         let ms = number(&pass["milliseconds"]["median"]);
         assert!(floor > 0.0 && (ratio - ms / floor).abs() < 1e-9 * ratio, "{pass}");

@@ -4,10 +4,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use glam::{DVec3, dvec3};
-use gscream_vk::prepare::doctor;
 use gscream_vk::compose::{self, Drawn, Kind, Object, Placed, Request, Stand};
 use gscream_vk::gpu::testing;
 use gscream_vk::multiview::DepthGrid;
+use gscream_vk::scene::doctor;
 use gscream_vk::scene::{self, Scene, View, synthetic};
 use tempfile::TempDir;
 

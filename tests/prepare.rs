@@ -8,9 +8,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use assert_cmd::cargo::cargo_bin_cmd;
-use gscream_vk::prepare::doctor::{self, Severity};
-use gscream_vk::prepare::{self, Evidence, Request, Step, Watch};
 use gscream_vk::gpu::testing;
+use gscream_vk::prepare::{self, Evidence, Request, Step, Watch};
+use gscream_vk::scene::doctor::{self, Severity};
 use gscream_vk::scene::{self, Camera, Scene, synthetic};
 use image::{GrayImage, Luma, Rgb, RgbImage};
 use skip::{Lack, skip};
@@ -70,7 +70,7 @@ fn ious(folder: &TempDir, scene: &Path, given: &[u32]) -> Vec<f64> {
     let others = (0..VIEWS).filter(|view| !given.contains(view));
     let of = |view| {
         let carried = mask(&scene.join("masks").join(name(view) + ".png"));
-        prepare::masks::iou(&carried, &mask(&truth(folder, view)))
+        scene::doctor::iou(&carried, &mask(&truth(folder, view)))
     };
     others.map(of).collect()
 }
@@ -101,7 +101,7 @@ fn one_box_becomes_a_scene() {
     prepare::prepare(&gpu, &request, &mut lines).expect("a scene");
 
     // The cut at the object's own edge, a line of about 100 pixels around some 800.
-    let own = prepare::masks::iou(&mask(&out.join("masks").join(name(given) + ".png")), &mask(&truth(&folder, given)));
+    let own = scene::doctor::iou(&mask(&out.join("masks").join(name(given) + ".png")), &mask(&truth(&folder, given)));
     let others = ious(&folder, &out, &[given]);
     let mean = others.iter().sum::<f64>() / others.len() as f64;
     println!("the cut's IoU {own:.3}, carried {mean:.3}: {others:.3?}; {:?}", lines.0);
@@ -445,7 +445,7 @@ fn strokes_count_within_the_box() {
     let beyond =
         cut.enumerate_pixels().filter(|(x, y, v)| v.0[0] != 0 && !((x0..x1).contains(x) && (y0..y1).contains(y)));
     assert_eq!(beyond.count(), 0, "pixels beyond the box");
-    assert!(prepare::masks::iou(&cut, &object) > 0.8);
+    assert!(scene::doctor::iou(&cut, &object) > 0.8);
     let record = fs::read_to_string(folder.path().join("scene/prepare.json")).expect("a record");
     assert!(record.contains(&format!("--strokes strokes.png within --box {x0},{y0},{x1},{y1}")), "{record}");
 }

@@ -19,8 +19,8 @@ use crate::config::{Settings, SettingsArgs};
 use crate::evaluate::{Judge, Mean, Metrics, PUBLISHED_ROWS, Published, Region, decibel};
 use crate::folder::{self, Lock};
 use crate::gpu::Gpu;
-use crate::report::pace::Pace;
-use crate::report::statistics::{Moments, Paired};
+use crate::lab::pace::Pace;
+use crate::lab::statistics::{Moments, Paired};
 use crate::scene::Scene;
 
 /// Train scenes with and without each part of the method, and compare (the ablation of the paper)

@@ -7,13 +7,14 @@ use anyhow::{Context as _, bail};
 use super::next;
 use super::report::{command_line, last_part};
 use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, add_dense, load_scene, only_anchors, with_gpu};
-use crate::bench::ceilings::Prober;
-use crate::bench::compare::{self, Subject};
-use crate::bench::{self, Device, Record, Trained, figures, loads, predict, tables, text};
 use crate::config::SettingsArgs;
 use crate::gpu::Options;
-use crate::report::tables::write;
-use crate::report::{SceneFacts, plots};
+use crate::lab::bench::ceilings::Prober;
+use crate::lab::bench::compare::{self, Subject};
+use crate::lab::bench::{self, Device, Record, Trained, figures, loads, predict, tables, text};
+use crate::lab::plots;
+use crate::lab::report::SceneFacts;
+use crate::lab::report::tables::write;
 use crate::train::plan::Plan;
 
 /// Measure every pass of a step against the time it would take at the device's own ceilings

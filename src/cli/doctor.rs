@@ -5,9 +5,10 @@ use crate::atomic::AtomicWriteFile;
 use anyhow::{Context as _, bail};
 
 use super::{next, pictures};
-use crate::prepare::doctor::{self, Report, Severity};
+use crate::prepare::record;
 use crate::prepare::reference::PROVENANCE;
-use crate::prepare::sheet;
+use crate::scene::doctor::{self, Report, Severity};
+use crate::scene::{Scene, sheet};
 
 /// Look over a scene before training: masks, names, sizes, poses, depth, reference, exposure
 ///
@@ -37,7 +38,7 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
-    let (report, scene) = doctor::examine(&args.scene, args.masks.as_deref())?;
+    let (report, scene) = examined(&args.scene, args.masks.as_deref())?;
     if args.json {
         println!("{}", serde_json::to_string_pretty(&report)?);
     } else {
@@ -62,6 +63,15 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         1 => bail!("{}: 1 problem", args.scene.display()),
         count => bail!("{}: {count} problems", args.scene.display()),
     }
+}
+
+/// What [`doctor::examine`] finds, and what `prepare` noted when it made the scene.
+pub(super) fn examined(folder: &Path, masks: Option<&Path>) -> anyhow::Result<(Report, Option<Scene>)> {
+    let (mut report, scene) = doctor::examine(folder, masks)?;
+    if scene.is_some() {
+        record::notes(folder).into_iter().for_each(|note| report.add(Severity::Note, "prepare", None, note));
+    }
+    Ok((report, scene))
 }
 
 /// The findings as lines, the worst first.

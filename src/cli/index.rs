@@ -14,9 +14,9 @@ use super::folders::{Record, SETTINGS, TEST};
 use super::report::last_part;
 use super::{next, pictures};
 use crate::export;
-use crate::report::pace::duration;
-use crate::report::page::STYLE;
-use crate::report::plots::{self, Axis, Figure, Mark, Panel, Scale, Series};
+use crate::lab::pace::duration;
+use crate::lab::plots::{self, Axis, Figure, Mark, Panel, Scale, Series};
+use crate::lab::report::page::STYLE;
 use crate::scene::Scene;
 use crate::train::run::LOG;
 

@@ -9,10 +9,11 @@ use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, add_dense, load_scene, o
 use super::train::default_folder;
 use crate::config::Settings;
 use crate::gpu::{Gpu, Options};
-use crate::report::page::{self, Drawings};
-use crate::report::training::Spacing;
-use crate::report::variants::{self, Variant};
-use crate::report::{Report, SceneFacts, figures, kernels, plots, tables, training};
+use crate::lab::plots;
+use crate::lab::report::page::{self, Drawings};
+use crate::lab::report::training::Spacing;
+use crate::lab::report::{Report, SceneFacts, figures, kernels, tables, training};
+use crate::lab::variants::{self, Variant};
 use crate::scene::Scene;
 
 /// Measure error against run time, of a step's stages and of whole training runs, for a table of choices
@@ -95,7 +96,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         }
     }
     if !args.kernels_only && scene.test.is_empty() {
-        return Err(crate::report::Error::NoTestViews.into());
+        return Err(crate::lab::report::Error::NoTestViews.into());
     }
     std::fs::create_dir_all(&out).with_context(|| format!("{}: cannot be made", out.display()))?;
 

@@ -60,7 +60,7 @@ pub struct Config {
 #[serde(deny_unknown_fields, default, expecting = "a table")]
 pub struct Attention {
     /// Whether attention is trained and applied at all (GScream: true). Off: over five seeds it moved no figure, and a step
-    /// takes longer with it (`src/report/README.md`).
+    /// takes longer with it (`src/lab/report/README.md`).
     pub enabled: bool,
     /// First step with attention (GScream: 15,000).
     pub start: u32,

@@ -8,7 +8,8 @@ use rayon::prelude::*;
 
 use super::record::Batch;
 use super::splats::Splats;
-use super::{Error, Watch, doctor, network};
+use super::{Error, Watch, network};
+use crate::scene::doctor;
 use crate::scene::{self, Camera, Prior, PriorKind, Scene, resample};
 
 /// A pixel less covered than this has no depth.

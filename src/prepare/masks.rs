@@ -221,16 +221,6 @@ pub fn without_specks(mask: &GrayImage, share: f64) -> GrayImage {
     GrayImage::from_raw(mask.width(), mask.height(), raw).expect("a value per pixel")
 }
 
-/// Intersection over union of two masks of one size; 1 if both are empty.
-pub fn iou(a: &GrayImage, b: &GrayImage) -> f64 {
-    let (mut both, mut any) = (0u64, 0u64);
-    for (a, b) in a.as_raw().iter().zip(b.as_raw()) {
-        both += u64::from(*a != 0 && *b != 0);
-        any += u64::from(*a != 0 || *b != 0);
-    }
-    if any == 0 { 1.0 } else { both as f64 / any as f64 }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -238,14 +228,6 @@ mod tests {
     fn mask(rows: &[&str]) -> GrayImage {
         let (w, h) = (rows[0].len() as u32, rows.len() as u32);
         GrayImage::from_fn(w, h, |x, y| Luma([if rows[y as usize].as_bytes()[x as usize] == b'#' { 255 } else { 0 }]))
-    }
-
-    #[test]
-    fn overlap() {
-        let (a, b) = (mask(&["##.", "##."]), mask(&[".##", ".##"]));
-        assert_eq!(iou(&a, &b), 2.0 / 6.0);
-        assert_eq!((iou(&a, &a), iou(&a, &mask(&["...", "..."]))), (1.0, 0.0));
-        assert_eq!(iou(&mask(&["..."]), &mask(&["..."])), 1.0);
     }
 
     #[test]

@@ -2,7 +2,6 @@
 
 pub mod click;
 pub mod depth;
-pub mod doctor;
 pub mod fit;
 pub mod graph_cut;
 pub mod lens;
@@ -14,7 +13,6 @@ pub mod poses;
 mod program;
 pub mod record;
 pub mod reference;
-pub mod sheet;
 pub mod splats;
 
 use std::collections::BTreeMap;

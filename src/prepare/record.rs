@@ -14,7 +14,7 @@ use image::{GrayImage, ImageFormat, RgbImage};
 use serde::{Deserialize, Serialize};
 use tempfile::TempDir;
 
-use super::Error;
+use super::{Error, Step};
 use crate::folder;
 
 /// The record's file within a prepared scene.
@@ -184,6 +184,17 @@ impl Batch {
 pub struct Folder {
     root: PathBuf,
     record: Record,
+}
+
+/// The lines that the steps of `prepare` left about a scene: where its reference comes from, among others. Empty for a
+/// scene that `prepare` did not make.
+pub fn notes(scene: &Path) -> Vec<String> {
+    if !scene.join(RECORD).is_file() {
+        return vec![];
+    }
+    let Ok(folder) = Folder::open(scene) else { return vec![] };
+    let steps = Step::ALL.iter().filter_map(|step| folder.record().steps.get(step.name()));
+    steps.flat_map(|step| step.notes.clone()).collect()
 }
 
 impl Folder {

@@ -5,7 +5,7 @@ use image::{Luma, Rgb};
 use serde_json::{Value, json};
 
 use super::*;
-use crate::prepare::masks::iou;
+use crate::scene::doctor::iou;
 use crate::view::server;
 
 const SIZE: [u32; 2] = [160, 120];

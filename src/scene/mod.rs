@@ -23,6 +23,7 @@ mod camera;
 pub mod colmap;
 mod condition;
 mod config;
+pub mod doctor;
 mod error;
 mod layout;
 mod note;
@@ -32,6 +33,7 @@ mod picture;
 mod priors;
 pub(crate) mod resample;
 pub mod room360;
+pub mod sheet;
 mod strays;
 pub mod synthetic;
 

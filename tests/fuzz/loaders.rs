@@ -3,14 +3,14 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use gscream_vk::prepare::graph_cut::Strokes;
-use gscream_vk::prepare::lens::Pinhole;
-use gscream_vk::prepare::{Silent, doctor, poses, record};
 use gscream_vk::config::{Settings, Source};
 use gscream_vk::evaluate::network::Weights;
 use gscream_vk::export::{gltf, ply, spz};
 use gscream_vk::gpu::testing;
 use gscream_vk::model::{files, init};
+use gscream_vk::prepare::graph_cut::Strokes;
+use gscream_vk::prepare::lens::Pinhole;
+use gscream_vk::prepare::{Silent, poses, record};
 use gscream_vk::scene::{self, PriorKind, colmap};
 use gscream_vk::train::checkpoint::{self, History, Model, Owner, State};
 use gscream_vk::train::plan::Plan;
@@ -69,7 +69,7 @@ fn colmap_binary() {
 
 fn whole(folder: &Path) -> Result<(), scene::Error> {
     let config = scene::Config { test_every: 2, ..scene::Config::default() };
-    scene::load(folder, &config).map(|scene| drop(doctor::look(&scene)))
+    scene::load(folder, &config).map(|scene| drop(scene::doctor::look(&scene)))
 }
 
 #[test]

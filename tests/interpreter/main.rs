@@ -156,10 +156,10 @@ fn kernels_do_on_any_device_what_their_twins_do() {
 /// Kernels that no such training runs. Their own tests hold them against their twins on a device.
 const ELSEWHERE: [&str; 14] = [
     // They measure a device, and nothing reads what they write.
-    "bench/ceilings_copy",
-    "bench/ceilings_empty",
-    "bench/ceilings_exp",
-    "bench/ceilings_fma",
+    "lab/bench/ceilings_copy",
+    "lab/bench/ceilings_empty",
+    "lab/bench/ceilings_exp",
+    "lab/bench/ceilings_fma",
     // `export` and pictures larger than the training's.
     "render/activate",
     "render/activate_backward",

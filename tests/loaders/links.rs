@@ -3,8 +3,9 @@
 use std::fs;
 use std::path::Path;
 
-use gscream_vk::prepare::{self, Request, Silent, Step, Watch};
 use gscream_vk::gpu::testing;
+use gscream_vk::prepare::{self, Request, Silent, Step, Watch};
+use gscream_vk::scene::doctor;
 use serde_json::json;
 
 use crate::support::{VIEWS, copy, load, scene};
@@ -29,12 +30,9 @@ fn a_link_that_points_up_multiplies_nothing() {
         let says = format!("{} is not looked into: it leads to ", at.join(link).display());
         assert!(scene.notes.iter().any(|note| note.starts_with(&says)), "{:?}", scene.notes);
     }
-    let (report, _) = prepare::doctor::examine(&at, None).expect("a folder");
+    let (report, _) = doctor::examine(&at, None).expect("a folder");
     let named = report.findings.iter().filter(|finding| finding.message.contains("is not looked into"));
-    assert!(
-        named.clone().count() == 3
-            && named.clone().all(|finding| finding.severity == prepare::doctor::Severity::Problem)
-    );
+    assert!(named.clone().count() == 3 && named.clone().all(|finding| finding.severity == doctor::Severity::Problem));
 }
 
 /// A link to photographs elsewhere is read, once: of two to one folder the first by name counts, and a real folder

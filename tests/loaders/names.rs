@@ -5,8 +5,8 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use assert_cmd::cargo::cargo_bin;
-use gscream_vk::prepare::{self, Request, Silent};
 use gscream_vk::gpu::testing;
+use gscream_vk::prepare::{self, Request, Silent};
 use gscream_vk::scene::synthetic;
 
 use crate::support::{SIZE, copy, load};

@@ -10,10 +10,10 @@ use anyhow::Context as _;
 use super::prepare::ObjectArgs;
 use super::shared::DeviceArgs;
 use super::{next, signals, train};
-use crate::prepare::poses;
 use crate::config::SettingsArgs;
 use crate::export;
 use crate::folder::Lock;
+use crate::prepare::poses;
 use crate::remove::objects;
 use work::{Job, Places};
 

@@ -11,18 +11,18 @@ use serde::{Deserialize, Serialize};
 
 use super::Args;
 use crate::atomic::AtomicWriteFile;
-use crate::prepare::doctor::{self, Report};
-use crate::prepare::record::{self, Inputs};
-use crate::prepare::{self, Evidence, Request, Step, Watch};
 use crate::cli::folders::{MODEL, Record as RunRecord};
+use crate::cli::prepare::Bars;
 use crate::cli::shared::{SceneArgs, add_dense};
 use crate::cli::train::{self, Manner, Stop, Trained};
-use crate::cli::prepare::Bars;
 use crate::cli::{doctor as findings, export, minutes, preset};
 use crate::evaluate::Judge;
 use crate::export::{Observer, Options};
 use crate::gpu::Gpu;
 use crate::model::files::{POINT_CLOUD, WEIGHTS};
+use crate::prepare::record::{self, Inputs};
+use crate::prepare::{self, Evidence, Request, Step, Watch};
+use crate::scene::doctor::Report;
 use crate::train::checkpoint::{self, Fingerprint};
 use crate::train::run::Signal;
 use crate::view::live::Board;
@@ -212,7 +212,7 @@ impl Job<'_> {
     ) -> anyhow::Result<()> {
         let Places { root, scene, run, .. } = &self.places;
         prepare::prepare(gpu, &self.request(object), &mut Watched::<Bars>::new(audience))?;
-        let (report, _) = doctor::examine(scene, None)?;
+        let (report, _) = findings::examined(scene, None)?;
         eprint!("{}", findings::text(&report));
         audience.examined(&report);
         match report.problems() {

@@ -6,11 +6,12 @@ use std::time::Instant;
 use image::{GrayImage, Luma, RgbImage};
 
 use super::{Cues, Mark, mask, next};
+use crate::gpu::testing;
 use crate::prepare::depth::DepthMap;
-use crate::prepare::masks::{self, Votes, iou};
+use crate::prepare::masks::{self, Votes};
 use crate::prepare::splats::Splats;
 use crate::prepare::{self, Request, Silent};
-use crate::gpu::testing;
+use crate::scene::doctor::iou;
 use crate::scene::{self, resample, synthetic};
 
 /// The middle of the largest part of a mask: the pixel that is farthest from its rim.

@@ -1,0 +1,11 @@
+//! The instruments: how fast a step is, how near its arithmetic is to float64, and what its parts are worth.
+//!
+//! [`bench`] times and predicts passes and steps. [`report`] holds error against run time. A training needs none of them.
+
+pub mod bench;
+pub mod pace;
+pub mod pareto;
+pub mod plots;
+pub mod report;
+pub mod statistics;
+pub mod variants;
