@@ -182,11 +182,12 @@ struct Figure(#[serde(with = "decibel")] f64);
 /// A column: the figure's name in JSON, its title, digits.
 type Column = (&'static str, &'static str, usize);
 
-const COLUMNS: [Column; 22] = [
+const COLUMNS: [Column; 23] = [
     ("psnr", "PSNR", 2),
     ("masked_psnr", "masked PSNR", 2),
     ("ssim", "SSIM", 4),
     ("masked_ssim", "masked SSIM", 4),
+    ("fitted_psnr", "PSNR, exposure fitted", 2),
     ("flip", "FLIP", 4),
     ("masked_flip", "masked FLIP", 4),
     ("outside_seen_psnr", "outside, seen: PSNR", 2),
@@ -247,6 +248,7 @@ fn figures(mean: &Mean) -> BTreeMap<&'static str, f64> {
         ("masked_psnr", mask.map(|m| m.psnr)),
         ("ssim", Some(metrics.full.ssim)),
         ("masked_ssim", mask.map(|m| m.ssim)),
+        ("fitted_psnr", metrics.fitted.map(|m| m.psnr)),
         ("flip", Some(metrics.full.flip)),
         ("masked_flip", mask.map(|m| m.flip)),
         ("outside_seen_psnr", seen.map(|m| m.psnr)),

@@ -9,7 +9,7 @@ use super::shared::{self, DeviceArgs};
 use super::{instruments, next};
 use crate::evaluate::fid::Inception;
 use crate::evaluate::lpips::Lpips;
-use crate::evaluate::{Judge, Judging, Protocol, Report};
+use crate::evaluate::{Judge, Judging, Metrics, Protocol, Report};
 use crate::scene::{self, Scene};
 
 /// Measure rendered views against photographs: PSNR, SSIM and FLIP, and LPIPS and FID with your weights
@@ -153,7 +153,8 @@ fn of_run(args: &Args, judge: &Judge) -> anyhow::Result<Report> {
             .ok_or_else(|| anyhow!("{}: test view {} is missing", renders.display(), view.name))?;
         let map = super::pictures::path(&maps, &view.name, "png");
         let map = map.is_file().then(|| scene::mask(&map, 1)).transpose()?;
-        add(&mut judging, &view.name, path, &view.image, view.mask.as_ref(), map.as_ref())?;
+        let (render, metrics) = add(&mut judging, &view.name, path, &view.image, view.mask.as_ref(), map.as_ref())?;
+        metrics.fitted = instruments::fitted(&scene, view, &render)?;
     }
     Ok(judging.report())
 }
@@ -229,21 +230,21 @@ fn of_folders(args: &Args, judge: &Judge, truth: &Path) -> anyhow::Result<Report
     Ok(judging.report())
 }
 
-fn add(
-    judging: &mut Judging<'_>,
+fn add<'a>(
+    judging: &'a mut Judging<'_>,
     name: &str,
     render: &Path,
     truth: &RgbImage,
     mask: Option<&GrayImage>,
     seen: Option<&GrayImage>,
-) -> anyhow::Result<()> {
+) -> anyhow::Result<(RgbImage, &'a mut Metrics)> {
     let image = scene::photograph(render, 1)?;
-    judging.add(name, &image, truth, mask, seen).map_err(|error| {
+    let metrics = judging.add(name, &image, truth, mask, seen).map_err(|error| {
         let reduced = image.dimensions() < truth.dimensions();
         let hint = if reduced { "; --downscale N reduces photographs and masks" } else { "" };
         anyhow!("{}: {error}{hint}", render.display())
     })?;
-    Ok(())
+    Ok((image, metrics))
 }
 
 /// The pictures below a folder by their path without extension.

@@ -7,7 +7,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{index, pictures};
 use crate::config::Settings;
-use crate::evaluate::{Judge, Report, Residue, Shown, Surface, hole, seen_map};
+use crate::evaluate::{self, Figures, Judge, Report, Residue, Shown, Surface, hole, seen_map};
 use crate::gpu::Gpu;
 use crate::model::stored::Stored;
 use crate::render::view::{Rendered, Renderer};
@@ -94,6 +94,7 @@ pub(super) fn measure(
         go_on()?;
         let map = seen_map(drawn.shown(view), &shown);
         let metrics = judging.add(&view.name, &drawn.picture, &view.image, view.mask.as_ref(), Some(&map))?;
+        metrics.fitted = fitted(scene, view, &drawn.picture)?;
         if let (Some(depth), Some(mask)) = (&view.depth, &view.mask) {
             let depth: Vec<f32> = depth.iter().map(|z| z * factor.unwrap_or(1.0) as f32).collect();
             metrics.geometry = hole::geometry(&drawn.surface, &depth, mask);
@@ -105,6 +106,15 @@ pub(super) fn measure(
     report.depth_factor = factor;
     let shown = index::chosen(scene).into_iter().map(|at| (at, train[at].picture.clone())).collect();
     Ok(Measured { report, seen, shown })
+}
+
+/// A test view's figures without its own exposure, where the train views' was evened out.
+///
+/// # Errors
+/// Pictures that cannot be compared.
+pub(super) fn fitted(scene: &Scene, view: &View, drawn: &RgbImage) -> Result<Option<Figures>, evaluate::Error> {
+    let fit = || evaluate::with_fitted_exposure(drawn, &view.image, view.mask.as_ref());
+    (!scene.gains.is_empty()).then(fit).transpose()
 }
 
 /// Of every train view that shows the object, against the first reference's picture as the view would show it.

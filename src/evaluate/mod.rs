@@ -8,6 +8,7 @@
 //! What a photograph without the object does not tell is measured in [`hole`]: the geometry behind the object, and how
 //! much of the object is left.
 
+mod exposure;
 pub mod fid;
 pub mod hole;
 pub mod lpips;
@@ -22,6 +23,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::scene::resample;
 
+pub use exposure::with_fitted_exposure;
 pub use hole::Geometry;
 pub use lpips::Perceptual;
 pub use protocol::{Judge, Judging, PUBLISHED_ROWS, Protocol, Published};
@@ -117,6 +119,10 @@ pub struct Metrics {
     /// Share of all pixels that some train view photographed.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub seen_share: Option<f64>,
+    /// All pixels, after a gain and an offset per channel were fitted to the photograph outside the mask; where the
+    /// photographs' exposure was evened out for training.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub fitted: Option<Figures>,
     /// Depth inside the mask, where the true one is known.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub geometry: Option<Geometry>,
@@ -171,6 +177,7 @@ impl Metrics {
             outside_seen: None,
             rim_seen: None,
             seen_share: None,
+            fitted: None,
             geometry: None,
             lpips: None,
         }

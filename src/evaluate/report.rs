@@ -171,6 +171,10 @@ impl Report {
                 write(format_args!("seen: photographed by some train view, past its mask, by the trained depth\n"));
             }
         }
+        if let Some(Figures { psnr, ssim, flip }) = metrics.fitted {
+            let by = "with each test view's own exposure (gain and offset per channel) fitted";
+            write(format_args!("{by}: PSNR {psnr:.2}, SSIM {ssim:.4}, FLIP {flip:.4}\n"));
+        }
         let distances: Vec<(&str, Distance)> = metrics.lpips.iter().flat_map(named).collect();
         if !distances.is_empty() || fid.is_some() {
             write(format_args!(
@@ -238,6 +242,7 @@ fn mean_metrics(views: &[ViewMetrics]) -> Metrics {
     let geometry: Vec<Geometry> = views.iter().filter_map(|view| view.metrics.geometry).collect();
     metrics.lpips = mean_perceptual(&views.iter().filter_map(|view| view.metrics.lpips).collect::<Vec<_>>());
     metrics.seen_share = mean_of(views.iter().filter_map(|view| view.metrics.seen_share));
+    metrics.fitted = mean(&views.iter().filter_map(|view| view.metrics.fitted).collect::<Vec<_>>());
     metrics.geometry = mean_of(geometry.iter().map(|g| g.completeness)).map(|completeness| Geometry {
         relative_error: mean_of(geometry.iter().filter_map(|g| g.relative_error)),
         completeness,

@@ -28,6 +28,9 @@ pub struct Config {
     /// Length of the model's that counts as one wherever a setting means a length; 0 takes a third of the median depth of
     /// the points, so that the unit of the capture changes nothing (GScream: 1).
     pub unit: f64,
+    /// Divide each photograph by its exposure and white balance over the others', by what they show of the same points, where
+    /// these differ (GScream: off).
+    pub even_exposures: bool,
     /// Leave out points that fall into the mask in more than this share of the views that have them in the picture: they
     /// stand on the object. 1 keeps all (GScream).
     pub object_point_share: f64,
@@ -118,6 +121,7 @@ impl Default for Config {
             priors: true,
             reference: true,
             unit: 0.0,
+            even_exposures: true,
             object_point_share: 0.9,
             check_priors: true,
             guess_reference_prior: true,

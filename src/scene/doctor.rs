@@ -1,6 +1,5 @@
 //! Is a scene right? Checks that cost seconds and find what costs days.
 
-mod exposure;
 mod geometry;
 
 use std::path::Path;
@@ -172,8 +171,8 @@ fn weigh(note: &Note) -> (Severity, &'static str) {
 fn examine_scene(scene: &Scene, report: &mut Report) {
     report.views = scene.train.par_iter().map(|view| figures(scene, view)).collect();
     geometry::look(scene, report);
-    for (figures, exposure) in report.views.iter_mut().zip(exposure::exposures(scene)) {
-        figures.exposure = exposure;
+    for (figures, exposure) in report.views.iter_mut().zip(super::exposure::exposures(scene)) {
+        figures.exposure = exposure.map(|exposure| exposure.luminance);
     }
     mask_findings(scene, report);
     depth_findings(scene, report);
@@ -214,7 +213,7 @@ fn seen(scene: &Scene, camera: &Camera) -> Vec<Seen> {
     nearest.into_iter().flatten().collect()
 }
 
-fn median(values: &mut [f64]) -> Option<f64> {
+pub(super) fn median(values: &mut [f64]) -> Option<f64> {
     values.sort_unstable_by(f64::total_cmp);
     values.get(values.len() / 2).copied()
 }
@@ -484,14 +483,14 @@ fn exposure_findings(report: &mut Report) {
     let worst = off.iter().max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()));
     if let Some((name, by)) = worst {
         let message = format!(
-            "{} of {} photographs show the same points brighter or darker by more than {:.0} % (most: {name}, {:+.0} %); a fixed \
-             exposure trains better",
+            "{} of {} photographs show the same points brighter or darker by more than {:.0} % (most: {name}, {:+.0} %); \
+             training evens them out (scene.even_exposures), and a fixed exposure is better still",
             off.len(),
             all.len(),
             100.0 * DRIFT,
             100.0 * by
         );
-        report.add(Severity::Problem, "exposure", None, message);
+        report.add(Severity::Note, "exposure", None, message);
     }
 }
 

@@ -25,6 +25,7 @@ mod condition;
 mod config;
 pub mod doctor;
 mod error;
+mod exposure;
 mod layout;
 mod note;
 mod npy;
@@ -119,6 +120,9 @@ pub struct Scene {
     pub radius: f32,
     /// Lengths of the model's per world unit of this scene: 1 as read, see [`condition`].
     pub unit: f64,
+    /// `[train view]` red, green and blue of its photograph over the usual ones, divided out by [`condition`]; empty where
+    /// the photographs were left as they are.
+    pub gains: Vec<[f64; 3]>,
     /// One line each: the layout found, scales worked out, what is absent and what follows.
     pub notes: Notes,
 }
@@ -305,7 +309,17 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     if radius.is_none() {
         notes.push("all train cameras stand at one place: the scene radius is taken as 1");
     }
-    Ok(Scene { train, test, references, points, dense: vec![], radius: radius.unwrap_or(1.0), unit: 1.0, notes })
+    Ok(Scene {
+        train,
+        test,
+        references,
+        points,
+        dense: vec![],
+        radius: radius.unwrap_or(1.0),
+        unit: 1.0,
+        gains: vec![],
+        notes,
+    })
 }
 
 impl View {

@@ -481,6 +481,7 @@ fn resized(scene: &Scene, from: u32, to: u32) -> Scene {
         references: references.collect(),
         points: scene.points.clone(),
         dense: scene.dense.clone(),
+        gains: scene.gains.clone(),
         radius: scene.radius,
         unit: scene.unit,
         notes: Notes::default(),

@@ -168,6 +168,7 @@ impl Load {
             references: vec![Reference { view: 0, image, prior: Some(prior), truth: false }],
             points: vec![crate::scene::Point { position: [0.0, 0.0, 3.0], color: [0; 3] }],
             dense: vec![],
+            gains: vec![],
             radius: 1.0,
             unit: 1.0,
             notes: Notes::default(),

@@ -2,6 +2,7 @@
 //! is made.
 //!
 //! - [`unit`]: lengths are counted in a unit that the scene itself gives, so that the user's unit changes nothing.
+//! - [`exposure`]: photographs that are brighter, darker or of another tint than the others are brought to the same exposure.
 //! - [`sparse`]: each prior is held against the points of the sparse model. One that does not follow them is not used, and
 //!   disparity becomes depth.
 //! - [`rim`]: masks grow, if asked for, by what the inpainted picture was repainted beyond them, and fall off around the object.
@@ -22,7 +23,7 @@ mod sparse;
 mod stereo;
 mod unit;
 
-use super::{Config, STEREO_PRIOR, Scene};
+use super::{Config, STEREO_PRIOR, Scene, exposure};
 
 pub(crate) use points::on_object;
 pub(crate) use sparse::samples;
@@ -31,6 +32,9 @@ pub use unit::footprint;
 /// Makes a scene that was read ready for training, and adds what was done to its notes.
 pub fn condition(scene: &mut Scene, config: &Config) {
     unit::normalize(scene, config.unit);
+    if config.even_exposures {
+        exposure::even_out(scene);
+    }
     rim::grow_masks(scene, config.grow_masks);
     points::drop_object(scene, config.object_point_share);
     if config.truth_prior == STEREO_PRIOR {
