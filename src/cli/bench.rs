@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail};
 
+use super::folders::last_part;
 use super::next;
-use super::report::{command_line, last_part};
+use super::next::command_line;
 use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, add_dense, load_scene, only_anchors, with_gpu};
 use crate::config::SettingsArgs;
 use crate::gpu::Options;

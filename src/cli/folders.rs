@@ -188,3 +188,7 @@ impl Origin {
         }
     }
 }
+/// The folder's own name: where it lies is nobody's business who reads the page.
+pub(super) fn last_part(name: &str) -> &str {
+    name.rsplit(['/', '\\']).find(|part| !part.is_empty()).unwrap_or(name)
+}

@@ -10,8 +10,7 @@ use image::RgbImage;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use serde_json::Value;
 
-use super::folders::{Record, SETTINGS, TEST};
-use super::report::last_part;
+use super::folders::{Record, SETTINGS, TEST, last_part};
 use super::{next, pictures};
 use crate::export;
 use crate::lab::pace::duration;

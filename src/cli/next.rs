@@ -32,6 +32,12 @@ pub(super) fn typed(word: &str) -> String {
     }
 }
 
+/// The command line without the place of the program.
+pub(super) fn command_line() -> String {
+    let arguments = std::env::args_os().skip(1).map(|word| typed(&word.to_string_lossy()));
+    std::iter::once("gscream-vk".to_owned()).chain(arguments).collect::<Vec<_>>().join(" ")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

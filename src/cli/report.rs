@@ -4,7 +4,9 @@ use std::path::PathBuf;
 
 use anyhow::{Context as _, bail};
 
+use super::folders::last_part;
 use super::next;
+use super::next::command_line;
 use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, add_dense, load_scene, only_anchors, with_gpu};
 use super::train::default_folder;
 use crate::config::Settings;
@@ -165,17 +167,6 @@ fn read(gpu: &Gpu, args: &Args, settings: &Settings) -> anyhow::Result<Scene> {
     let mut scene = load_scene(&args.scene.scene, settings)?;
     add_dense(gpu, &args.scene.scene, &mut scene, &mut settings.clone())?;
     Ok(scene)
-}
-
-/// The folder's own name: where it lies is nobody's business who reads the page.
-pub(super) fn last_part(name: &str) -> &str {
-    name.rsplit(['/', '\\']).find(|part| !part.is_empty()).unwrap_or(name)
-}
-
-/// The command line without the place of the program.
-pub(super) fn command_line() -> String {
-    let arguments = std::env::args_os().skip(1).map(|word| next::typed(&word.to_string_lossy()));
-    std::iter::once("gscream-vk".to_owned()).chain(arguments).collect::<Vec<_>>().join(" ")
 }
 
 fn write(report: &Report, out: &std::path::Path) -> anyhow::Result<Vec<&'static str>> {
