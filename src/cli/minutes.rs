@@ -147,7 +147,7 @@ pub(super) fn fitted(
     let first = timed(1)?;
     let full = if coarse > 0.0 { timed(1 + 2 * TIMED)? } else { first };
     drop(run);
-    let mean = GROWTH * (coarse * first + (1.0 - coarse) * full);
+    let mean = step_time([first, full], coarse);
     // All views are drawn for what they show of the hole, and the test views once more for their figures.
     let drawn = if scene.test.is_empty() { 0 } else { scene.train.len() + 2 * scene.test.len() };
     let after = DRAWN * drawn as f64 * full * GROWTH + WRITTEN;
@@ -163,6 +163,12 @@ pub(super) fn fitted(
         1e3 * mean
     );
     Ok((settings.rescheduled(steps), Clock::new(began, 60.0 * minutes, full / first, drawn)))
+}
+
+/// The time of a step over the whole run, from those measured before anchors grew: of small pictures, which have the share
+/// `coarse` of the steps, and of full ones.
+fn step_time([small, full]: [f64; 2], coarse: f64) -> f64 {
+    GROWTH * (coarse * small + (1.0 - coarse) * full)
 }
 
 /// Fewest steps of a training worth the name.
@@ -200,6 +206,16 @@ mod tests {
         }
         let full = cost * 2.5 * 5f64.powf(0.8) * slow(now);
         (now + 0.4 * 30.0 * full + 1.0, settings)
+    }
+
+    /// Anchors grow, so that steps become slower, and of the growing the clock learns only later.
+    #[test]
+    fn steps_become_slower_than_the_first_ones() {
+        for coarse in [0.0, 0.4, 1.0] {
+            let measured = coarse * 0.05 + (1.0 - coarse) * 0.2;
+            let expected = step_time([0.05, 0.2], coarse);
+            assert!(expected > measured && expected < 2.0 * measured, "{expected} for {measured}");
+        }
     }
 
     #[test]
