@@ -5,6 +5,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::shared::DeviceArgs;
 use super::{next, signals};
+use crate::prepare::shadow::Answer;
 use crate::prepare::{self, Evidence, Request, Step, Watch};
 use crate::train::run::Signal;
 
@@ -14,7 +15,7 @@ use crate::train::run::Signal;
 /// in images/), or nerfstudio's transforms.json. For photographs alone the program colmap is asked, where it is installed.
 /// The scene gets the plain layout, which `train` takes.
 ///
-/// The steps are poses, fit, masks, depth and reference. A step whose inputs have not changed is skipped, a file that was
+/// The steps are poses, fit, masks, shadow, depth and reference. A step whose inputs have not changed is skipped, a file that was
 /// changed or put there by hand stays, and a mask corrected by hand counts as one that was given. prepare.json says what
 /// every file was made from, prepare/provenance.png where each pixel of the reference is from.
 #[derive(Debug, clap::Args)]
@@ -38,6 +39,8 @@ pub(super) struct Args {
     /// Run this step alone, with what those before it left; may be given many times
     #[arg(long, value_name = "STEP", value_parser = step)]
     only: Vec<Step>,
+    #[command(flatten)]
+    shadow: ShadowArgs,
     /// Make no depth priors; otherwise they are the fit's own depth, nothing (NaN) where views disagree
     ///
     /// A scene that has priors of its own in depth/ or disparity/ keeps those alone.
@@ -82,6 +85,33 @@ pub(super) struct ObjectArgs {
     /// With a --box of the same view they count within it alone: for one leaf of many.
     #[arg(long, value_name = "NAME=FILE", value_parser = strokes)]
     strokes: Vec<(String, Evidence)>,
+}
+
+/// What happens to the object's shadow.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+enum Shadow {
+    /// Where one is found on the surface that the object stands on, training sees the photographs without it
+    #[default]
+    Remove,
+    /// Left as it is
+    Keep,
+}
+
+#[derive(Debug, Clone, Copy, Default, clap::Args)]
+pub(super) struct ShadowArgs {
+    /// What to do about the shadow that the object casts on the surface it stands on
+    #[arg(long, value_name = "WHAT", value_enum, default_value_t = Shadow::Remove)]
+    shadow: Shadow,
+}
+
+impl ShadowArgs {
+    /// For the request.
+    pub fn answer(self) -> Answer {
+        match self.shadow {
+            Shadow::Remove => Answer::Remove,
+            Shadow::Keep => Answer::Keep,
+        }
+    }
 }
 
 impl ObjectArgs {
@@ -129,6 +159,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         reference: args.reference.clone(),
         only: args.only.clone(),
         depth: !args.no_depth,
+        shadow: args.shadow.answer(),
         inpaint_model: args.inpaint_model.clone(),
         depth_model: args.depth_model.clone(),
         fit_steps: args.fit_steps,

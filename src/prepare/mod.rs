@@ -13,6 +13,7 @@ pub mod poses;
 mod program;
 pub mod record;
 pub mod reference;
+pub mod shadow;
 pub mod splats;
 
 use std::collections::BTreeMap;
@@ -115,6 +116,8 @@ pub enum Step {
     Fit,
     /// The object in every view.
     Masks,
+    /// The object's shadow.
+    Shadow,
     /// Depth priors.
     Depth,
     /// The reference view without the object.
@@ -123,7 +126,7 @@ pub enum Step {
 
 impl Step {
     /// All of them.
-    pub const ALL: [Self; 5] = [Self::Poses, Self::Fit, Self::Masks, Self::Depth, Self::Reference];
+    pub const ALL: [Self; 6] = [Self::Poses, Self::Fit, Self::Masks, Self::Shadow, Self::Depth, Self::Reference];
 
     /// Its name in the record and on the command line.
     pub fn name(self) -> &'static str {
@@ -131,6 +134,7 @@ impl Step {
             Self::Poses => "poses",
             Self::Fit => "fit",
             Self::Masks => "masks",
+            Self::Shadow => "shadow",
             Self::Depth => "depth",
             Self::Reference => "reference",
         }
@@ -167,6 +171,8 @@ pub struct Request {
     pub fit_side: u32,
     /// Whether depth priors are made of the fit, NaN where nothing is known; a scene that has its own keeps those alone.
     pub depth: bool,
+    /// What to do about the object's shadow.
+    pub shadow: shadow::Answer,
     /// A network that fills what nobody saw, instead of PatchMatch: an ONNX file, see [`network`].
     pub inpaint_model: Option<PathBuf>,
     /// A network whose maps become the depth priors, instead of the fit's own depth: likewise.
@@ -187,6 +193,7 @@ impl Request {
             fit_steps: 600,
             fit_side: 256,
             depth: true,
+            shadow: shadow::Answer::Remove,
             inpaint_model: None,
             depth_model: None,
             seed: 0,
@@ -303,6 +310,10 @@ fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(
     let masked = |preparation: &Preparation<'_>| preparation.masks_on_disk(&scene);
     if request.wants(Step::Masks) {
         preparation.masks(&scene, &fit, &mut splats, &object)?;
+    }
+    if request.wants(Step::Shadow) {
+        let masks = masked(&preparation)?;
+        preparation.shadow(&scene, &mut splats, &masks)?;
     }
     if request.wants(Step::Depth) {
         let masks = masked(&preparation)?;
@@ -566,19 +577,26 @@ impl Preparation<'_> {
 
     /// The scene at the size of the fit, without anything but photographs, cameras and points.
     fn small(&mut self) -> Result<Scene, Error> {
-        self.load(self.request.fit_side)
+        self.load(self.request.fit_side, false)
     }
 
-    /// The photographs with their cameras, the longer side of the largest at most about `side` pixels.
-    fn load(&self, side: u32) -> Result<Scene, Error> {
+    /// The photographs with their cameras, the longer side of the largest at most about `side` pixels, without the object's
+    /// shadow where it has been found and that is wanted.
+    fn load(&self, side: u32, relight: bool) -> Result<Scene, Error> {
         let images = self.folder.root().join(poses::IMAGES);
         let mut longest = 1;
         for path in scene::pictures(&images)?.values() {
             longest = longest.max(picture_size(path)?.into_iter().max().unwrap_or(1));
         }
         let downscale = ((f64::from(longest) / f64::from(side)).round() as u32).max(1);
-        let config =
-            scene::Config { downscale, masks: false, priors: false, reference: false, ..scene::Config::default() };
+        let config = scene::Config {
+            downscale,
+            masks: false,
+            priors: false,
+            relight,
+            reference: false,
+            ..scene::Config::default()
+        };
         let mut scene = scene::load(self.folder.root(), &config)?;
         scene.test.clear();
         Ok(scene)
@@ -755,6 +773,32 @@ impl Preparation<'_> {
         Ok(())
     }
 
+    fn shadow(&mut self, scene: &Scene, splats: &mut Splats, masks: &[GrayImage]) -> Result<(), Error> {
+        let answer = self.request.shadow;
+        let inputs = self.inputs_behind_masks(masks).with(answer.name()).with(self.request.seed.to_le_bytes()).finish();
+        if self.skips(Step::Shadow, &inputs)? {
+            return Ok(());
+        }
+        let mut batch = Batch::default();
+        if answer == shadow::Answer::Keep {
+            batch.notes.push("the object's shadow is not looked for (--shadow keep)".into());
+            return self.write(Step::Shadow, inputs, batch);
+        }
+        let fine = self.load(shadow::SIDE, false)?;
+        self.watch.begin(Step::Shadow, 2 * scene.train.len() as u64 + 1);
+        let task = shadow::Task { scene, fine: &fine, masks, seed: self.request.seed };
+        batch = shadow::make(&task, splats, self.watch)?;
+        self.write(Step::Shadow, inputs, batch)?;
+        self.watch.end();
+        Ok(())
+    }
+
+    /// Hashes of what the step shadow has made.
+    fn shadow_hashes(&self) -> impl Iterator<Item = &str> {
+        let files = self.folder.record().steps.get(Step::Shadow.name()).map(|step| &step.files);
+        files.into_iter().flatten().map(|(_, file)| file.hash.as_str())
+    }
+
     fn depth(&mut self, scene: &Scene, splats: &mut Splats, masks: &[GrayImage]) -> Result<(), Error> {
         if !self.depth {
             self.watch.say("depth: the scene has priors of its own, none are made");
@@ -780,11 +824,12 @@ impl Preparation<'_> {
     fn reference(&mut self, scene: &Scene, fit: &Fit, splats: &mut Splats, masks: &[GrayImage]) -> Result<(), Error> {
         let named = self.request.reference.clone().unwrap_or_default();
         let inputs = self.inputs_behind_masks(masks).with(named).with([u8::from(self.depth)]);
+        let inputs = self.shadow_hashes().fold(inputs, |inputs, hash| inputs.with(hash));
         let inputs = self.networks.inputs(inputs, true).finish();
         if self.skips(Step::Reference, &inputs)? {
             return Ok(());
         }
-        let fine = self.load(reference::SIDE)?;
+        let fine = self.load(reference::SIDE, true)?;
         self.watch.begin(Step::Reference, 2 * scene.train.len() as u64 + 4);
         let task = reference::Task {
             scene,

@@ -23,6 +23,8 @@ pub struct Config {
     pub masks: bool,
     /// Use the depth priors.
     pub priors: bool,
+    /// Take the object's shadow out of the photographs, where `prepare` has found it (`relight/`).
+    pub relight: bool,
     /// Use the inpainted reference view.
     pub reference: bool,
     /// Length of the model's that counts as one wherever a setting means a length; 0 takes a third of the median depth of
@@ -119,6 +121,7 @@ impl Default for Config {
             leave_out: vec![],
             masks: true,
             priors: true,
+            relight: true,
             reference: true,
             unit: 0.0,
             even_exposures: true,

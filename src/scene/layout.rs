@@ -26,6 +26,8 @@ pub(super) struct Entry {
     pub prior: Option<(PathBuf, PriorKind)>,
     /// True depth z, of test views.
     pub depth: Option<PathBuf>,
+    /// What the object's shadow leaves of the light, of train views.
+    pub relight: Option<PathBuf>,
 }
 
 /// The inpainted picture of one train view.
@@ -114,11 +116,13 @@ fn plain(scene: &Path) -> Result<Layout, Error> {
         Some(kind) => index(kind.folder(), &priors::EXTENSIONS)?,
         None => Index::new(),
     };
-    let train = entries(&images, |name| masks.get(name).cloned(), |name| Some((priors.get(name)?.clone(), kind?)));
+    let mut train = entries(&images, |name| masks.get(name).cloned(), |name| Some((priors.get(name)?.clone(), kind?)));
     let prior = |name: &String| Some((priors.get(name)?.clone(), kind?));
     let mut test = entries(&test_images, |name| test_masks.get(name).cloned(), prior);
     let depths = index("test_depth", &priors::EXTENSIONS)?;
     test.iter_mut().for_each(|entry| entry.depth = depths.get(&entry.name).cloned());
+    let relight = index(super::RELIGHT, &["png"])?;
+    train.iter_mut().for_each(|entry| entry.relight = relight.get(&entry.name).cloned());
     let mut notes = misspelt(scene)?;
     notes.append(&mut passed_over);
     let of_test =
@@ -378,6 +382,7 @@ fn entries(
             mask: mask(name),
             prior: prior(name),
             depth: None,
+            relight: None,
         })
         .collect()
 }

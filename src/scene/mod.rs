@@ -12,6 +12,7 @@
 //! SCENE/reference/NAME.npy|exr              its prior; NAME_depth.* or NAME_disparity.* says which kind it is
 //! SCENE/test_images/, SCENE/test_masks/     views without the object, and where the object stood
 //! SCENE/test_depth/NAME.npy|exr|png         true depth z of these, not positive where it is unknown
+//! SCENE/relight/NAME.png                    what the object's shadow leaves of the light, of 255, see `prepare`
 //! SCENE/sparse/0/                           COLMAP model with poses of all of these
 //! ```
 //!
@@ -32,6 +33,7 @@ mod npy;
 pub mod path;
 mod picture;
 mod priors;
+mod relight;
 pub(crate) mod resample;
 pub mod room360;
 pub mod sheet;
@@ -56,6 +58,7 @@ pub use picture::{decode, dimensions, object_mask};
 pub(crate) use priors::rank_correlation;
 pub use priors::read as read_prior;
 pub use priors::{Prior, PriorKind, in_own_range, own_range};
+pub use relight::{RELIGHT, lighten};
 
 /// A photograph at the training resolution and what is known about it.
 #[derive(Clone, Debug)]
@@ -152,6 +155,13 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     let mut notes = Notes::from_iter([layout.found.clone()]);
     notes.append(&mut layout.notes);
 
+    let shadowed = layout.train.iter().filter(|e| e.relight.is_some()).count();
+    if shadowed > 0 && config.relight {
+        notes.push(format!("the object's shadow is taken out of {shadowed} photographs ({RELIGHT}/)"));
+    } else if shadowed > 0 {
+        layout.train.iter_mut().for_each(|e| e.relight = None);
+        notes.push(format!("{RELIGHT}/ is ignored, as configured: the object's shadow stays"));
+    }
     let no_masks = layout.train.iter().all(|e| e.mask.is_none());
     let clean_views = !layout.test.is_empty();
     if !config.prior_folder.is_empty() {
@@ -638,7 +648,10 @@ impl Reader<'_> {
         }
         let image = decode(&entry.image)?.into_rgb8();
         let size = picture.map(|n| reduced(n, self.config.downscale));
-        let image = if size == picture { image } else { resample::photograph(&image, size) };
+        let mut image = if size == picture { image } else { resample::photograph(&image, size) };
+        if let Some(map) = &entry.relight {
+            relight::apply(map, picture, &mut image)?;
+        }
         let mut stretched_mask = false;
         let mask = match &entry.mask {
             None => None,

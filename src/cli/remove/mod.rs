@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 
-use super::prepare::ObjectArgs;
+use super::prepare::{ObjectArgs, ShadowArgs};
 use super::shared::DeviceArgs;
 use super::{next, signals, train};
 use crate::config::SettingsArgs;
@@ -57,6 +57,8 @@ pub(super) struct Args {
     /// View to become the reference [default: the one whose hole is seen best by others]
     #[arg(long, value_name = "NAME")]
     reference: Option<String>,
+    #[command(flatten)]
+    shadow: ShadowArgs,
     /// Train for about so many minutes: see train
     #[arg(long, value_name = "N", conflicts_with = "iterations", value_parser = train::positive)]
     minutes: Option<f64>,

@@ -178,10 +178,11 @@ impl Observer for Watched<'_, export::Bars> {
 impl Job<'_> {
     /// The request to `prepare`.
     pub fn request(&self, object: Vec<(String, Evidence)>) -> Request {
-        let Args { photographs, reference, fit_steps, .. } = self.args;
+        let Args { photographs, reference, shadow, fit_steps, .. } = self.args;
         Request {
             object,
             reference: reference.clone(),
+            shadow: shadow.answer(),
             fit_steps: *fit_steps,
             ..Request::new(photographs, &self.places.scene)
         }

@@ -1,0 +1,256 @@
+//! The object's shadow on the surface that it stands on: found once on the surface, and taken out of every photograph.
+//!
+//! A static shadow contradicts nothing between views, so that no comparison of views finds it, and it stays when the object
+//! goes. Here the surface is found ([`plane`]) and seen straight from above ([`texture`]); a shadow is a place of it that is
+//! darker by one ratio of all channels where a light from one side would put the object's ([`detect`]). Photographs of it are
+//! made brighter by the inverse ratio ([`relight`]): what it lies on keeps its texture, and nothing has to be painted. The
+//! photographs stay as they are; `relight/NAME.png` says what is left of each pixel's light, and training divides by it.
+
+mod border;
+pub mod detect;
+pub mod mixture;
+pub mod plane;
+pub mod relight;
+pub mod texture;
+
+use glam::DVec3;
+use image::GrayImage;
+
+use super::depth::{self, DepthMap};
+use super::record::Batch;
+use super::splats::Splats;
+use super::{Error, Watch};
+use crate::export::up;
+use crate::scene::{Camera, Scene};
+use detect::{Ground, Shadow, Verdict};
+use plane::Support;
+use texture::{Photograph, Texture};
+
+/// The longer side of the photographs that a shadow is looked for in, pixels.
+pub const SIDE: u32 = 1024;
+/// A picture of what was found, below the scene's folder.
+pub const PICTURE: &str = "prepare/shadow.png";
+/// Places that are looked at, of the object and of what is around it.
+const PLACES: usize = 4000;
+const AROUND: usize = 8000;
+/// A place is the object's if the masks have it in this share of the views that show it.
+const OBJECT: f64 = 0.8;
+/// Surroundings reach so many radii of the object's.
+const NEAR: f64 = 3.0;
+/// Views of which each has to see the shadow about as dark as all of them do.
+const VIEWS: f64 = 0.7;
+/// About as dark: the logarithm of what is left differs by this share at most, or by so much.
+const SAME: [f64; 2] = [0.4, 0.06];
+
+/// What to do about the object's shadow.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Answer {
+    /// Look for it, and take it out of the photographs.
+    #[default]
+    Remove,
+    /// Leave it where it is.
+    Keep,
+}
+
+impl Answer {
+    /// Its name on the command line and in the record.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Remove => "remove",
+            Self::Keep => "keep",
+        }
+    }
+}
+
+/// What a shadow is looked for in.
+pub struct Task<'a> {
+    /// The scene at the fit's size.
+    pub scene: &'a Scene,
+    /// The scene at [`SIDE`].
+    pub fine: &'a Scene,
+    /// By view, as large as the photographs.
+    pub masks: &'a [GrayImage],
+    /// Of every random choice.
+    pub seed: u64,
+}
+
+/// A shadow and where it lies.
+pub struct Found {
+    /// The surface.
+    pub support: Support,
+    /// The surface from above.
+    pub texture: Texture,
+    /// The shadow on it.
+    pub shadow: Shadow,
+    /// Views that see it as dark as it is, and views that see enough of it to tell.
+    pub views: [usize; 2],
+}
+
+/// Looks for the shadow, and writes what of the light is left at each pixel of each photograph.
+///
+/// # Errors
+/// When the device has no room, or is lost.
+pub fn make(task: &Task<'_>, splats: &mut Splats, watch: &mut dyn Watch) -> Result<Batch, Error> {
+    let n = task.scene.train.len() as u64;
+    let mut maps = vec![];
+    for (i, view) in task.scene.train.iter().enumerate() {
+        maps.push(DepthMap::of(splats, &view.camera, |_| false)?);
+        watch.turn(i as u64 + 1)?;
+    }
+    let views = task.fine.train.iter().zip(task.masks);
+    let masks: Vec<GrayImage> = views.map(|(view, mask)| depth::enlarged(mask, view.camera.size)).collect();
+    let photographs: Vec<Photograph<'_>> = task
+        .fine
+        .train
+        .iter()
+        .zip(&masks)
+        .zip(&maps)
+        .map(|((view, mask), depth)| Photograph { camera: view.camera, picture: &view.image, mask, depth })
+        .collect();
+    let mut batch = Batch::default();
+    let found = match look(task, &maps, &photographs) {
+        Ok(found) => found,
+        Err(why) => {
+            batch.notes.push(format!("the object has no shadow that could be taken away: {why}"));
+            return Ok(batch);
+        }
+    };
+    watch.turn(n + 1)?;
+    let [alike, all] = found.views;
+    let share = alike as f64 / all.max(1) as f64;
+    let left = found.shadow.ratio.iter().sum::<f64>() / 3.0;
+    let mut lit = 0;
+    for (i, (view, photograph)) in task.fine.train.iter().zip(&photographs).enumerate() {
+        if let Some(map) = relight::map(&found, photograph) {
+            batch.rgb_aside(relight::path(&view.name), &map, "the object's shadow, found on its surface")?;
+            lit += 1;
+        }
+        watch.turn(n + 2 + i as u64)?;
+    }
+    batch.rgb(PICTURE, &relight::picture(&found, &photographs), "the surface from above, the shadow, and without it");
+    batch.notes.push(format!(
+        "the object's shadow on the surface below it leaves {:.0} % of the light, alike in {:.0} % of {all} views; it is taken \
+         out of {lit} photographs for training ({PICTURE} shows it, --shadow keep leaves it)",
+        100.0 * left,
+        100.0 * share
+    ));
+    batch.figures.extend([("light left".to_owned(), left), ("views that see it alike".to_owned(), share)]);
+    Ok(batch)
+}
+
+/// Looks for the shadow; a clause that says why there is none otherwise.
+///
+/// # Errors
+/// There is none.
+pub fn look(task: &Task<'_>, maps: &[DepthMap], photographs: &[Photograph<'_>]) -> Result<Found, String> {
+    let cameras: Vec<Camera> = task.scene.train.iter().map(|view| view.camera).collect();
+    let object = object(maps, task.masks);
+    let around = around(task.scene, maps, photographs, &object);
+    let support = plane::find(&around, &object, up::estimate(&cameras), task.seed)
+        .ok_or("no surface is known that it stands on")?;
+    log::debug!("shadow: {support:?}, {} places of the object, {} around", object.len(), around.len());
+    let refined = texture::refined(&support, photographs);
+    log::debug!("shadow: {refined:?}");
+    let support = refined;
+    let texture = Texture::of(&support, photographs);
+    let middle = 0.5 * texture.side as f64;
+    let in_cells = |point: &DVec3| {
+        let local = support.local(*point) / texture.cell;
+        [local.x + middle, local.y + middle, local.z]
+    };
+    let places: Vec<[f64; 3]> = object.iter().map(in_cells).collect();
+    let ground =
+        Ground { side: texture.side, log: &texture.log, object: &places, height: support.height / texture.cell };
+    let shadow = match detect::find(&ground) {
+        Verdict::Found(shadow) => *shadow,
+        Verdict::Nothing(why) => return Err(why),
+    };
+    let views = alike(&texture, &support, &shadow, photographs);
+    log::debug!("shadow: {views:?} views, ratio {:?}, alike {:.2}", shadow.ratio, shadow.alike);
+    if (views[0] as f64) < VIEWS * views[1] as f64 || views[1] == 0 {
+        return Err(format!("only {} of {} views see what is darker as dark as the others do", views[0], views[1]));
+    }
+    Ok(Found { support, texture, shadow, views })
+}
+
+/// Views that see the shadow as dark as it is on the whole, and all that see enough of it.
+fn alike(texture: &Texture, support: &Support, shadow: &Shadow, photographs: &[Photograph<'_>]) -> [usize; 2] {
+    let deep: Vec<usize> = (0..shadow.region.len()).filter(|i| shadow.amount[*i] > 0.8 && texture.seen(*i)).collect();
+    let lit: Vec<usize> = (0..shadow.region.len()).filter(|i| shadow.lit[*i]).collect();
+    let some = |cells: Vec<usize>| -> Vec<usize> {
+        let every = cells.len().div_ceil(2000).max(1);
+        cells.into_iter().step_by(every).collect()
+    };
+    let (deep, lit) = (some(deep), some(lit));
+    let whole = (shadow.ratio.iter().map(|r| r.ln()).sum::<f64>() / 3.0).abs();
+    let says: Vec<f64> = photographs
+        .iter()
+        .filter_map(|photograph| texture::left(photograph, texture, support, [&deep, &lit], &shadow.expected))
+        .collect();
+    let same = says.iter().filter(|left| (left.ln() + whole).abs() <= (SAME[0] * whole).max(SAME[1]));
+    [same.count(), says.len()]
+}
+
+/// Every so many pixels of all views, so that there are about so many in all.
+fn some(sizes: impl Iterator<Item = usize>, wanted: usize) -> usize {
+    sizes.sum::<usize>().div_ceil(wanted).max(1)
+}
+
+fn world(map: &DepthMap, pixel: usize) -> Option<DVec3> {
+    let w = map.camera.size[0] as usize;
+    let z = f64::from(map.depth[pixel]);
+    let at = [(pixel % w) as f64 + 0.5, (pixel / w) as f64 + 0.5];
+    z.is_finite().then(|| depth::point(&map.camera, at, z)).flatten().map(DVec3::from)
+}
+
+/// Places of the object: what the fit has within the masks, where the masks of most views agree.
+fn object(maps: &[DepthMap], masks: &[GrayImage]) -> Vec<DVec3> {
+    let small: Vec<GrayImage> =
+        maps.iter().zip(masks).map(|(map, mask)| crate::scene::resample::mask(mask, map.camera.size)).collect();
+    let inside = |view: usize| small[view].as_raw().iter().enumerate().filter(|(_, v)| **v != 0).map(|(i, _)| i);
+    let every = some((0..maps.len()).map(|view| inside(view).count()), 4 * PLACES);
+    let is_object = |point: &DVec3| {
+        let (mut shown, mut masked) = (0u32, 0u32);
+        for (map, mask) in maps.iter().zip(&small) {
+            let Some([x, y]) = map.camera.project(point.to_array()) else { continue };
+            let [w, h] = map.camera.size;
+            if x >= 0.0 && y >= 0.0 && x < f64::from(w) && y < f64::from(h) {
+                shown += 1;
+                masked += u32::from(mask.get_pixel(x as u32, y as u32).0[0] != 0);
+            }
+        }
+        f64::from(masked) >= OBJECT * f64::from(shown)
+    };
+    let places =
+        (0..maps.len()).flat_map(|view| inside(view).step_by(every).filter_map(move |i| world(&maps[view], i)));
+    let kept: Vec<DVec3> = places.filter(is_object).collect();
+    let every = kept.len().div_ceil(PLACES).max(1);
+    kept.into_iter().step_by(every).collect()
+}
+
+/// Places around the object: points of the model and what the fit has, outside the masks and near it.
+fn around(scene: &Scene, maps: &[DepthMap], photographs: &[Photograph<'_>], object: &[DVec3]) -> Vec<DVec3> {
+    let Some((middle, radius)) = plane::extent(object) else { return vec![] };
+    let near = |p: &DVec3| (*p - middle).length() <= NEAR * radius;
+    let off = |p: &DVec3| {
+        // Within no mask that could show it: a point of the model on the object is in all of them.
+        let on = photographs.iter().filter(|photograph| {
+            let [w, h] = photograph.camera.size;
+            photograph.camera.project(p.to_array()).is_some_and(|[x, y]| {
+                let inside = x >= 0.0 && y >= 0.0 && x < f64::from(w) && y < f64::from(h);
+                inside && photograph.mask.get_pixel(x as u32, y as u32).0[0] != 0
+            })
+        });
+        2 * on.count() < photographs.len()
+    };
+    let points = scene.points.iter().map(|point| DVec3::from(point.position.map(f64::from)));
+    let mut places: Vec<DVec3> = points.filter(|p| near(p) && off(p)).collect();
+    let every = some(maps.iter().map(|map| map.depth.len()), 8 * AROUND);
+    for (map, photograph) in maps.iter().zip(photographs) {
+        let mask = crate::scene::resample::mask(photograph.mask, map.camera.size);
+        let outside = (0..map.depth.len()).step_by(every).filter(|i| mask.as_raw()[*i] == 0);
+        places.extend(outside.filter_map(|i| world(map, i)).filter(near));
+    }
+    let every = places.len().div_ceil(AROUND).max(1);
+    places.into_iter().step_by(every).collect()
+}

@@ -1,0 +1,174 @@
+//! The surface that the object stands on: a plane through what is seen around the object, which the object rests on.
+
+use glam::{DMat3, DVec3};
+use rand::RngExt as _;
+use rand_pcg::Pcg64;
+
+/// Planes drawn.
+const DRAWS: usize = 600;
+/// On the plane: within this share of the object's size.
+const ON: f64 = 0.03;
+/// Share of the object's places that lie above the plane, at least; what lies below is an error of their depth.
+const ABOVE: f64 = 0.9;
+/// The object's lowest places, by this share of them, lie as near to the plane as this share of its size.
+const LOWEST: f64 = 0.05;
+const GAP: f64 = 0.2;
+/// Cosine between a plane's normal and the cameras' common up below which it counts half.
+const STEEP: f64 = 0.7;
+
+/// A plane and what stands on it.
+#[derive(Clone, Copy, Debug)]
+pub struct Support {
+    /// Below the object's middle, on the plane, world coordinates.
+    pub foot: DVec3,
+    /// Unit, towards the object.
+    pub up: DVec3,
+    /// Two unit vectors along the plane, with `up` a right-handed system.
+    pub along: [DVec3; 2],
+    /// The object's height above the plane, world units.
+    pub height: f64,
+    /// The radius within which the object stands around `foot`, world units.
+    pub radius: f64,
+}
+
+impl Support {
+    /// A world point along the plane and above it, from the foot.
+    pub fn local(&self, point: DVec3) -> DVec3 {
+        let from = point - self.foot;
+        DVec3::new(from.dot(self.along[0]), from.dot(self.along[1]), from.dot(self.up))
+    }
+
+    /// The plane moved along its normal, world units, and tilted about its two directions, radians.
+    pub fn moved(&self, by: f64, [a, b]: [f64; 2]) -> Self {
+        let up = (self.up + self.along[0] * a + self.along[1] * b).normalize();
+        let first = (self.along[0] - up * self.along[0].dot(up)).normalize();
+        Self { foot: self.foot + self.up * by, up, along: [first, up.cross(first)], height: self.height - by, ..*self }
+    }
+
+    /// A world point from places along the plane and above it.
+    pub fn world(&self, local: DVec3) -> DVec3 {
+        self.foot + self.along[0] * local.x + self.along[1] * local.y + self.up * local.z
+    }
+}
+
+fn middle(points: &[DVec3]) -> DVec3 {
+    let median = |axis: usize| {
+        let mut values: Vec<f64> = points.iter().map(|p| p[axis]).collect();
+        values.sort_unstable_by(f64::total_cmp);
+        values[values.len() / 2]
+    };
+    DVec3::new(median(0), median(1), median(2))
+}
+
+/// The value below which a share of all lie.
+fn quantile(mut values: Vec<f64>, share: f64) -> f64 {
+    values.sort_unstable_by(f64::total_cmp);
+    let last = values.len().saturating_sub(1);
+    values[((values.len() as f64 * share) as usize).min(last)]
+}
+
+/// The object's middle and the radius around it that nine in ten of its places lie in; nothing where there are too few.
+pub fn extent(object: &[DVec3]) -> Option<(DVec3, f64)> {
+    if object.len() < 20 {
+        return None;
+    }
+    let middle = middle(object);
+    let radius = quantile(object.iter().map(|p| (*p - middle).length()).collect(), 0.9);
+    (radius > 0.0).then_some((middle, radius))
+}
+
+/// The plane that the object rests on: of `around`, places on what surrounds it, those near it count most. `up` is the
+/// cameras'. The same seed finds the same.
+pub fn find(around: &[DVec3], object: &[DVec3], up: DVec3, seed: u64) -> Option<Support> {
+    let (middle, size) = extent(object)?;
+    if around.len() < 30 {
+        return None;
+    }
+    let on = ON * size;
+    let weight = |p: &DVec3| 1.0 / (1.0 + (*p - middle).length_squared() / (size * size));
+    let rests = |through: DVec3, normal: DVec3| {
+        let heights: Vec<f64> = object.iter().map(|p| (*p - through).dot(normal)).collect();
+        let above = heights.iter().filter(|h| **h > -ON * size).count() as f64 / heights.len() as f64;
+        above >= ABOVE && quantile(heights, LOWEST).abs() <= GAP * size
+    };
+    let mut rng = Pcg64::new(seed.into(), 61);
+    let mut best: Option<(f64, DVec3, DVec3)> = None;
+    for _ in 0..DRAWS {
+        let [a, b, c] = std::array::from_fn(|_| around[rng.random_range(0..around.len())]);
+        let Some(normal) = (b - a).cross(c - a).try_normalize() else { continue };
+        let normal = if (middle - a).dot(normal) < 0.0 { -normal } else { normal };
+        if !rests(a, normal) {
+            continue;
+        }
+        let level = if normal.dot(up) >= STEEP { 1.0 } else { 0.5 };
+        let count: f64 = around.iter().filter(|p| (**p - a).dot(normal).abs() <= on).map(weight).sum();
+        if best.is_none_or(|(most, ..)| count * level > most) {
+            best = Some((count * level, a, normal));
+        }
+    }
+    let (_, mut through, mut normal) = best?;
+    for _ in 0..3 {
+        let inliers: Vec<DVec3> = around.iter().copied().filter(|p| (*p - through).dot(normal).abs() <= on).collect();
+        if inliers.len() < 12 {
+            break;
+        }
+        let (mean, fitted) = least_squares(&inliers, weight, normal);
+        if !rests(mean, fitted) {
+            break;
+        }
+        (through, normal) = (mean, fitted);
+    }
+    let foot = middle - normal * (middle - through).dot(normal);
+    let (x, y) = normal.any_orthonormal_pair();
+    let support = Support { foot, up: normal, along: [x, y], height: 0.0, radius: 0.0 };
+    let local: Vec<DVec3> = object.iter().map(|p| support.local(*p)).collect();
+    let height = quantile(local.iter().map(|p| p.z).collect(), 0.97);
+    let radius = quantile(local.iter().map(|p| p.truncate().length()).collect(), 0.95);
+    (height > 0.0).then_some(Support { height, radius, ..support })
+}
+
+/// The plane of least squares: its mean and its normal, on the side of `near`.
+fn least_squares(points: &[DVec3], weight: impl Fn(&DVec3) -> f64, near: DVec3) -> (DVec3, DVec3) {
+    let sum: f64 = points.iter().map(&weight).sum();
+    let mean = points.iter().map(|p| *p * weight(p)).sum::<DVec3>() / sum;
+    let outer = |d: DVec3| DMat3::from_cols(d * d.x, d * d.y, d * d.z);
+    let spread = points.iter().fold(DMat3::ZERO, |all, p| all + outer(*p - mean) * weight(p));
+    let trace = spread.x_axis.x + spread.y_axis.y + spread.z_axis.z;
+    // Inverse iteration finds the direction of least spread.
+    let inverse = (spread + DMat3::from_diagonal(DVec3::splat(1e-9 * trace.max(f64::MIN_POSITIVE)))).inverse();
+    let mut normal = near;
+    for _ in 0..30 {
+        normal = (inverse * normal).try_normalize().unwrap_or(normal);
+    }
+    (mean, if normal.dot(near) < 0.0 { -normal } else { normal })
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::dvec3;
+
+    use super::*;
+
+    /// A box on a table before a wall, and a floor below the table that has more places: the table is found.
+    #[test]
+    fn the_plane_is_the_one_that_the_object_rests_on() {
+        let mut rng = Pcg64::new(4, 4);
+        let mut noise = move |by: f64| rng.random_range(-by..by);
+        let object: Vec<DVec3> =
+            (0..400).map(|_| dvec3(noise(0.3), noise(0.3), 1.0 + 0.25 + noise(0.25) + noise(0.01))).collect();
+        let mut around = vec![];
+        for _ in 0..300 {
+            around.push(dvec3(noise(1.0), noise(1.0), 1.0 + noise(0.008)));
+            around.push(dvec3(noise(3.0), noise(3.0), noise(0.008)));
+            around.push(dvec3(noise(3.0), noise(3.0), noise(0.008)));
+            around.push(dvec3(noise(1.0), 1.2 + noise(0.008), 1.5 + noise(1.0)));
+        }
+        let found = find(&around, &object, DVec3::Z, 0).expect("a plane");
+        assert!(found.up.z > 0.9995, "{}", found.up);
+        // Noise of 0.008 over some hundred places; the object's middle is a median of 400 over 0.6: 0.02.
+        assert!((found.foot.z - 1.0).abs() < 0.004 && found.foot.truncate().length() < 0.08, "{}", found.foot);
+        assert!((found.height - 0.5).abs() < 0.03, "{}", found.height);
+        assert!((found.world(found.local(object[0])) - object[0]).length() < 1e-12);
+        assert!(find(&around[..10], &object, DVec3::Z, 0).is_none());
+    }
+}

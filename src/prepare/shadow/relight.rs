@@ -1,0 +1,145 @@
+//! Photographs without the shadow: what is left of the light at each of their pixels, and pictures to look at.
+
+use glam::DVec3;
+use image::{Rgb, RgbImage};
+use rayon::prelude::*;
+
+use super::Found;
+use super::texture::Photograph;
+
+/// A pixel shows the surface where the fit is within this share of the object's height from it, and does not from twice
+/// that on.
+const OFF: f64 = 0.12;
+/// Logarithms of channels within which a pixel has the surface's colour.
+const SAME: f32 = 0.35;
+/// Less than this share of the light changes nothing.
+const LEAST: f64 = 0.004;
+
+/// Where the map of a photograph is kept, below the scene's folder.
+pub fn path(name: &str) -> String {
+    format!("{}/{name}.png", crate::scene::RELIGHT)
+}
+
+/// What is left of the light at each pixel, of 255; nothing where the photograph does not show the shadow.
+pub fn map(found: &Found, photograph: &Photograph<'_>) -> Option<RgbImage> {
+    let [w, h] = photograph.camera.size;
+    let rows: Vec<Vec<[u8; 3]>> =
+        (0..h).into_par_iter().map(|y| (0..w).map(|x| left(found, photograph, [x, y])).collect()).collect();
+    let bytes: Vec<u8> = rows.into_iter().flatten().flatten().collect();
+    bytes.iter().any(|v| *v < 255).then(|| RgbImage::from_raw(w, h, bytes).expect("three bytes per pixel"))
+}
+
+/// What is left of the light at one pixel.
+fn left(found: &Found, photograph: &Photograph<'_>, [x, y]: [u32; 2]) -> [u8; 3] {
+    let amount = amount(found, photograph, [f64::from(x) + 0.5, f64::from(y) + 0.5]);
+    if amount <= LEAST {
+        return [255; 3];
+    }
+    found.shadow.ratio.map(|ratio| (255.0 * ratio.powf(amount)).round().clamp(1.0, 255.0) as u8)
+}
+
+/// How much of the full shadow lies on what a pixel position shows.
+fn amount(found: &Found, photograph: &Photograph<'_>, pixel: [f64; 2]) -> f64 {
+    let (support, texture, shadow) = (&found.support, &found.texture, &found.shadow);
+    let camera = &photograph.camera;
+    let Some([x, y]) = camera.unproject(pixel) else { return 0.0 };
+    let rows = camera.rotation.map(|row| DVec3::from(row.map(f64::from)));
+    let eye = DVec3::from(camera.center());
+    let ray = rows[0] * x + rows[1] * y + rows[2];
+    let along = ray.dot(support.up);
+    let z = (support.foot - eye).dot(support.up) / along;
+    if !(z.is_finite() && z > 0.0) {
+        return 0.0;
+    }
+    let place = support.local(eye + ray * z) / texture.cell;
+    let middle = 0.5 * texture.side as f64;
+    let [u, v] = [place.x + middle - 0.5, place.y + middle - 0.5];
+    let last = (texture.side - 1) as f64;
+    if !(u >= 0.0 && v >= 0.0 && u < last && v < last) {
+        return 0.0;
+    }
+    let (column, row) = (u as usize, v as usize);
+    let (fx, fy) = (u - column as f64, v - row as f64);
+    let at = |i: usize, j: usize| f64::from(shadow.amount[(row + j) * texture.side + column + i]);
+    let amount = (at(0, 0) * (1.0 - fx) + at(1, 0) * fx) * (1.0 - fy) + (at(0, 1) * (1.0 - fx) + at(1, 1) * fx) * fy;
+    if amount <= LEAST {
+        return 0.0;
+    }
+    // Near the object the fit's depth is the object's in part.
+    if photograph.mask.get_pixel(pixel[0] as u32, pixel[1] as u32).0[0] != 0 {
+        return amount;
+    }
+    let small = photograph.depth.camera.size;
+    let scaled = std::array::from_fn(|i| pixel[i] * f64::from(small[i]) / f64::from(camera.size[i]));
+    let depth = f64::from(photograph.depth.smooth(scaled));
+    if !depth.is_finite() {
+        return amount;
+    }
+    // On bare surfaces the fit's depth errs: what has the surface's colour is the surface.
+    let nearest = row * texture.side + column;
+    let color = photograph.picture.get_pixel(pixel[0] as u32, pixel[1] as u32).0.map(|v| f32::from(v).max(4.0).ln());
+    let apart = (0..3).map(|c| (color[c] - texture.log[nearest][c]).abs()).fold(0.0, f32::max);
+    if apart <= SAME {
+        return amount;
+    }
+    let height = support.local(eye + ray * depth).z.abs() / support.height;
+    amount * (2.0 - height / OFF).clamp(0.0, 1.0)
+}
+
+/// The photograph without the shadow, by its map: as training sees it.
+pub fn lit(picture: &RgbImage, map: &RgbImage) -> RgbImage {
+    let mut out = picture.clone();
+    crate::scene::lighten(&mut out, map);
+    out
+}
+
+/// The surface from above as it is seen, with the shadow tinted, and without it; below, the photograph that sees most of it, likewise.
+pub fn picture(found: &Found, photographs: &[Photograph<'_>]) -> RgbImage {
+    let side = found.texture.side as u32;
+    let above = |i: usize| found.texture.log[i].map(|v| if v.is_finite() { v.exp().min(255.0) as u8 } else { 30 });
+    let seen = RgbImage::from_fn(side, side, |x, y| Rgb(above((y * side + x) as usize)));
+    let amount = |i: usize| f64::from(found.shadow.amount[i]);
+    let left = RgbImage::from_fn(side, side, |x, y| {
+        let i = (y * side + x) as usize;
+        Rgb(found.shadow.ratio.map(|r| (255.0 * r.powf(amount(i))).round().clamp(1.0, 255.0) as u8))
+    });
+    let mut rows = vec![triple(&seen, &left)];
+    let maps = photographs.iter().filter_map(|photograph| {
+        let map = map(found, photograph)?;
+        let dark: u64 = map.as_raw().iter().map(|v| 255 - u64::from(*v)).sum();
+        Some((dark, photograph, map))
+    });
+    if let Some((_, photograph, map)) = maps.fold(None, |best: Option<(u64, _, _)>, next| match best {
+        Some(best) if best.0 >= next.0 => Some(best),
+        _ => Some(next),
+    }) {
+        rows.push(triple(photograph.picture, &map));
+    }
+    let width = rows.iter().map(RgbImage::width).max().unwrap_or(1);
+    let height = rows.iter().map(RgbImage::height).sum();
+    let mut out = RgbImage::new(width, height);
+    let mut top = 0;
+    for row in &rows {
+        image::imageops::replace(&mut out, row, 0, top);
+        top += i64::from(row.height());
+    }
+    out
+}
+
+/// A picture, with its shadow tinted, and without it, side by side.
+fn triple(picture: &RgbImage, map: &RgbImage) -> RgbImage {
+    let (w, h) = picture.dimensions();
+    let mut out = RgbImage::new(3 * w, h);
+    let mut tinted = picture.clone();
+    for (pixel, left) in tinted.pixels_mut().zip(map.pixels()) {
+        let dark = 255 - left.0[1];
+        if dark > 2 {
+            let [r, g, b] = pixel.0;
+            *pixel = Rgb([r.saturating_add(dark), g, b.saturating_add(dark / 3)]);
+        }
+    }
+    for (i, part) in [picture, &tinted, &lit(picture, map)].into_iter().enumerate() {
+        image::imageops::replace(&mut out, part, i64::from(w) * i as i64, 0);
+    }
+    out
+}

@@ -1,0 +1,211 @@
+//! The support surface as seen straight from above: each place has the median colour of the photographs that see it.
+
+use glam::DVec3;
+use image::{GrayImage, RgbImage};
+use rayon::prelude::*;
+
+use super::plane::Support;
+use crate::prepare::depth::{DepthMap, Witness};
+use crate::scene::Camera;
+
+/// Cells on each side of the texture, at most.
+const MOST: usize = 320;
+/// Cells along a pixel of the median photograph at the foot of the object.
+const FINER: f64 = 1.6;
+/// Photographs that are compared to find the surface more exactly; of more, every so many.
+const ASKED: usize = 24;
+/// The texture reaches so far beyond the object's radius, in its heights (or radii, where it is wider than high).
+const REACH: f64 = 2.6;
+/// A fit's depth may be off by this part before it hides a place of the surface.
+const HIDDEN: f64 = 0.1;
+/// A place that a photograph sees through by more than this part of the depth is none of the surface.
+const THROUGH: f64 = 0.2;
+/// Fewest photographs that a colour is the median of.
+const FEWEST: usize = 2;
+/// Levels below which a stored value says nothing of a ratio.
+const DARK: f32 = 4.0;
+
+/// Places that photographs are compared at to find the surface more exactly, on each side.
+const COMPARED: usize = 44;
+/// First steps of that: along the normal, in heights of the object, and tilts; they are halved so often.
+const STEPS: [f64; 2] = [0.08, 0.06];
+const HALVED: u32 = 6;
+
+/// A photograph and what is known of it.
+pub struct Photograph<'a> {
+    /// Its camera.
+    pub camera: Camera,
+    /// Its pixels.
+    pub picture: &'a RgbImage,
+    /// Not 0 on the object, enlarged.
+    pub mask: &'a GrayImage,
+    /// The fit's depth, with the object; its camera is the same at any size.
+    pub depth: &'a DepthMap,
+}
+
+impl Photograph<'_> {
+    /// The pixel position at which it shows a place, unless that is outside, behind something or masked.
+    fn shows(&self, place: [f64; 3]) -> Option<[f64; 2]> {
+        let [x, y] = self.camera.project(place)?;
+        let [w, h] = self.camera.size;
+        let inside = x >= 1.0 && y >= 1.0 && x < f64::from(w) - 1.0 && y < f64::from(h) - 1.0;
+        if !inside || self.mask.get_pixel(x as u32, y as u32).0[0] != 0 {
+            return None;
+        }
+        let is_there = self.depth.witness(place, HIDDEN) != Witness::Hidden
+            && self.depth.witness(place, THROUGH) != Witness::Contradicts;
+        is_there.then_some([x, y])
+    }
+
+    /// The logarithms of the channels at a pixel position, bilinear; levels of 255.
+    fn log(&self, [x, y]: [f64; 2]) -> [f32; 3] {
+        let (w, h) = self.picture.dimensions();
+        let (x, y) = (x - 0.5, y - 0.5);
+        let (u, v) = (x as u32, y as u32);
+        let (fx, fy) = ((x - f64::from(u)) as f32, (y - f64::from(v)) as f32);
+        let at = |u: u32, v: u32, c: usize| f32::from(self.picture.get_pixel(u.min(w - 1), v.min(h - 1)).0[c]);
+        std::array::from_fn(|c| {
+            let above = at(u, v, c) * (1.0 - fx) + at(u + 1, v, c) * fx;
+            let below = at(u, v + 1, c) * (1.0 - fx) + at(u + 1, v + 1, c) * fx;
+            (above * (1.0 - fy) + below * fy).max(DARK).ln()
+        })
+    }
+}
+
+/// How much photographs differ on a surface: the mean deviation from the median, of logarithms of the brightness.
+fn disagreement(support: &Support, photographs: &[Photograph<'_>]) -> f64 {
+    let half = reach(support);
+    let one = |i: usize| {
+        let at = |n: usize| ((n as f64 + 0.5) / COMPARED as f64 - 0.5) * 2.0 * half;
+        let place = support.world(DVec3::new(at(i % COMPARED), at(i / COMPARED), 0.0)).to_array();
+        let of = |photograph: &Photograph<'_>| {
+            let log = photograph.log(photograph.shows(place)?);
+            Some(log[0] + log[1] + log[2])
+        };
+        let every = photographs.len().div_ceil(ASKED).max(1);
+        let mut values: Vec<f32> = photographs.iter().step_by(every).filter_map(of).collect();
+        if values.len() < 4 {
+            return None;
+        }
+        values.sort_unstable_by(f32::total_cmp);
+        let median = values[values.len() / 2];
+        let mut apart: Vec<f32> = values.iter().map(|v| (v - median).abs()).collect();
+        apart.sort_unstable_by(f32::total_cmp);
+        // The farthest quarter sees something else.
+        let kept = &apart[..apart.len() * 3 / 4];
+        Some(f64::from(kept.iter().sum::<f32>()) / kept.len() as f64)
+    };
+    let all: Vec<Option<f64>> = (0..COMPARED * COMPARED).into_par_iter().map(one).collect();
+    let count = all.iter().flatten().count();
+    all.iter().flatten().sum::<f64>() / count.max(1) as f64
+}
+
+/// The surface, moved and tilted until the photographs agree best on what it looks like.
+pub fn refined(support: &Support, photographs: &[Photograph<'_>]) -> Support {
+    let (mut best, mut least) = (*support, disagreement(support, photographs));
+    let mut scale = 1.0;
+    for _ in 0..HALVED {
+        for _ in 0..2 {
+            let before = least;
+            for (which, sign) in [(0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0), (2, 1.0), (2, -1.0)] {
+                let step = |i: usize, by: f64| if which == i { sign * scale * by } else { 0.0 };
+                let tried = best.moved(step(0, STEPS[0] * support.height), [step(1, STEPS[1]), step(2, STEPS[1])]);
+                let found = disagreement(&tried, photographs);
+                if found < least {
+                    (best, least) = (tried, found);
+                }
+            }
+            if least == before {
+                break;
+            }
+        }
+        scale *= 0.5;
+    }
+    best
+}
+
+/// Half the side of the texture, world units.
+fn reach(support: &Support) -> f64 {
+    support.radius + REACH * support.height.max(support.radius)
+}
+
+/// The rectified surface. Cell (i, j) is `j * side + i`; its middle lies `(i + 0.5 - side / 2) * cell` along the first
+/// direction of the support and likewise along the second.
+pub struct Texture {
+    /// Cells on each side.
+    pub side: usize,
+    /// World units per cell.
+    pub cell: f64,
+    /// `[cell]` logarithms of the channels, levels of 255; not a number where too few photographs show it.
+    pub log: Vec<[f32; 3]>,
+}
+
+impl Texture {
+    /// The texture around an object, its cells somewhat smaller than a pixel of the median photograph.
+    pub fn of(support: &Support, photographs: &[Photograph<'_>]) -> Self {
+        let half = reach(support);
+        let mut pixels: Vec<f64> = photographs
+            .iter()
+            .filter_map(|photograph| {
+                let z = photograph.camera.to_camera(support.foot.to_array())[2];
+                (z > 0.0).then(|| z / f64::from(photograph.camera.focal[0].min(photograph.camera.focal[1])))
+            })
+            .collect();
+        pixels.sort_unstable_by(f64::total_cmp);
+        let pixel = pixels.get(pixels.len() / 2).copied().unwrap_or(half / 50.0);
+        let side = ((FINER * 2.0 * half / pixel).ceil() as usize).clamp(64, MOST);
+        let mut texture = Self { side, cell: 2.0 * half / side as f64, log: vec![] };
+        let log = |cell: usize| median(texture.place(support, cell), photographs);
+        texture.log = (0..side * side).into_par_iter().map(log).collect();
+        texture
+    }
+
+    /// The world point in the middle of a cell.
+    pub fn place(&self, support: &Support, cell: usize) -> [f64; 3] {
+        let at = |n: usize| (n as f64 + 0.5 - 0.5 * self.side as f64) * self.cell;
+        support.world(DVec3::new(at(cell % self.side), at(cell / self.side), 0.0)).to_array()
+    }
+
+    /// Whether photographs show a cell.
+    pub fn seen(&self, cell: usize) -> bool {
+        self.log[cell][0].is_finite()
+    }
+}
+
+/// The median of what photographs show of a place.
+fn median(place: [f64; 3], photographs: &[Photograph<'_>]) -> [f32; 3] {
+    let mut channels: [Vec<f32>; 3] = Default::default();
+    for pixel in photographs.iter().filter_map(|photograph| Some(photograph.log(photograph.shows(place)?))) {
+        pixel.into_iter().zip(&mut channels).for_each(|(v, c)| c.push(v));
+    }
+    let count = channels[0].len();
+    if count < FEWEST {
+        return [f32::NAN; 3];
+    }
+    let median = |mut values: Vec<f32>| {
+        values.sort_unstable_by(f32::total_cmp);
+        0.5 * (values[(count - 1) / 2] + values[count / 2])
+    };
+    channels.map(median)
+}
+
+/// How much darker a photograph shows some cells than others, beyond what the texture's own colours there differ by: the
+/// ratio of brightness that is left, or nothing where it shows too little of either.
+pub fn left(
+    photograph: &Photograph<'_>,
+    texture: &Texture,
+    support: &Support,
+    [inside, outside]: [&[usize]; 2],
+    lit: &[f32],
+) -> Option<f64> {
+    let median = |cells: &[usize]| {
+        let one = |cell: &usize| {
+            let log = photograph.log(photograph.shows(texture.place(support, *cell))?);
+            Some((log[0] + log[1] + log[2]) / 3.0 - lit[*cell])
+        };
+        let mut values: Vec<f32> = cells.iter().filter_map(one).filter(|v| v.is_finite()).collect();
+        values.sort_unstable_by(f32::total_cmp);
+        (values.len() >= 12.max(cells.len() / 8)).then(|| f64::from(values[values.len() / 2]))
+    };
+    Some((median(inside)? - median(outside)?).exp())
+}
