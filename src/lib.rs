@@ -60,6 +60,7 @@ mod sentence;
 #[cfg(test)]
 #[path = "../tests/common/skip.rs"]
 mod skip;
+pub mod splat;
 pub mod stage;
 pub mod train;
 pub mod view;

@@ -173,6 +173,16 @@ pub(super) struct Cameras {
     pub cameras: Vec<Pose>,
 }
 
+impl Cameras {
+    /// Those of a scene's train views, in the scene's axes.
+    pub(super) fn of(scene: &Scene, background: [f64; 3]) -> Self {
+        let cameras: Vec<Camera> = scene.train.iter().map(|view| view.camera).collect();
+        let focus = path::focus(&cameras, &[]).unwrap_or_default();
+        let cameras = scene.train.iter().map(|view| Pose::new(&view.name, &view.camera)).collect();
+        Self { background, focus, cameras }
+    }
+}
+
 #[derive(Serialize)]
 struct File {
     name: String,

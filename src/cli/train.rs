@@ -22,6 +22,7 @@ use crate::model::files::{POINT_CLOUD, WEIGHTS};
 use crate::render::view::Rendered;
 use crate::scene::doctor::{self, Severity};
 use crate::scene::{Camera, Scene};
+use crate::splat;
 use crate::train::checkpoint::{self, Owner, Search};
 use crate::train::forecast::{self, Fitting, Question};
 use crate::train::run::{LOG, Observer, Progress, Run, Signal, Summary};
@@ -46,6 +47,7 @@ use crate::view::server;
   gscream-vk train synthetic
   gscream-vk train garden --out runs/garden
   gscream-vk train garden --preset paper --set losses.depth.enabled=false --iterations 7000
+  gscream-vk train garden --from scene.ply --out runs/more
   gscream-vk train --resume runs/garden
   gscream-vk train garden --out runs/garden --resume-or-start")]
 pub(super) struct Args {
@@ -54,6 +56,12 @@ pub(super) struct Args {
     scene: Option<PathBuf>,
     #[command(flatten)]
     settings: SettingsArgs,
+    /// Go on from the plain Gaussians of this PLY, SPZ or GLB, of whatever program, instead of the scene's points
+    ///
+    /// It must stand in the scene's own place, axes and units. [same as --set model.from=FILE with model.form=gaussians and
+    /// the file's model.degree]
+    #[arg(long, value_name = "FILE", conflicts_with = "resume")]
+    from: Option<PathBuf>,
     /// Run folder; must not hold a run already [default: runs/SCENE]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
@@ -126,7 +134,11 @@ fn show(address: SocketAddr, name: &str, scene: &Scene, settings: &Settings) -> 
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let began = Instant::now();
-    let given = |scene: &PathBuf| SceneArgs { scene: scene.clone(), settings: args.settings.clone() };
+    let mut settings = args.settings.clone();
+    if let Some(path) = &args.from {
+        settings.set.splice(0..0, begun_from(path)?);
+    }
+    let given = |scene: &PathBuf| SceneArgs { scene: scene.clone(), settings: settings.clone() };
     let given = args.scene.as_ref().map(given);
     let (mut scene, mut settings, name, path, folder, begun, _lock) = if let Some(folder) = &args.resume {
         let read = || {
@@ -199,6 +211,22 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         next::say(&steps);
         Ok(())
     })
+}
+
+/// The settings of a training that goes on from a splat.
+fn begun_from(path: &Path) -> anyhow::Result<Vec<String>> {
+    let splat = splat::read::read(path)?;
+    let absolute = std::path::absolute(path).with_context(|| path.display().to_string())?;
+    let name = toml::Value::String(absolute.to_string_lossy().into_owned());
+    // Room to grow by a half.
+    let most = splat.len() + splat.len() / 2;
+    Ok(vec![
+        "model.form=gaussians".to_owned(),
+        format!("model.degree={}", splat.cloud.degree),
+        format!("model.from={name}"),
+        format!("densify.max_gaussians={most}"),
+        "scene.dense=false".to_owned(),
+    ])
 }
 
 /// Says again what is wrong with the scene, now that the lines of the start have scrolled away.

@@ -93,7 +93,15 @@ impl Settings {
         self.render.validate().map_err(|invalid| invalid.inside("render"))?;
         self.losses.validate().map_err(|invalid| invalid.inside("losses"))?;
         self.optimizer.validate().map_err(|invalid| invalid.inside("optimizer"))?;
-        self.densify.validate().map_err(|invalid| invalid.inside("densify"))
+        self.densify.validate().map_err(|invalid| invalid.inside("densify"))?;
+        let frozen = self.model.frozen;
+        ensure(
+            frozen == 0 || !self.densify.enabled,
+            "model.frozen",
+            frozen,
+            "keeps Gaussians as they are, which relocation moves; set densify.enabled=false",
+        )
+        .map_err(|invalid| invalid.against("densify.enabled"))
     }
 
     /// These settings with what is given in pixels turned into world units of this scene: the initial grid, the growth cells

@@ -31,6 +31,10 @@ impl Form {
 pub struct Config {
     /// Anchors, or plain Gaussians.
     pub form: Form,
+    /// PLY, SPZ or GLB file of the plain Gaussians that training begins with, in place of the scene's points; "": those.
+    pub from: String,
+    /// So many of the first plain Gaussians stay as they are: the others alone are learnt.
+    pub frozen: u32,
     /// Highest degree of the harmonics of plain Gaussians, 0 to 3: 0 shows the same colour from everywhere.
     pub degree: u32,
     /// Edge of the grid to which points are snapped to become anchors, in scene units (Scaffold-GS: 0.001 in general,
@@ -81,6 +85,8 @@ impl Default for Config {
     fn default() -> Self {
         Self {
             form: Form::Anchors,
+            from: String::new(),
+            frozen: 0,
             degree: 1,
             voxel: 0.001,
             voxel_pixels: 0.0,
@@ -119,6 +125,11 @@ impl Config {
             "model.form is \"gaussians\", which have no features to attend to; set model.attention.enabled=false",
         )
         .map_err(|invalid| invalid.against("form"))?;
+        let plain = self.form == Form::Gaussians;
+        let what = "begins with plain Gaussians; set model.form=gaussians";
+        ensure(plain || self.from.is_empty(), "from", &self.from, what).map_err(|invalid| invalid.against("form"))?;
+        let what = "keeps plain Gaussians; set model.form=gaussians";
+        ensure(plain || self.frozen == 0, "frozen", self.frozen, what).map_err(|invalid| invalid.against("form"))?;
         ensure(self.voxel.is_finite(), "voxel", self.voxel, "must be finite (0 derives it from the points)")?;
         let pixels = self.voxel_pixels;
         ensure((0.0..=1e6).contains(&pixels), "voxel_pixels", pixels, "must be a number of pixels, or 0")?;

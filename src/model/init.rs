@@ -20,6 +20,9 @@ pub enum Error {
     /// Nothing to start from.
     #[error("the reconstruction has no points: training starts from its sparse point cloud")]
     NoPoints,
+    /// Plain Gaussians that cannot be begun with.
+    #[error("{0}")]
+    From(String),
     /// A point that is NaN or infinite.
     #[error("point {index} of the reconstruction is not finite ({position:?})")]
     NotFinite {

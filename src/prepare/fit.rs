@@ -6,7 +6,8 @@ use super::record::Batch;
 use super::{Error, Request, Watch};
 use crate::config::Settings;
 use crate::gpu::Gpu;
-use crate::model::files::{self, Anchors, POINT_CLOUD, WEIGHTS, Weights};
+use crate::model::files::{POINT_CLOUD, WEIGHTS};
+use crate::model::stored::Stored;
 use crate::scene::Scene;
 use crate::train::run::{Observer, Progress, Run, Signal};
 
@@ -14,11 +15,10 @@ use crate::train::run::{Observer, Progress, Run, Signal};
 pub const FOLDER: &str = "prepare/fit";
 
 /// A fit.
+#[derive(Clone, Debug)]
 pub struct Fit {
-    /// What is learnt per anchor.
-    pub anchors: Anchors,
-    /// The decoders.
-    pub weights: Weights,
+    /// Anchors that were fitted, or the plain Gaussians of a splat that the photographs are pictures of.
+    pub model: Stored,
     /// What it was made with.
     pub settings: Settings,
 }
@@ -77,8 +77,16 @@ pub fn make(gpu: &Gpu, scene: &Scene, settings: Settings, watch: &mut dyn Watch)
         batch.bytes(format!("{FOLDER}/{name}"), bytes, "a short fit to the photographs");
     }
     batch.figures.insert("anchors".into(), f64::from(summary.anchors));
-    let (anchors, weights) = files::load(&model)?;
-    Ok((batch, Fit { anchors, weights, settings }))
+    Ok((batch, Fit { model: Stored::load(&model)?, settings }))
+}
+
+/// A fit that is there already: the splat whose pictures the photographs are.
+#[derive(Clone, Debug)]
+pub struct Ready {
+    /// The fit.
+    pub fit: Fit,
+    /// A hash of what it was made of.
+    pub made_of: String,
 }
 
 impl Fit {
@@ -87,7 +95,14 @@ impl Fit {
     /// # Errors
     /// Files that cannot be read.
     pub fn read(root: &Path, settings: Settings) -> Result<Self, Error> {
-        let (anchors, weights) = files::load(&root.join(FOLDER))?;
-        Ok(Self { anchors, weights, settings })
+        Ok(Self { model: Stored::load(&root.join(FOLDER))?, settings })
+    }
+
+    /// The positions of the anchors or of the plain Gaussians, scene units.
+    pub fn positions(&self) -> &[[f32; 3]] {
+        match &self.model {
+            Stored::Anchors(anchors, _) => &anchors.position,
+            Stored::Gaussians(cloud) => &cloud.position,
+        }
     }
 }

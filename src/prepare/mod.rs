@@ -18,6 +18,7 @@ pub mod splats;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use image::GrayImage;
 
@@ -165,6 +166,8 @@ pub struct Request {
     pub reference: Option<String>,
     /// The steps to run, whose inputs must be there; all if empty.
     pub only: Vec<Step>,
+    /// The fit, where there is one: the step is left out, and nothing is written for it.
+    pub ready: Option<Arc<fit::Ready>>,
     /// Steps of the fit.
     pub fit_steps: u32,
     /// The longer side of the pictures that the fit is made with, pixels.
@@ -190,6 +193,7 @@ impl Request {
             object: vec![],
             reference: None,
             only: vec![],
+            ready: None,
             fit_steps: 600,
             fit_side: 256,
             depth: true,
@@ -306,7 +310,7 @@ fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(
         return Err(no_such_view(name, "--reference", scene.train.iter().map(|v| v.name.as_str())));
     }
     let fit = preparation.fit(&scene)?;
-    let mut splats = Splats::new(gpu, &fit.anchors, &fit.weights, &fit.settings.render)?;
+    let mut splats = Splats::new(gpu, &fit.model, &fit.settings.render)?;
     let masked = |preparation: &Preparation<'_>| preparation.masks_on_disk(&scene);
     if request.wants(Step::Masks) {
         preparation.masks(&scene, &fit, &mut splats, &object)?;
@@ -603,6 +607,9 @@ impl Preparation<'_> {
     }
 
     fn fit(&mut self, scene: &Scene) -> Result<Fit, Error> {
+        if let Some(ready) = &self.request.ready {
+            return Ok(ready.fit.clone());
+        }
         let settings = fit::settings(self.request, scene.points.len());
         let fingerprint = serde_json::to_string(&Fingerprint::of(scene)).expect("names and hashes");
         let inputs = Inputs::default().with(fingerprint).with(settings.to_toml()).finish();
@@ -621,6 +628,9 @@ impl Preparation<'_> {
 
     /// What of the fit counts as input of a step behind it.
     fn fit_hash(&self) -> String {
+        if let Some(ready) = &self.request.ready {
+            return ready.made_of.clone();
+        }
         self.folder.record().steps.get(Step::Fit.name()).map_or_else(String::new, |step| {
             step.files.values().map(|file| file.hash.as_str()).collect::<Vec<_>>().join(" ")
         })
@@ -662,7 +672,7 @@ impl Preparation<'_> {
             }
         }
         let colors = masks::colors(splats, &scene.train)?;
-        let shares = votes.count(&fit.anchors.position, &colors);
+        let shares = votes.count(fit.positions(), &colors);
         let mut batch = Batch::default();
         let names: Vec<&str> = given.keys().map(String::as_str).collect();
         let from = format!("carried from {}", abridged(&names));

@@ -19,7 +19,7 @@ use super::lens::{self, Pinhole};
 use super::program::{self, Halt};
 use super::record::{self, Batch, Inputs};
 use super::{Error, Watch};
-use crate::scene::{self, colmap, undistort};
+use crate::scene::{self, Camera, colmap, undistort};
 
 /// Where a scene keeps its photographs and its model.
 pub const IMAGES: &str = "images";
@@ -698,6 +698,27 @@ fn shot(frame: &Frame, name: &str, lens: &colmap::Lens, pinhole: Option<&Pinhole
     let rotation = DQuat::from_mat3(&axes).normalize().inverse();
     let translation = -(rotation * column(3));
     Ok(Shot { id: None, name: name.to_owned(), size: lens.size, parameters, rotation, translation })
+}
+
+/// `cameras.bin` and `images.bin` with these names and cameras.
+pub(crate) fn model_of<'a>(cameras: impl Iterator<Item = (&'a str, &'a Camera)>) -> [(&'static str, Vec<u8>); 2] {
+    let shots: Vec<Shot> = cameras
+        .map(|(name, camera)| {
+            let axes = camera.rotation.map(|row| DVec3::from_array(row.map(f64::from)));
+            let of = |[a, b]: [f32; 2]| [f64::from(a), f64::from(b)];
+            let ([fx, fy], [cx, cy]) = (of(camera.focal), of(camera.principal));
+            let [k1, k2, p1, p2] = camera.distortion.map(f64::from);
+            Shot {
+                id: None,
+                name: name.to_owned(),
+                size: camera.size,
+                parameters: [fx, fy, cx, cy, k1, k2, p1, p2],
+                rotation: DQuat::from_mat3(&DMat3::from_cols(axes[0], axes[1], axes[2]).transpose()).normalize(),
+                translation: DVec3::from_array(camera.translation),
+            }
+        })
+        .collect();
+    model_files_of(&shots)
 }
 
 /// `cameras.bin` and `images.bin`, a camera for each photograph: unlike lines of text they hold any name.

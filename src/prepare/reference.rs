@@ -211,7 +211,7 @@ fn votes(task: &Task<'_>, fit: &Fit, splats: &mut Splats, watch: &mut dyn Watch)
         watch.turn(i as u64)?;
     }
     let colors = masks::colors(splats, &task.scene.train)?;
-    Ok(votes.count(&fit.anchors.position, &colors))
+    Ok(votes.count(fit.positions(), &colors))
 }
 
 /// Makes the reference picture, the map of where its pixels are from and, if asked for, its depth.

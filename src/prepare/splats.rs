@@ -1,16 +1,15 @@
 //! The Gaussians of a fit, one by one: who has a share in which pixels, and pictures with other colours.
 //!
 //! A Gaussian is named by its anchor and its number within it, `anchor K + k`: decoded Gaussians differ from view to view,
-//! their names do not.
+//! their names do not. A plain Gaussian is named by its own number.
 
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
-use crate::model::anchors::Anchors;
-use crate::model::files;
+use crate::model::stored::Stored;
 use crate::render::bin::Binned;
-use crate::render::forward::{Capacity, Model};
+use crate::render::forward::{Capacity, Front};
 use crate::render::rasterize::{self, Backward, Outputs, Picture, PictureGradient, Projected};
 use crate::render::session::{Room, Stages};
-use crate::render::view::Rendered;
+use crate::render::view::{Finished, Rendered};
 use crate::render::{Config, Session};
 use crate::scene::Camera;
 
@@ -38,8 +37,7 @@ impl Canvas {
 /// Draws and questions a model Gaussian by Gaussian.
 pub struct Splats {
     gpu: Gpu,
-    anchors: Anchors,
-    weights: Buffer<f32>,
+    model: Finished,
     session: Session<Canvas>,
 }
 
@@ -48,21 +46,20 @@ impl Splats {
     ///
     /// # Errors
     /// When the device has no room for it.
-    pub fn new(gpu: &Gpu, anchors: &files::Anchors, weights: &files::Weights, config: &Config) -> Result<Self, Error> {
-        let weights = gpu.upload("weights", &weights.decoders())?;
-        let anchors = Anchors::upload(gpu, anchors, 0)?;
-        let session = Session::new(gpu, config, Capacity::guess(anchors.count), Canvas::new)?;
-        Ok(Self { gpu: gpu.clone(), anchors, weights, session })
+    pub fn new(gpu: &Gpu, model: &Stored, config: &Config) -> Result<Self, Error> {
+        let model = Finished::upload(gpu, model)?;
+        let session = Session::new(gpu, config, Capacity::guess(model.count()), Canvas::new)?;
+        Ok(Self { gpu: gpu.clone(), model, session })
     }
 
     /// How many names there are.
     pub fn len(&self) -> usize {
-        self.anchors.count as usize * self.anchors.offsets as usize
+        self.model.count() as usize * self.offsets()
     }
 
-    /// How many names an anchor has.
+    /// How many names an anchor has; a plain Gaussian has one.
     pub fn offsets(&self) -> usize {
-        self.anchors.offsets as usize
+        self.model.offsets() as usize
     }
 
     /// Whether there is no Gaussian at all.
@@ -76,13 +73,16 @@ impl Splats {
         camera: &Camera,
         work: impl Fn(&mut Recorder<'_>, &Stages<Canvas>, Binned<'_>),
     ) -> Result<&Stages<Canvas>, Error> {
-        self.session.run(Model::Anchors { anchors: &self.anchors, weights: &self.weights }, camera, work)
+        self.session.run(self.model.model(), camera, work)
     }
 
     /// Runs the forward stages for a camera; returns the slots of the Gaussians that exist, with their names.
     fn decode(&mut self, camera: &Camera) -> Result<Vec<(u32, u32)>, Error> {
-        let (gpu, offsets) = (self.gpu.clone(), self.anchors.offsets);
+        let (gpu, offsets) = (self.gpu.clone(), self.model.offsets());
         let forward = &self.run(camera, |_, _, _| {})?.forward;
+        if let Front::Gaussians { count, .. } = forward.front {
+            return Ok((0..count).map(|name| (name, name)).collect());
+        }
         let visible = gpu.read(&forward.visible().count)?[0];
         let list = gpu.read_range(&forward.visible().list, visible as usize)?;
         let existing = &forward.decode().existing;
@@ -97,7 +97,7 @@ impl Splats {
     /// When the device has no room, or is lost.
     pub fn colors(&mut self, camera: &Camera) -> Result<Vec<(u32, [f32; 3])>, Error> {
         let names = self.decode(camera)?;
-        let colors = self.gpu.read(&self.session.stages().forward.decode().color)?;
+        let colors = self.gpu.read(self.session.stages().forward.projected().color)?;
         Ok(names.into_iter().map(|(slot, name)| (name, colors[slot as usize])).collect())
     }
 
@@ -146,8 +146,8 @@ impl Splats {
         let names = self.decode(camera)?;
         let gpu = self.gpu.clone();
         let Stages { forward, own: Canvas { color, opacity, .. }, .. } = self.session.stages();
-        let mut colors = gpu.read(&forward.decode().color)?;
-        let mut opacities = gpu.read(&forward.decode().opacity)?;
+        let mut colors = gpu.read(forward.projected().color)?;
+        let mut opacities = gpu.read(forward.projected().opacity)?;
         for (slot, name) in names {
             let slot = slot as usize;
             match look(name, colors[slot]) {

@@ -117,9 +117,51 @@ pub struct Renderer {
 
 /// A finished model on the device.
 #[expect(clippy::large_enum_variant, reason = "a renderer has one")]
-enum Finished {
+pub enum Finished {
+    /// Anchors and their decoders, flat.
     Anchors(Anchors, Buffer<f32>),
+    /// Plain Gaussians.
     Gaussians(Static),
+}
+
+impl Finished {
+    /// This model on the device.
+    ///
+    /// # Errors
+    /// When the device has no room for it.
+    pub fn upload(gpu: &Gpu, model: &Stored) -> Result<Self, Error> {
+        Ok(match model {
+            Stored::Anchors(anchors, weights) => {
+                let weights = gpu.upload("weights", &weights.decoders())?;
+                Self::Anchors(Anchors::upload(gpu, anchors, 0)?, weights)
+            }
+            Stored::Gaussians(cloud) => Self::Gaussians(Static::upload(gpu, cloud)?),
+        })
+    }
+
+    /// Anchors or plain Gaussians.
+    pub fn count(&self) -> u32 {
+        match self {
+            Self::Anchors(anchors, _) => anchors.count,
+            Self::Gaussians(gaussians) => gaussians.count,
+        }
+    }
+
+    /// Gaussians of an anchor; 1 for plain ones.
+    pub fn offsets(&self) -> u32 {
+        match self {
+            Self::Anchors(anchors, _) => anchors.offsets,
+            Self::Gaussians(_) => 1,
+        }
+    }
+
+    /// The model as the forward stages read it.
+    pub fn model(&self) -> Model<'_> {
+        match self {
+            Self::Anchors(anchors, weights) => Model::Anchors { anchors, weights },
+            Self::Gaussians(gaussians) => Model::Gaussians(gaussians),
+        }
+    }
 }
 
 impl Renderer {
@@ -145,13 +187,9 @@ impl Renderer {
     /// # Errors
     /// When the device has no room for it.
     pub fn of(gpu: &Gpu, model: &Stored, config: &super::Config, background: [f32; 3]) -> Result<Self, Error> {
-        let cloud = match model {
-            Stored::Anchors(anchors, weights) => return Self::new(gpu, anchors, weights, config, background),
-            Stored::Gaussians(cloud) => cloud,
-        };
-        let gaussians = Static::upload(gpu, cloud)?;
-        let painter = Painter::new(gpu, config, background, Capacity::guess(gaussians.count))?;
-        Ok(Self { painter, model: Finished::Gaussians(gaussians) })
+        let model = Finished::upload(gpu, model)?;
+        let painter = Painter::new(gpu, config, background, Capacity::guess(model.count()))?;
+        Ok(Self { painter, model })
     }
 
     /// For pictures so many times larger than those of the training.
@@ -165,10 +203,6 @@ impl Renderer {
     /// # Errors
     /// When the device has no room for it, or is lost.
     pub fn render(&mut self, camera: &Camera) -> Result<Rendered, Error> {
-        let model = match &self.model {
-            Finished::Anchors(anchors, weights) => Model::Anchors { anchors, weights },
-            Finished::Gaussians(gaussians) => Model::Gaussians(gaussians),
-        };
-        self.painter.render(model, camera)
+        self.painter.render(self.model.model(), camera)
     }
 }

@@ -223,12 +223,12 @@ pub fn lenses(scene: &Path) -> Result<(Lenses, Vec<Image>), Error> {
     cameras_and_images(scene, READ).map(|(_, cameras, images)| (cameras, images))
 }
 
-/// The model's folder under `scene` and the extension of its cameras and images.
+/// The model's folder under `scene`, which may be `scene` itself, and the extension of its cameras and images.
 ///
 /// # Errors
 /// No model.
 pub(crate) fn folder(scene: &Path) -> Result<(PathBuf, &'static str), Error> {
-    let folders = [scene.join("sparse/0"), scene.join("sparse")];
+    let folders = [scene.join("sparse/0"), scene.join("sparse"), scene.to_owned()];
     let has = |folder: &Path, extension: &str| {
         ["cameras", "images"].iter().all(|stem| folder.join(stem).with_extension(extension).is_file())
     };

@@ -11,6 +11,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use image::{GrayImage, RgbImage};
 use serde::Serialize;
 
+use super::begin;
 use super::photographs;
 use super::plan::Plan;
 use super::step::{Rates, Step};
@@ -85,9 +86,7 @@ impl Beginning {
     pub fn of(scene: &Scene, settings: &Settings) -> Result<Self, init::Error> {
         Ok(match settings.model.form {
             Form::Anchors => Self::Anchors(initial(scene, settings)?),
-            Form::Gaussians => {
-                Self::Gaussians(init::gaussians(&scene.starts(), &settings.model, settings.densify.max_gaussians)?)
-            }
+            Form::Gaussians => Self::Gaussians(begin::gaussians(scene, settings)?),
         })
     }
 

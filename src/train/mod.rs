@@ -3,6 +3,7 @@
 #![doc = include_str!("README.md")]
 
 pub mod attend;
+pub mod begin;
 pub mod checkpoint;
 pub mod config;
 pub mod forecast;

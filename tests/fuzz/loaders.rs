@@ -12,6 +12,7 @@ use gscream_vk::prepare::graph_cut::Strokes;
 use gscream_vk::prepare::lens::Pinhole;
 use gscream_vk::prepare::{Silent, poses, record};
 use gscream_vk::scene::{self, PriorKind, colmap};
+use gscream_vk::splat;
 use gscream_vk::train::checkpoint::{self, History, Model, Owner, State};
 use gscream_vk::train::plan::Plan;
 use gscream_vk::train::step::Step;
@@ -171,6 +172,15 @@ fn exports() {
     Loader::of_bytes("scene.ply", clouds.iter().map(ply::encode).collect()).run(|bytes| told(ply::decode(bytes)));
     let glb = clouds.iter().map(|cloud| gltf::encode(cloud).expect("it fits")).collect();
     Loader::of_bytes("scene.glb", glb).run(|bytes| told(gltf::decode(bytes)));
+    // Of other programs: what they wrote is spliced, too.
+    let whole = |bytes: &[u8]| {
+        told(splat::read::decode(bytes.to_vec()).map(|splat| splat.spliced(&vec![true; splat.len()], &clouds[0])))
+    };
+    Loader::of_bytes("splat.ply", clouds.iter().map(ply::encode).collect()).run(whole);
+    Loader::of_text("splat.ply (header)", clouds.iter().take(1).map(ply::encode).collect()).run(whole);
+    Loader::of_bytes("splat.ply (compressed)", vec![seeds::compressed_splat()]).run(whole);
+    Loader::of_text("splat.ply (compressed, header)", vec![seeds::compressed_splat()]).run(whole);
+    Loader::of_text("cameras.json", vec![seeds::cameras_json()]).run(of_file("cameras.json", splat::cameras::read));
     let packed: Vec<_> = clouds.iter().map(|cloud| spz::encode(cloud).expect("it fits")).collect();
     Loader::of_bytes("scene.spz", packed.clone()).run(|bytes| told(spz::decode(bytes)));
     let raw: Vec<_> = packed.iter().map(|bytes| seeds::gunzip(bytes)).collect();

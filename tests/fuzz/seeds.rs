@@ -193,3 +193,31 @@ pub fn with_digest(mut bytes: Vec<u8>) -> Vec<u8> {
     }
     bytes
 }
+
+/// SuperSplat's compressed PLY of three Gaussians of degree 1.
+pub fn compressed_splat() -> Vec<u8> {
+    let mut head = String::from("ply\nformat binary_little_endian 1.0\nelement chunk 1\n");
+    for stem in ["x", "y", "z", "scale_x", "scale_y", "scale_z", "r", "g", "b"] {
+        head += &format!("property float min_{stem}\nproperty float max_{stem}\n");
+    }
+    head += "element vertex 3\n";
+    ["position", "rotation", "scale", "color"].iter().for_each(|n| head += &format!("property uint packed_{n}\n"));
+    head += "element sh 3\n";
+    (0..9).for_each(|i| head += &format!("property uchar f_rest_{i}\n"));
+    let mut bytes = (head + "end_header\n").into_bytes();
+    (0..9).for_each(|_| [0f32, 1.0].iter().for_each(|v| bytes.extend(v.to_le_bytes())));
+    (0..12u32).for_each(|i| bytes.extend(i.wrapping_mul(0x9e37_79b9).to_le_bytes()));
+    bytes.extend([128; 27]);
+    bytes
+}
+
+/// The cameras that 3DGS writes.
+pub fn cameras_json() -> Vec<u8> {
+    let entry = |id: usize| {
+        format!(
+            r#"{{"id": {id}, "img_name": "a{id}", "width": 64, "height": 48, "position": [{id}.5, 0.0, -2.0], "rotation":
+            [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], "fy": 60.0, "fx": 60.0}}"#
+        )
+    };
+    format!("[{}]", (0..3).map(entry).collect::<Vec<_>>().join(",")).into_bytes()
+}

@@ -1,6 +1,7 @@
 //! `gscream-vk remove`: point at it, and it is gone.
 
 mod page;
+mod splat;
 mod work;
 
 use std::path::{Path, PathBuf};
@@ -15,6 +16,7 @@ use crate::export;
 use crate::folder::Lock;
 use crate::prepare::poses;
 use crate::remove::objects;
+use crate::splat::read;
 use work::{Job, Places};
 
 /// The run's folder within what is made.
@@ -29,15 +31,20 @@ pub(super) const RUN: &str = "run";
 /// PHOTOS is what prepare takes: a folder of photographs, alone or with a COLMAP model or a transforms.json. Everything goes
 /// into one folder: the masks that were clicked (objects/NAME.png), the scene (scene/), the run (run/), and the files for
 /// viewers. The same command again goes on where it was cut off, and makes again only what has changed.
+///
+/// A splat of any program (PLY of 3D Gaussian Splatting, SuperSplat's compressed PLY, SPZ, or GLB with
+/// KHR_gaussian_splatting) stands for photographs as well: it is drawn from --cameras, the object's Gaussians are taken out,
+/// new ones are trained in the hole, and every other Gaussian stays as it is.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   gscream-vk remove photos
   gscream-vk remove photos --minutes 20
+  gscream-vk remove scene.ply --cameras sparse/0 --mask IMG_0012=mask.png --yes
   gscream-vk remove photos --out garden --mask IMG_0012=mask.png
   gscream-vk remove photos --out garden --box IMG_0012=310,220,540,470 --yes
   gscream-vk remove photos --out garden --yes      # with the masks in garden/objects")]
 pub(super) struct Args {
-    /// Folder of photographs
+    /// Folder of photographs, or a splat (PLY, SPZ or GLB)
     #[arg(value_name = "PHOTOS")]
     photographs: PathBuf,
     /// Folder for all that is made [default: PHOTOS-removed, here]
@@ -45,6 +52,12 @@ pub(super) struct Args {
     out: Option<PathBuf>,
     #[command(flatten)]
     object: ObjectArgs,
+    /// Cameras to look at a splat from: a cameras.json, or the folder of a COLMAP model [default: cameras.json beside it]
+    #[arg(long, value_name = "PATH")]
+    cameras: Option<PathBuf>,
+    /// Views of a splat at most, evenly spread over the cameras
+    #[arg(long, value_name = "N", default_value_t = 60, value_parser = clap::value_parser!(u32).range(3..))]
+    views: u32,
     /// No page and no questions: take the masks that are there, and go on whatever doctor finds
     #[arg(long)]
     yes: bool,
@@ -75,15 +88,16 @@ pub(super) struct Args {
 }
 
 impl Args {
-    fn job(&self) -> Job<'_> {
-        Job { args: self, places: Places::new(self.out.clone().unwrap_or_else(|| default_folder(&self.photographs))) }
+    fn places(&self) -> Places {
+        Places::new(self.out.clone().unwrap_or_else(|| default_folder(&self.photographs)))
     }
 }
 
 /// The last part of the photographs' folder, and `-removed`.
 fn default_folder(photographs: &Path) -> PathBuf {
     let absolute = photographs.canonicalize().unwrap_or_else(|_| photographs.to_owned());
-    let mut name = absolute.file_name().map_or_else(|| "photos".into(), std::ffi::OsStr::to_owned);
+    let own = if read::is_splat(&absolute) { absolute.file_stem() } else { absolute.file_name() };
+    let mut name = own.map_or_else(|| "photos".into(), std::ffi::OsStr::to_owned);
     name.push("-removed");
     name.into()
 }
@@ -91,9 +105,19 @@ fn default_folder(photographs: &Path) -> PathBuf {
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     // A mistake in the settings is said before anything is made.
     args.settings.resolve()?;
-    let job = args.job();
-    let capture = poses::find(&args.photographs)?;
-    let _lock = Lock::take(&job.places.root)?;
+    let places = args.places();
+    let is_splat = read::is_splat(&args.photographs);
+    if args.cameras.is_some() && !is_splat {
+        anyhow::bail!("--cameras: are a splat's; photographs bring theirs (see prepare)");
+    }
+    let found = if is_splat { None } else { Some(poses::find(&args.photographs)?) };
+    let _lock = Lock::take(&places.root)?;
+    let splat = if is_splat { Some(splat::open(args, &places)?) } else { None };
+    let job = Job { args, places, splat };
+    let capture = match found {
+        Some(capture) => capture,
+        None => poses::find(job.photographs())?,
+    };
     if args.object.evidence().is_empty() && !args.yes {
         return page::run(&job, &capture);
     }

@@ -171,7 +171,7 @@ impl Carrier {
     fn new(job: &Job<'_>, gpu: &Gpu, session: &Session) -> anyhow::Result<Self> {
         session.begin("poses", 0);
         let (scene, fit) = job.fitted(gpu, &Visitors(session))?;
-        let mut splats = Splats::new(gpu, &fit.anchors, &fit.weights, &fit.settings.render)?;
+        let mut splats = Splats::new(gpu, &fit.model, &fit.settings.render)?;
         session.begin("shape", scene.train.len() as u64);
         let colors = masks::colors(&mut splats, &scene.train)?;
         let numbers: Vec<Option<usize>> = scene.train.iter().map(|view| session.number(&view.name)).collect();
@@ -207,7 +207,7 @@ impl Carrier {
             let mut sum = Votes::new(&self.splats);
             let others = self.votes.iter().filter(|(number, _)| Some(**number) != without);
             others.for_each(|(_, (_, votes))| sum.join(votes));
-            sum.count(&self.fit.anchors.position, &self.colors)
+            sum.count(self.fit.positions(), &self.colors)
         };
         if self.votes.is_empty() {
             session.carried(revision);

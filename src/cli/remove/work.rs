@@ -10,17 +10,20 @@ use anyhow::{Context as _, bail};
 use serde::{Deserialize, Serialize};
 
 use super::Args;
+use super::splat::Source;
 use crate::atomic::AtomicWriteFile;
 use crate::cli::folders::{MODEL, Record as RunRecord};
 use crate::cli::prepare::Bars;
 use crate::cli::shared::{SceneArgs, add_dense};
 use crate::cli::train::{self, Manner, Stop, Trained};
 use crate::cli::{doctor as findings, export, minutes, preset};
+use crate::config::SettingsArgs;
 use crate::evaluate::Judge;
 use crate::export::{Observer, Options};
 use crate::gpu::Gpu;
 use crate::model::files::{POINT_CLOUD, WEIGHTS};
 use crate::prepare::record::{self, Inputs};
+use crate::prepare::shadow::Answer;
 use crate::prepare::{self, Evidence, Request, Step, Watch};
 use crate::scene::doctor::Report;
 use crate::train::checkpoint::{self, Fingerprint};
@@ -57,6 +60,8 @@ impl Places {
 pub struct Job<'a> {
     /// As the user asked for it.
     pub args: &'a Args,
+    /// The splat, where there is one in place of photographs.
+    pub splat: Option<Source>,
     /// Where to.
     pub places: Places,
 }
@@ -87,7 +92,7 @@ impl Audience for Nobody {}
 
 /// The contents of `remove.json`: hashes of what was made of what.
 #[derive(Default, Serialize, Deserialize)]
-struct Record {
+pub(super) struct Record {
     version: String,
     /// The hash of what the run was begun with.
     train: String,
@@ -99,7 +104,7 @@ const RECORD: &str = "remove.json";
 
 impl Record {
     /// An unreadable one says nothing: all is made again.
-    fn read(root: &Path) -> Self {
+    pub(super) fn read(root: &Path) -> Self {
         let text = std::fs::read(root.join(RECORD)).unwrap_or_default();
         serde_json::from_slice(&text).unwrap_or_default()
     }
@@ -176,15 +181,23 @@ impl Observer for Watched<'_, export::Bars> {
 }
 
 impl Job<'_> {
+    /// The folder of the photographs, or of the splat's pictures.
+    pub fn photographs(&self) -> &Path {
+        self.splat.as_ref().map_or(&self.args.photographs, |splat| &splat.views)
+    }
+
     /// The request to `prepare`.
     pub fn request(&self, object: Vec<(String, Evidence)>) -> Request {
-        let Args { photographs, reference, shadow, fit_steps, .. } = self.args;
+        let Args { reference, shadow, fit_steps, .. } = self.args;
+        // A splat's own Gaussians keep their shadow: only the hole changes.
+        let shadow = if self.splat.is_some() { Answer::Keep } else { shadow.answer() };
         Request {
             object,
+            ready: self.splat.as_ref().map(|splat| splat.ready.clone()),
             reference: reference.clone(),
-            shadow: shadow.answer(),
+            shadow,
             fit_steps: *fit_steps,
-            ..Request::new(photographs, &self.places.scene)
+            ..Request::new(self.photographs(), &self.places.scene)
         }
     }
 
@@ -225,8 +238,11 @@ impl Job<'_> {
                 if problems == 1 { "problem" } else { "problems" }
             ),
         }
+        if let Some(source) = &self.splat {
+            return self.splice(gpu, source, audience);
+        }
         let mut record = Record::read(root);
-        self.train(gpu, &mut record, audience)?;
+        self.train(gpu, &mut record, audience, &self.args.settings)?;
         let mut inputs = Inputs::default().with(self.args.export_steps.to_le_bytes());
         // Plain Gaussians have no decoders.
         for name in [POINT_CLOUD, WEIGHTS].into_iter().filter(|name| run.join(MODEL).join(name).is_file()) {
@@ -243,8 +259,14 @@ impl Job<'_> {
         record.write(root)
     }
 
-    fn train(&self, gpu: &Gpu, record: &mut Record, audience: &dyn Audience) -> anyhow::Result<()> {
-        let Args { settings, device, minutes, .. } = self.args;
+    pub(super) fn train(
+        &self,
+        gpu: &Gpu,
+        record: &mut Record,
+        audience: &dyn Audience,
+        settings: &SettingsArgs,
+    ) -> anyhow::Result<()> {
+        let Args { device, minutes, .. } = self.args;
         let Places { root, scene: folder, run, .. } = &self.places;
         let began = Instant::now();
         let given = SceneArgs { scene: folder.clone(), settings: settings.clone() };

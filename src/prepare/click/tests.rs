@@ -94,7 +94,7 @@ struct Found {
 fn measure(request: &Request, truth: &Path, every: usize) -> Found {
     let gpu = testing::gpu();
     let (scene, fit) = prepare::fitted(&gpu, request, &mut Silent).expect("a fit");
-    let mut splats = Splats::new(&gpu, &fit.anchors, &fit.weights, &fit.settings.render).expect("room");
+    let mut splats = Splats::new(&gpu, &fit.model, &fit.settings.render).expect("room");
     let files = scene::pictures(&request.out.join("images")).expect("photographs");
     let truths = scene::pictures(truth).expect("masks");
     let truth =
@@ -130,7 +130,7 @@ fn measure(request: &Request, truth: &Path, every: usize) -> Found {
             for (n, (given, _)) in after.iter().enumerate() {
                 let mut votes = Votes::new(&splats);
                 votes.add(&mut splats, &view.camera, &masks::parts(given, view.camera.size)).expect("votes");
-                let shares = votes.count(&fit.anchors.position, &colors);
+                let shares = votes.count(fit.positions(), &colors);
                 let others: Vec<usize> = looked.iter().copied().filter(|other| *other != i).collect();
                 for &other in &others {
                     let other = &scene.train[other];

@@ -16,6 +16,7 @@ use crate::primitives::limit::{COUNTERS, Counter};
 use crate::render::forward::Capacity;
 use crate::render::view::Rendered;
 use crate::scene::Scene;
+use crate::train::begin;
 use crate::train::checkpoint::{self, History, LastFigures, Model, Owner, State};
 use crate::train::order::Order;
 use crate::train::photographs::{self, Photograph};
@@ -150,7 +151,7 @@ fn fresh(gpu: &Gpu, scene: &Scene, settings: &Settings) -> Result<Step, Error> {
     let settings = &settings.fitted(scene);
     let plan = Plan::new(scene, settings);
     if settings.model.form == Form::Gaussians {
-        let cloud = init::gaussians(&scene.starts(), &settings.model, settings.densify.max_gaussians)?;
+        let cloud = begin::gaussians(scene, settings)?;
         return Ok(Step::of_gaussians(gpu, plan, settings, &cloud)?);
     }
     let offsets = settings.model.offsets as usize;

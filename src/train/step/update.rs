@@ -1,5 +1,7 @@
 //! The end of a step: the search for values that are not finite, and the optimiser.
 
+use std::ops::Range;
+
 use super::{Rates, Step};
 use crate::gpu::{Buffer, Recorder};
 use crate::model::parameter::Parameter;
@@ -61,29 +63,31 @@ impl Step {
         let config = &self.config.model.attention;
         let written_back = config.write_back && self.plan.attention && step >= config.start;
         let trained = |parameter: &&Parameter| !written_back || parameter.groups().all(|g| g != Group::Feature);
+        let rows = self.config.model.frozen..self.learnt.count();
         for parameter in self.learnt.rows().into_iter().filter(trained) {
-            self.update(rec, parameter, self.learnt.count(), overflow, (step, rates));
+            self.update(rec, parameter, rows.clone(), overflow, (step, rates));
         }
         if let Some(weights) = self.learnt.weights() {
-            self.update(rec, weights, 1, overflow, (step, rates));
+            self.update(rec, weights, 0..1, overflow, (step, rates));
         }
         if let Some((attend, skip)) = attention {
             let since = step + 1 - config.start.max(1);
-            self.update(rec, &attend.weights, 1, skip, (since, rates));
+            self.update(rec, &attend.weights, 0..1, skip, (since, rates));
         }
     }
 
-    /// Records Adam's step `step` on the first rows of a parameter, if it is trained; skipped on the device where `skip` is set.
+    /// Records Adam's step `step` on these rows of a parameter, if it is trained; skipped on the device where `skip` is set.
     fn update(
         &self,
         rec: &mut Recorder<'_>,
         parameter: &Parameter,
-        rows: u32,
+        rows: Range<u32>,
         skip: &Buffer<u32>,
         (step, rates): (u32, Rates),
     ) {
         let Some((gradient, rates)) = parameter.gradient.as_ref().zip(rates.of_parts(parameter)) else { return };
+        let range = (rows.start * parameter.width, rows.len() as u32 * parameter.width);
         let tensors = Tensors { value: &parameter.value, gradient, first: &parameter.first, root: &parameter.root };
-        adam::record(rec, &self.adam, tensors, skip, (0, rows * parameter.width), (step, rates));
+        adam::record(rec, &self.adam, tensors, skip, range, (step, rates));
     }
 }

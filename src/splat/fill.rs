@@ -1,0 +1,128 @@
+//! What is taken out of a splat and what is put in its place: the Gaussians that the masks vote out, and those that the
+//! reference picture's hole begins with.
+
+use std::path::Path;
+
+use image::imageops::{FilterType, resize};
+
+use super::Error;
+use super::views::{Artist, Seen};
+use crate::gpu::Gpu;
+use crate::math::harmonics::ZEROTH;
+use crate::model::gaussians::{Cloud, logit};
+use crate::prepare::depth;
+use crate::prepare::fit::Fit;
+use crate::prepare::masks::{self, Votes};
+use crate::prepare::splats::Splats;
+use crate::scene::{self, PriorKind, Scene, resample};
+
+/// A Gaussian with more than this share inside the masks is the object's.
+const OBJECT: f32 = 0.5;
+/// A pixel of the hole needs filling where the rest of the splat differs from the reference by this in a channel,
+const DIFFERS: f32 = 0.06;
+/// or lets this much through.
+const OPEN: f32 = 0.1;
+/// Pixels by which the hole is enlarged.
+const MARGIN: u32 = 1;
+/// Standard deviation of a Gaussian of the fill, in pixels of the reference picture as it was loaded.
+const WIDTH: f64 = 0.6;
+/// Opacity that it begins with.
+const OPACITY: f64 = 0.7;
+
+/// Which of the seen Gaussians are the object, by the votes of all masks.
+///
+/// # Errors
+/// When the device has no room, or is lost; a view without a mask.
+pub fn object(
+    gpu: &Gpu,
+    scene: &Scene,
+    fit: &Fit,
+    turn: &mut dyn FnMut() -> Result<(), Error>,
+) -> Result<Vec<bool>, Error> {
+    let mut splats = Splats::new(gpu, &fit.model, &fit.settings.render)?;
+    let mut votes = Votes::new(&splats);
+    for view in &scene.train {
+        let Some(mask) = &view.mask else { continue };
+        votes.add(&mut splats, &view.camera, &masks::parts(mask, view.camera.size))?;
+        turn()?;
+    }
+    let colors = masks::colors(&mut splats, &scene.train)?;
+    let shares = votes.count(fit.positions(), &colors);
+    Ok(shares.object.iter().map(|share| *share > OBJECT).collect())
+}
+
+/// A Gaussian for each pixel of the reference's hole where the rest of the splat is not what the reference shows, at the
+/// reference's depth.
+///
+/// # Errors
+/// A scene without a reference, or without its depth; when the device has no room, or is lost.
+pub fn begin(gpu: &Gpu, scene: &Scene, root: &Path, rest: &Cloud, fit: &Fit) -> Result<Cloud, Error> {
+    let missing = |what: &str| {
+        Error::Request(format!("{}: there is no {what} to fill the hole with; run the step reference", root.display()))
+    };
+    let reference = scene.references.first().ok_or_else(|| missing("reference picture"))?;
+    let prior = reference.prior.as_ref().ok_or_else(|| missing("depth of the reference picture"))?;
+    let view = &scene.train[reference.view];
+    let mask = view.mask.as_ref().ok_or_else(|| missing("mask of the reference view"))?;
+    let camera = &view.camera;
+    let hole = resample::dilate(mask, MARGIN);
+    let drawn = Artist::new(gpu, rest, &fit.settings.render)?.draw(camera)?;
+    let [w, h] = camera.size;
+    let shown = if reference.image.dimensions() == (w, h) {
+        reference.image.clone()
+    } else {
+        resize(&reference.image, w, h, FilterType::Triangle)
+    };
+    let depth_of = |i: usize| match prior.kind {
+        PriorKind::Disparity => 1.0 / f64::from(prior.values[i]),
+        _ => f64::from(prior.values[i]),
+    };
+    let mut cloud = Cloud::default();
+    for (i, inside) in hole.as_raw().iter().enumerate().filter(|(i, inside)| **inside != 0 && *i < prior.values.len()) {
+        debug_assert!(*inside != 0, "filtered");
+        let (x, y) = (i as u32 % w, i as u32 / w);
+        let color = shown.get_pixel(x, y).0.map(|v| f32::from(v) / 255.0);
+        let off = (0..3).map(|c| (color[c] - drawn.rgb[i][c]).abs()).fold(0.0, f32::max);
+        let z = depth_of(i);
+        if (off < DIFFERS && drawn.transmittance[i] < OPEN) || !z.is_finite() || z <= 0.0 {
+            continue;
+        }
+        let Some(point) = depth::point(camera, [f64::from(x) + 0.5, f64::from(y) + 0.5], z) else { continue };
+        let width = WIDTH * z / f64::from(camera.focal[0].min(camera.focal[1]));
+        cloud.position.push(point.map(|v| v as f32));
+        cloud.log_scale.push([width.ln() as f32; 3]);
+        cloud.rotation.push([1.0, 0.0, 0.0, 0.0]);
+        cloud.logit.push(logit(OPACITY));
+        cloud.harmonics.push(color.map(|v| ((f64::from(v) - 0.5) / ZEROTH) as f32));
+    }
+    Ok(cloud)
+}
+
+/// The scene in a folder with the longer side of its pictures at most about `side` pixels.
+///
+/// # Errors
+/// As [`scene::load`].
+pub fn load(root: &Path, side: u32) -> Result<Scene, Error> {
+    let longest = scene::longest_side(root).unwrap_or(side);
+    let downscale = ((f64::from(longest) / f64::from(side)).round() as u32).max(1);
+    Ok(scene::load(root, &scene::Config { downscale, ..scene::Config::default() })?)
+}
+
+/// Flags by number in the file, of those of the seen Gaussians that are the object.
+pub fn in_file(seen: &Seen, object: &[bool], count: usize) -> Vec<bool> {
+    let mut flags = vec![false; count];
+    seen.numbers.iter().zip(object).for_each(|(number, object)| flags[*number as usize] = *object);
+    flags
+}
+
+/// The runs of true flags, as first and one past the last.
+pub fn ranges(flags: &[bool]) -> Vec<[usize; 2]> {
+    let mut ranges: Vec<[usize; 2]> = vec![];
+    for i in (0..flags.len()).filter(|i| flags[*i]) {
+        match ranges.last_mut() {
+            Some([_, end]) if *end == i => *end += 1,
+            _ => ranges.push([i, i + 1]),
+        }
+    }
+    ranges
+}

@@ -1,0 +1,165 @@
+//! Splats of other programs: what a file holds, and how the file is written again with only some Gaussians changed.
+
+use std::path::Path;
+
+use super::Error;
+use super::ply::{self, Rows};
+use crate::export::{gltf, spz};
+use crate::math::harmonics::coefficients;
+use crate::model::gaussians::Cloud;
+use crate::sentence::one_line;
+
+/// What a splat is kept in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Container {
+    /// PLY with a row of numbers per Gaussian.
+    Ply,
+    /// PLY as SuperSplat compresses it.
+    CompressedPly,
+    /// SPZ.
+    Spz,
+    /// glTF with `KHR_gaussian_splatting`.
+    Glb,
+}
+
+/// A splat.
+#[derive(Clone, Debug)]
+pub struct Splat {
+    /// What it was read from.
+    pub container: Container,
+    /// Its Gaussians in the file's order, as they can be drawn: see [`Splat::drawn`].
+    pub cloud: Cloud,
+    /// Whether a Gaussian has numbers throughout and a size. Others are kept in the file and drawn nowhere.
+    pub drawn: Vec<bool>,
+    rows: Option<Rows>,
+}
+
+/// Largest logit that is drawn; files have infinity for an opacity of 1.
+const MOST_LOGIT: f32 = 20.0;
+/// Natural logarithms of standard deviations that are drawn, scene units; files have minus infinity for flat Gaussians.
+const LOG_SCALES: [f32; 2] = [-30.0, 20.0];
+
+/// Whether the file begins as one of a splat, whatever its name.
+pub fn is_splat(path: &Path) -> bool {
+    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+    path.is_file() && extension.is_some_and(|e| ["ply", "spz", "glb"].contains(&e.as_str()))
+}
+
+/// Reads a splat.
+///
+/// # Errors
+/// A file that cannot be read, is not of a splat, is cut off, or holds no Gaussian that can be drawn.
+pub fn read(path: &Path) -> Result<Splat, Error> {
+    let bytes = std::fs::read(path).map_err(|source| Error::Io { path: path.to_owned(), source })?;
+    decode(bytes).map_err(|what| Error::File { path: path.to_owned(), what })
+}
+
+/// The same from a file's bytes.
+///
+/// # Errors
+/// What is wrong, in words that follow the file's name.
+pub fn decode(bytes: Vec<u8>) -> Result<Splat, String> {
+    // Words of the file may be of any length and of any characters.
+    decoded(bytes).map_err(|what| one_line(&what))
+}
+
+fn decoded(bytes: Vec<u8>) -> Result<Splat, String> {
+    let told = |error: crate::export::Error| error.to_string();
+    let (container, cloud, rows) = match bytes.get(..4) {
+        Some(b"ply\n" | b"ply\r") => {
+            let (cloud, rows) = ply::read(bytes)?;
+            (if rows.is_some() { Container::Ply } else { Container::CompressedPly }, cloud, rows)
+        }
+        Some(b"glTF") => (Container::Glb, gltf::decode(&bytes).map_err(told)?, None),
+        Some([0x1f, 0x8b, ..]) => (Container::Spz, spz::decode(&bytes).map_err(told)?, None),
+        _ => return Err("it is none of PLY, SPZ and GLB; splats come in these".into()),
+    };
+    if cloud.is_empty() {
+        return Err("it holds no Gaussian".into());
+    }
+    let mut splat = Splat { container, drawn: vec![true; cloud.len()], cloud, rows };
+    splat.settle();
+    if !splat.drawn.contains(&true) {
+        return Err(format!("none of its {} Gaussians has finite numbers", splat.cloud.len()));
+    }
+    Ok(splat)
+}
+
+impl Splat {
+    /// Brings what files have at infinity within what is drawn, and takes out what is no number.
+    fn settle(&mut self) {
+        let each = coefficients(self.cloud.degree);
+        let Cloud { position, log_scale, rotation, logit, harmonics, .. } = &mut self.cloud;
+        for (i, drawn) in self.drawn.iter_mut().enumerate() {
+            logit[i] = logit[i].clamp(-MOST_LOGIT, MOST_LOGIT);
+            log_scale[i] = log_scale[i].map(|v| v.clamp(LOG_SCALES[0], LOG_SCALES[1]));
+            let finite = |values: &[f32]| values.iter().all(|v| v.is_finite());
+            let own = i * each..(i + 1) * each;
+            *drawn = finite(&position[i])
+                && finite(&log_scale[i])
+                && finite(&rotation[i])
+                && rotation[i].iter().any(|v| v.abs() > 1e-12)
+                && logit[i].is_finite()
+                && finite(harmonics[own.clone()].as_flattened());
+            if !*drawn {
+                (position[i], log_scale[i], rotation[i]) = ([0.0; 3], [LOG_SCALES[0]; 3], [1.0, 0.0, 0.0, 0.0]);
+                logit[i] = -MOST_LOGIT;
+                harmonics[own].fill([0.0; 3]);
+            }
+        }
+    }
+
+    /// Number of Gaussians.
+    pub fn len(&self) -> usize {
+        self.cloud.len()
+    }
+
+    /// Whether there are none, which no splat that was read is.
+    pub fn is_empty(&self) -> bool {
+        self.cloud.is_empty()
+    }
+
+    /// A PLY file with the Gaussians of `kept` in their order, and those of `added` behind them. Those of a PLY with a row
+    /// per Gaussian keep every byte; of other containers their numbers as they were read.
+    ///
+    /// # Panics
+    /// Unless there is a flag for every Gaussian.
+    pub fn spliced(&self, kept: &[bool], added: &Cloud) -> Vec<u8> {
+        if let Some(rows) = &self.rows {
+            return rows.spliced(kept, added);
+        }
+        crate::model::ply::encode(&self.joined(kept, added))
+    }
+
+    /// The Gaussians of `kept` in their order, as they are drawn, and those of `added` behind them.
+    ///
+    /// # Panics
+    /// Unless there is a flag for every Gaussian.
+    pub fn joined(&self, kept: &[bool], added: &Cloud) -> Cloud {
+        assert_eq!(kept.len(), self.len(), "a flag for every Gaussian");
+        let mut cloud = self.cloud.clone();
+        cloud.retain(kept);
+        append(&mut cloud, added);
+        cloud
+    }
+}
+
+/// Puts Gaussians behind others, with as many coefficients as those have.
+pub fn append(cloud: &mut Cloud, added: &Cloud) {
+    let added = of_degree(added, cloud.degree);
+    cloud.position.extend_from_slice(&added.position);
+    cloud.log_scale.extend_from_slice(&added.log_scale);
+    cloud.rotation.extend_from_slice(&added.rotation);
+    cloud.logit.extend_from_slice(&added.logit);
+    cloud.harmonics.extend_from_slice(&added.harmonics);
+}
+
+/// The same Gaussians with harmonics up to this degree: zero where they had none, those beyond left out.
+pub fn of_degree(cloud: &Cloud, degree: u32) -> Cloud {
+    let each = coefficients(degree);
+    let of = |i: usize| {
+        let own = cloud.harmonics_of(i);
+        (0..each).map(move |k| own.get(k).copied().unwrap_or_default())
+    };
+    Cloud { degree, harmonics: (0..cloud.len()).flat_map(of).collect(), ..cloud.clone() }
+}

@@ -1,0 +1,320 @@
+//! Splats of other programs: what is read of them, and that of a file only what was meant to changes.
+
+#[allow(dead_code)]
+mod common;
+
+use std::path::Path;
+
+use gscream_vk::config::Settings;
+use gscream_vk::export::{gltf, ply as own, spz};
+use gscream_vk::gpu::testing;
+use gscream_vk::math::harmonics::{ZEROTH, coefficients};
+use gscream_vk::model::config::Form;
+use gscream_vk::model::gaussians::{Cloud, sigmoid};
+use gscream_vk::splat::cameras;
+use gscream_vk::splat::fill;
+use gscream_vk::splat::read::{Container, decode, of_degree};
+use gscream_vk::train::begin;
+use gscream_vk::train::run::{Run, Silent};
+
+/// Gaussians whose numbers all differ.
+fn cloud(n: usize, degree: u32) -> Cloud {
+    let number = |i: usize, k: usize| ((i * 37 + k * 11) % 101) as f32 / 101.0 - 0.5;
+    let three = |i: usize, k: usize| [number(i, k), number(i, k + 1), number(i, k + 2)];
+    Cloud {
+        position: (0..n).map(|i| three(i, 0).map(|v| 4.0 * v)).collect(),
+        log_scale: (0..n).map(|i| three(i, 3).map(|v| v - 3.0)).collect(),
+        rotation: (0..n)
+            .map(|i| {
+                let q = [0.9, number(i, 6), number(i, 7), number(i, 8)];
+                let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt();
+                q.map(|v| v / norm)
+            })
+            .collect(),
+        logit: (0..n).map(|i| 4.0 * number(i, 9)).collect(),
+        degree,
+        harmonics: (0..n * coefficients(degree)).map(|i| three(i, 12)).collect(),
+    }
+}
+
+/// A PLY as another program might write it: properties in another order, one that is none of ours, comments, an element
+/// behind the Gaussians.
+fn foreign(cloud: &Cloud) -> (Vec<u8>, usize) {
+    let rest = 3 * (coefficients(cloud.degree) - 1);
+    let mut head = String::from("ply\nformat binary_little_endian 1.0\ncomment by hand\n");
+    head += &format!("element vertex {}\nproperty uchar label\n", cloud.len());
+    for name in ["opacity", "x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "scale_0", "scale_1", "scale_2"] {
+        head += &format!("property float {name}\n");
+    }
+    (0..rest).for_each(|i| head += &format!("property float f_rest_{i}\n"));
+    (0..3).for_each(|i| head += &format!("property double f_dc_{i}\n"));
+    head += "element extra 1\nproperty int words\nend_header\n";
+    let mut bytes = head.into_bytes();
+    let stride = 1 + 4 * (11 + rest) + 24;
+    for i in 0..cloud.len() {
+        bytes.push(i as u8);
+        let mut put = |value: f32| bytes.extend(value.to_le_bytes());
+        put(cloud.logit[i]);
+        cloud.position[i].into_iter().for_each(&mut put);
+        cloud.rotation[i].into_iter().for_each(&mut put);
+        cloud.log_scale[i].into_iter().for_each(&mut put);
+        let harmonics = cloud.harmonics_of(i);
+        (0..3).for_each(|c| harmonics[1..].iter().for_each(|rgb| put(rgb[c])));
+        harmonics[0].into_iter().for_each(|v| bytes.extend(f64::from(v).to_le_bytes()));
+    }
+    bytes.extend(7i32.to_le_bytes());
+    (bytes, stride)
+}
+
+#[test]
+fn what_stays_keeps_its_bytes_and_its_order() {
+    for degree in 0..=3 {
+        let whole = cloud(20, degree);
+        let (bytes, stride) = foreign(&whole);
+        let splat = decode(bytes.clone()).expect("a splat");
+        assert_eq!((splat.container, &splat.cloud), (Container::Ply, &whole));
+        let kept: Vec<bool> = (0..20).map(|i| i % 3 != 1).collect();
+        let added = cloud(4, 1);
+        let after = splat.spliced(&kept, &added);
+        let rows = |bytes: &[u8], count: usize| -> Vec<Vec<u8>> {
+            let end = bytes.len() - 4;
+            bytes[end - count * stride..end].chunks_exact(stride).map(<[u8]>::to_vec).collect()
+        };
+        let (before, now) = (rows(&bytes, 20), rows(&after, 13 + 4));
+        let stayed: Vec<Vec<u8>> = (0..20).filter(|i| kept[*i]).map(|i| before[i].clone()).collect();
+        assert_eq!(now[..13], stayed, "every byte, in the order of the file");
+        assert_eq!(after[after.len() - 4..], 7i32.to_le_bytes(), "what stands behind the rows");
+        let back = decode(after).expect("a splat");
+        assert_eq!(back.len(), 17);
+        assert_eq!(back.cloud.position[13..], added.position);
+        // With the coefficients that the file has: none beyond its degree, zero where the fill has none.
+        let shown = of_degree(&added, degree);
+        assert_eq!(back.cloud.harmonics[13 * coefficients(degree)..], shown.harmonics);
+        assert!(splat.spliced(&[true; 20], &Cloud::default()) == bytes, "nothing changes where nothing goes or comes");
+    }
+}
+
+#[test]
+fn containers_say_the_same() {
+    for degree in 0..=3 {
+        let whole = cloud(300, degree);
+        let read = |bytes: Vec<u8>, container| {
+            let splat = decode(bytes).expect("a splat");
+            assert_eq!(splat.container, container);
+            splat.cloud
+        };
+        assert_eq!(read(own::encode(&whole), Container::Ply).position, whole.position);
+        let glb = read(gltf::encode(&whole).expect("small"), Container::Glb);
+        assert_eq!((&glb.position, &glb.harmonics), (&whole.position, &whole.harmonics));
+        let packed = read(spz::encode(&whole).expect("near"), Container::Spz);
+        let most = |a: &[[f32; 3]], b: &[[f32; 3]]| {
+            a.as_flattened().iter().zip(b.as_flattened()).fold(0f32, |m, (a, b)| m.max((a - b).abs()))
+        };
+        // Two units leave 21 fractional bits of 24 signed ones; log-scales are sixteenths.
+        assert!(most(&packed.position, &whole.position) <= 0.5 / (1 << 21) as f32 + 1e-7);
+        assert!(most(&packed.log_scale, &whole.log_scale) <= 0.5 / 16.0 + 1e-6);
+        let compressed = read(compress(&whole), Container::CompressedPly);
+        // Half a step of ten bits over at most 4 units, and of eleven over 1.
+        assert!(most(&compressed.position, &whole.position) <= 4.0 / 1023.0 / 2.0 + 1e-5);
+        assert!(most(&compressed.log_scale, &whole.log_scale) <= 1.0 / 1023.0 / 2.0 + 1e-5);
+        for (a, b) in compressed.logit.iter().zip(&whole.logit) {
+            assert!((sigmoid(*a) - sigmoid(*b)).abs() <= 0.5 / 255.0 + 1e-6);
+        }
+        for (a, b) in compressed.rotation.iter().zip(&whole.rotation) {
+            // Three components of ten bits over the root of two; the fourth follows with at most three times their error.
+            let step = std::f32::consts::SQRT_2 / 1023.0 / 2.0;
+            let dot: f32 = a.iter().zip(b).map(|(a, b)| a * b).sum();
+            assert!(a.iter().zip(b).all(|(a, b)| (a * dot.signum() - b).abs() <= 3.0 * step + 1e-5), "{a:?} {b:?}");
+        }
+        for (i, (a, b)) in compressed.harmonics.iter().zip(&whole.harmonics).enumerate() {
+            // Colours are eighths of bits of their chunk's range, the others bytes from -4 to 4.
+            let bound = if i % coefficients(degree) == 0 { 1.0 / 255.0 / 2.0 } else { 8.0 / 255.0 / 2.0 };
+            assert!((0..3).all(|c| (a[c] - b[c]).abs() <= bound + 1e-5), "{a:?} {b:?}");
+        }
+    }
+}
+
+/// SuperSplat's compressed PLY, written from its layout.
+fn compress(cloud: &Cloud) -> Vec<u8> {
+    let (n, rest) = (cloud.len(), 3 * (coefficients(cloud.degree) - 1));
+    let colors: Vec<[f32; 3]> = (0..n).map(|i| cloud.harmonics_of(i)[0].map(|v| 0.5 + ZEROTH as f32 * v)).collect();
+    let stems = ["x", "y", "z", "scale_x", "scale_y", "scale_z", "r", "g", "b"];
+    let mut head = format!("ply\nformat binary_little_endian 1.0\nelement chunk {}\n", n.div_ceil(256));
+    for three in stems.chunks(3) {
+        for end in ["min", "max"] {
+            three.iter().for_each(|stem| head += &format!("property float {end}_{stem}\n"));
+        }
+    }
+    head += &format!("element vertex {n}\n");
+    ["position", "rotation", "scale", "color"].iter().for_each(|n| head += &format!("property uint packed_{n}\n"));
+    if rest > 0 {
+        head += &format!("element sh {n}\n");
+        (0..rest).for_each(|i| head += &format!("property uchar f_rest_{i}\n"));
+    }
+    let mut bytes = (head + "end_header\n").into_bytes();
+    let bounds = |values: &[[f32; 3]]| {
+        let fold = |c: usize, start: f32, f: fn(f32, f32) -> f32| values.iter().fold(start, |m, v| f(m, v[c]));
+        let low: [f32; 3] = std::array::from_fn(|c| fold(c, f32::INFINITY, f32::min));
+        (low, std::array::from_fn::<f32, 3, _>(|c| fold(c, f32::NEG_INFINITY, f32::max)))
+    };
+    let arrays = [&cloud.position, &cloud.log_scale, &colors];
+    for first in (0..n).step_by(256) {
+        for array in arrays {
+            let (low, high) = bounds(&array[first..(first + 256).min(n)]);
+            low.iter().chain(&high).for_each(|v| bytes.extend(v.to_le_bytes()));
+        }
+    }
+    let part = |value: f32, low: f32, high: f32, most: u32| {
+        let part = if high > low { (value - low) / (high - low) } else { 0.0 };
+        (part * most as f32).round().clamp(0.0, most as f32) as u32
+    };
+    for i in 0..n {
+        let first = i / 256 * 256;
+        let three = |array: &[[f32; 3]], most: [u32; 3]| -> [u32; 3] {
+            let (low, high) = bounds(&array[first..(first + 256).min(n)]);
+            std::array::from_fn(|c| part(array[i][c], low[c], high[c], most[c]))
+        };
+        let word = |[a, b, c]: [u32; 3]| a << 21 | b << 11 | c;
+        let q = cloud.rotation[i];
+        let largest = (1..4).fold(0, |best, k| if q[k].abs() > q[best].abs() { k } else { best });
+        let sign = q[largest].signum();
+        let others = (0..4).filter(|k| *k != largest);
+        let turn = others.fold(largest as u32, |word, k| {
+            let most = std::f32::consts::FRAC_1_SQRT_2;
+            word << 10 | part(q[k] * sign, -most, most, 1023)
+        });
+        let [r, g, b] = three(&colors, [255; 3]);
+        let alpha = (sigmoid(cloud.logit[i]) * 255.0).round() as u32;
+        let words = [
+            word(three(&cloud.position, [2047, 1023, 2047])),
+            turn,
+            word(three(&cloud.log_scale, [2047, 1023, 2047])),
+            r << 24 | g << 16 | b << 8 | alpha,
+        ];
+        words.iter().for_each(|word| bytes.extend(word.to_le_bytes()));
+    }
+    for i in 0..n {
+        for c in 0..3 {
+            let higher = &cloud.harmonics_of(i)[1..];
+            bytes.extend(higher.iter().map(|rgb| ((rgb[c] + 4.0) * 255.0 / 8.0).round() as u8));
+        }
+    }
+    bytes
+}
+
+#[test]
+fn what_is_no_splat_is_refused_in_one_sentence() {
+    let whole = own::encode(&cloud(5, 0));
+    let renamed = |from: &str, to: &str| {
+        let text: Vec<u8> = whole.clone();
+        let at = text.windows(from.len()).position(|w| w == from.as_bytes()).expect("it is there");
+        [&text[..at], to.as_bytes(), &text[at + from.len()..]].concat()
+    };
+    for (bytes, what) in [
+        (vec![], "none of PLY, SPZ and GLB"),
+        (b"ply\n".to_vec(), "header does not end"),
+        (whole[..whole.len() - 1].to_vec(), "cut off"),
+        (renamed("binary_little_endian", "ascii"), "save it as binary_little_endian"),
+        (renamed("f_rest_44", "f_other__"), "degrees 0 to 3"),
+        (renamed("float scale_2", "float scale_9"), "2DGS"),
+        (renamed("float opacity", "float opaque_"), "no property opacity"),
+        (renamed("float f_dc_0", "float f_xx_0"), "point cloud without Gaussians"),
+        (renamed("element vertex 5", "element vertex 0"), "no Gaussian"),
+        (renamed("element vertex 5", "element vertex 99999999999999999999"), "its header says"),
+        (renamed("element vertex 5", "element vertex 9999999999999999999"), "cut off"),
+    ] {
+        let error = decode(bytes).expect_err(what);
+        assert!(error.contains(what) && !error.contains('\n'), "{what}: {error}");
+    }
+}
+
+/// Infinity stands for an opacity of 1 and for flat Gaussians; what is no number is kept and not drawn.
+#[test]
+fn numbers_at_infinity_are_drawn_and_no_numbers_are_not() {
+    let mut whole = cloud(4, 0);
+    whole.logit[0] = f32::INFINITY;
+    whole.log_scale[1][2] = f32::NEG_INFINITY;
+    whole.position[2][0] = f32::NAN;
+    let bytes = own::encode(&whole);
+    let splat = decode(bytes.clone()).expect("a splat");
+    assert_eq!(splat.drawn, [true, true, false, true]);
+    assert!(splat.cloud.first_not_finite().is_none());
+    assert!(splat.spliced(&[true; 4], &Cloud::default()) == bytes, "the file keeps them");
+}
+
+#[test]
+fn cameras_of_3dgs_stand_where_they_say() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("cameras.json");
+    let entry = |name: &str, x: f64| {
+        format!(
+            r#"{{"id":0,"img_name":"{name}","width":1600,"height":800,"position":[{x},2,3],"fx":900,"fy":910,
+            "rotation":[[0,0,1],[1,0,0],[0,1,0]]}}"#
+        )
+    };
+    let write = |entries: &[String]| std::fs::write(&path, format!("[{}]", entries.join(","))).expect("a file");
+    write(&[entry("b.jpg", 1.0), entry("a", 4.0), entry("c.png", 5.0)]);
+    let posed = cameras::read(&path).expect("cameras");
+    let names: Vec<&str> = posed.iter().map(|posed| posed.name.as_str()).collect();
+    assert_eq!(names, ["a", "b", "c"]);
+    let camera = posed[1].camera;
+    // A half of 1600 x 800; the camera's axis ahead is the third column: x of the world.
+    assert_eq!((camera.size, camera.focal, camera.principal), ([800, 400], [450.0, 455.0], [400.0, 200.0]));
+    let [x, y] = camera.project([11.0, 2.0, 3.0]).expect("it is ahead");
+    assert!((x - 400.0).abs() < 1e-4 && (y - 200.0).abs() < 1e-4, "{x} {y}");
+    for (entries, what) in [
+        (vec![entry("a", 0.0), entry("a", 1.0), entry("b", 2.0)], "two cameras called a"),
+        (vec![entry("a", 0.0), entry("../b", 1.0), entry("c", 2.0)], "no file can be called"),
+        (vec![entry("a", 0.0)], "three are the least"),
+        (vec![entry("a", 1e300), entry("b", 1.0), entry("c", 2.0)], "stands nowhere"),
+    ] {
+        write(&entries);
+        let error = cameras::read(Path::new(&path)).expect_err(what).to_string();
+        assert!(error.contains(what), "{error}");
+    }
+}
+
+#[test]
+fn runs_of_flags_are_ranges() {
+    let flags = [true, true, false, true, false, false, true];
+    assert_eq!(fill::ranges(&flags), [[0, 2], [3, 4], [6, 7]]);
+}
+
+/// A training that goes on from a splat: those that are to stay do, bit by bit, and the others learn.
+#[test]
+fn frozen_gaussians_stay_and_the_others_learn() {
+    let (gpu, scene) = (testing::gpu(), common::tiny());
+    let mut settings: Settings = common::settings(20);
+    settings.model.attention.enabled = false;
+    settings.model.form = Form::Gaussians;
+    settings.densify.enabled = false;
+    let mut start = begin::gaussians(&scene, &settings).expect("points");
+    let count = start.len();
+    start.rescale(scene.unit);
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("start.ply");
+    std::fs::write(&path, own::encode(&start)).expect("a file");
+    settings.model.from = path.to_string_lossy().into_owned();
+    let frozen = count / 3 + 1;
+    settings.model.frozen = frozen as u32;
+    settings.validate().expect("settings that make sense");
+    let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
+    let read = |run: &Run<'_>| match &run.step().learnt {
+        gscream_vk::model::learnt::Learnt::Gaussians(gaussians) => gaussians
+            .parameters()
+            .map(|parameter| (parameter.width as usize, parameter.read(&gpu, count as u32).expect("readable"))),
+        gscream_vk::model::learnt::Learnt::Anchors { .. } => panic!("plain Gaussians were asked for"),
+    };
+    let before = read(&run);
+    run.train(folder.path(), &mut Silent).expect("a run");
+    for ((width, before), (_, after)) in before.iter().zip(&read(&run)) {
+        let edge = width * frozen;
+        assert!(before[..edge] == after[..edge], "those that are frozen");
+        assert!(before[edge..] != after[edge..], "those that are not");
+    }
+    settings.model.frozen = count as u32 + 1;
+    let error = Run::new(&gpu, &scene, &settings).err().expect("fewer than are to stay").to_string();
+    assert!(error.contains("set model.frozen to fewer"), "{error}");
+    settings.densify.enabled = true;
+    assert!(settings.validate().is_err(), "relocation moves them");
+}
