@@ -2,6 +2,7 @@
 
 pub mod cameras;
 pub mod fill;
+pub mod frame;
 pub mod ply;
 pub mod read;
 pub mod views;

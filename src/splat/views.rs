@@ -6,9 +6,9 @@ use std::path::{Path, PathBuf};
 
 use image::{ImageFormat, RgbImage};
 
-use super::Error;
 use super::cameras::Posed;
 use super::read::{Splat, of_degree};
+use super::{Error, frame};
 use crate::export;
 use crate::gpu::Gpu;
 use crate::math::harmonics::{ZEROTH, coefficients, harmonics};
@@ -17,7 +17,7 @@ use crate::model::stored::Stored;
 use crate::prepare::poses;
 use crate::render::Config;
 use crate::render::view::{Rendered, Renderer};
-use crate::scene::Camera;
+use crate::scene::{self, Camera, colmap};
 
 /// Below this a Gaussian touches no pixel.
 const FAINT: f64 = 1.0 / 255.0;
@@ -88,10 +88,7 @@ impl Seen {
 /// # Errors
 /// Cameras that see none.
 pub fn depth(splat: &Splat, cameras: &[Camera]) -> Result<f64, Error> {
-    let opaque: Vec<[f64; 3]> = (0..splat.len())
-        .filter(|i| splat.drawn[*i] && sigmoid(splat.cloud.logit[*i]) >= MATTER)
-        .map(|i| splat.cloud.position[i].map(f64::from))
-        .collect();
+    let opaque = matter(splat);
     let some = || opaque.iter().step_by(opaque.len().div_ceil(POINTS).max(1));
     let mut depths = vec![];
     for camera in cameras.iter().step_by(cameras.len().div_ceil(64).max(1)) {
@@ -106,6 +103,31 @@ pub fn depth(splat: &Splat, cameras: &[Camera]) -> Result<f64, Error> {
     }
     let middle = depths.len() / 2;
     Ok(*depths.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+/// Takes the cameras of a COLMAP model to the frame of a splat that was moved and scaled against it. Returns whether it was.
+pub fn align(splat: &Splat, folder: &Path, posed: &mut [Posed]) -> bool {
+    // A file of cameras has no points, and a model may be without: then its frame is taken for the splat's.
+    let Ok(model) = colmap::read(folder) else { return false };
+    let points: Vec<[f64; 3]> = model.points.iter().map(|point| point.position.map(f64::from)).collect();
+    // Its program knew the photographs that are there, which may be fewer than the model has.
+    let photographs = scene::pictures(&folder.join("images")).unwrap_or_default();
+    let there = |image: &&colmap::Image| photographs.contains_key(scene::stem(&image.name));
+    let cameras = [
+        model.images.iter().filter(there).map(colmap::Image::center).collect(),
+        model.images.iter().map(colmap::Image::center).collect(),
+    ];
+    let Some(frame) = frame::find(&points, &cameras, &matter(splat)) else { return false };
+    for Posed { camera, .. } in posed {
+        camera.translation = Camera::translation_to(&camera.rotation, frame.apply(camera.center()));
+    }
+    true
+}
+
+/// Centres of opaque Gaussians.
+fn matter(splat: &Splat) -> Vec<[f64; 3]> {
+    let opaque = (0..splat.len()).filter(|i| splat.drawn[*i] && sigmoid(splat.cloud.logit[*i]) >= MATTER);
+    opaque.map(|i| splat.cloud.position[i].map(f64::from)).collect()
 }
 
 fn apart() -> Error {

@@ -79,7 +79,11 @@ pub fn open(args: &Args, places: &Places) -> anyhow::Result<Source> {
             path.display()
         ))
     })?;
-    let posed = some(cameras::read(&from)?, args);
+    let mut posed = cameras::read(&from)?;
+    if views::align(&splat, &from, &mut posed) {
+        eprintln!("splat: it was moved and scaled against {}, and its cameras are, too", from.display());
+    }
+    let posed = some(posed, args);
     let all: Vec<Camera> = posed.iter().map(|posed| posed.camera).collect();
     let render = views::config(views::depth(&splat, &all)?);
     let made_of = Inputs::default().with(record::hash(path)?).with(format!("{posed:?}")).finish();
