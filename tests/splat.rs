@@ -318,3 +318,33 @@ fn frozen_gaussians_stay_and_the_others_learn() {
     settings.densify.enabled = true;
     assert!(settings.validate().is_err(), "relocation moves them");
 }
+
+#[test]
+fn nothing_of_the_users_is_written_over() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name);
+    let splat = foreign(&cloud(400, 1)).0;
+    std::fs::write(at("scene.ply"), &splat).expect("a file");
+    let entry = |name: &str, x: f64| {
+        format!(
+            r#"{{"id":0,"img_name":"{name}","width":64,"height":48,"position":[{x},0,-6],"fx":60,"fy":60,
+            "rotation":[[1,0,0],[0,1,0],[0,0,1]]}}"#
+        )
+    };
+    let cameras = [entry("a", -0.5), entry("b", 0.0), entry("c", 0.5)].join(",");
+    std::fs::write(at("cameras.json"), format!("[{cameras}]")).expect("a file");
+    image::GrayImage::from_pixel(64, 48, image::Luma([255])).save(at("mask.png")).expect("a file");
+    let refused = |out: &str, says: &str| {
+        let mut program = std::process::Command::new(env!("CARGO_BIN_EXE_gscream-vk"));
+        let program = program.current_dir(folder.path()).args(["remove", "scene.ply", "--mask", "a=mask.png", "--yes"]);
+        let output = program.args(["--out", out]).output().expect("it runs");
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.code() == Some(1) && said.contains(says), "{said}");
+    };
+    refused(".", "scene.ply: what is made would be written over it");
+    assert_eq!(std::fs::read(at("scene.ply")).expect("it is there"), splat);
+    std::fs::create_dir_all(at("out/views")).expect("a folder");
+    std::fs::write(at("out/views/mine.txt"), "mine").expect("a file");
+    refused("out", "other files are there already");
+    assert_eq!(std::fs::read(at("out/views/mine.txt")).expect("it is there"), b"mine");
+}

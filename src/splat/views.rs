@@ -227,7 +227,12 @@ pub fn write(
     if std::fs::read_to_string(&mark).is_ok_and(|text| text == made_of) {
         return Ok(());
     }
-    // What is there is of something else from here on.
+    // Only a folder that this made is made again.
+    let empty = || std::fs::read_dir(folder).is_ok_and(|mut entries| entries.next().is_none());
+    if folder.exists() && !mark.is_file() && !empty() {
+        let what = "pictures of the splat would come here, and other files are there already: choose another --out";
+        return Err(Error::File { path: folder.to_owned(), what: what.into() });
+    }
     match std::fs::remove_dir_all(folder) {
         Err(source) if source.kind() != std::io::ErrorKind::NotFound => {
             return Err(Error::Io { path: folder.to_owned(), source });

@@ -72,6 +72,11 @@ const NOTE: &str = "removed_ranges: rows of the splat that was given, added_rang
 /// Reads the splat, and draws its pictures unless they are there.
 pub fn open(args: &Args, places: &Places) -> anyhow::Result<Source> {
     let path = &args.photographs;
+    let made = ["ply", "spz", "glb"].map(|extension| format!("{STEM}.{extension}")).into_iter().chain([OBJECT.into()]);
+    let given = path.canonicalize().ok();
+    if given.is_some() && made.into_iter().any(|name| places.root.join(name).canonicalize().ok() == given) {
+        bail!("{}: what is made would be written over it: choose another --out", path.display());
+    }
     let splat = read::read(path)?;
     let from = args.cameras.clone().or_else(|| cameras::beside(path)).ok_or_else(|| {
         Error::Request(format!(
