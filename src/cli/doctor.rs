@@ -65,7 +65,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     }
 }
 
-/// What [`doctor::examine`] finds, and what `prepare` noted when it made the scene.
+/// The findings of [`doctor::examine`], and the notes that `prepare` left when it made the scene.
 pub(super) fn examined(folder: &Path, masks: Option<&Path>) -> anyhow::Result<(Report, Option<Scene>)> {
     let (mut report, scene) = doctor::examine(folder, masks)?;
     if scene.is_some() {

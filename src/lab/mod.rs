@@ -1,6 +1,6 @@
 //! The instruments: how fast a step is, how near its arithmetic is to float64, and what its parts are worth.
 //!
-//! [`bench`] times and predicts passes and steps. [`report`] holds error against run time.
+//! [`mod@bench`] times and predicts passes and steps. [`report`] holds error against run time.
 //! `ablation` compares variants over seeds. A training needs none of them.
 
 pub(crate) mod ablation;

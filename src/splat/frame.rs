@@ -140,12 +140,12 @@ mod tests {
     fn a_splat_that_was_brought_to_unit_size_is_found() {
         let (points, all) = (surfaces(900), surfaces(9000));
         let cameras: Vec<[f64; 3]> = (0..40).map(|i| [0.2 * f64::from(i) - 3.0, -1.0, -2.0]).collect();
-        assert_eq!(find(&points, &[cameras.clone()], &all), None, "it stands where the model does");
+        assert_eq!(find(&points, std::slice::from_ref(&cameras), &all), None, "it stands where the model does");
         // Its program used every second camera alone.
         let used: Vec<[f64; 3]> = cameras.iter().step_by(2).copied().collect();
         let truth = unit_size(&used).expect("they stand apart");
         let matter: Vec<[f64; 3]> = all.iter().map(|p| truth.apply(*p)).collect();
-        let found = find(&points, &[cameras.clone()], &matter).expect("a frame");
+        let found = find(&points, std::slice::from_ref(&cameras), &matter).expect("a frame");
         // The lattice is 0.1 wide on sides of 10, and many points average out: a hundredth of a side is five times that.
         let off = points.iter().map(|p| distance(found.apply(*p), truth.apply(*p)) / truth.scale).fold(0.0, f64::max);
         assert!(off < 0.1, "{off}");

@@ -2,8 +2,9 @@
 //!
 //! [`kernels`] measures one training step by stage and as a whole: GPU time from timestamp queries beside the distance
 //! from the float64 reference path under the settings as they are. [`training`] measures whole runs: figures on held-out
-//! views against seconds and steps. [`variants`] lists the choices, [`pareto`] says which of them are superfluous.
-//! [`figures`] says what is drawn, [`plots`] draws it, [`page`] lays it out, [`tables`] writes the same numbers as JSON
+//! views against seconds and steps. [`variants`] lists the choices,
+//! [`pareto`](crate::lab::pareto) says which of them are superfluous.
+//! [`figures`] says what is drawn, [`plots`](crate::lab::plots) draws it, [`page`] lays it out, [`tables`] writes the same numbers as JSON
 //! and CSV.
 //!
 #![doc = include_str!("README.md")]
