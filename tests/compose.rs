@@ -27,8 +27,7 @@ fn true_grid(view: &View) -> DepthGrid {
     let mut grid = DepthGrid { camera, stride: 1, columns, rows, depth, confirmed: vec![true; sites], colors };
     for (x, y) in (0..rows).flat_map(|y| (0..columns).map(move |x| (x, y))) {
         let site = (y * columns + x) as usize;
-        let seen = gscream_vk::multiview::lift(&view.camera, grid.ray([x, y]), 1.0);
-        let [u, v] = view.camera.project(seen.to_array()).expect("ahead");
+        let [u, v] = view.camera.project(view.camera.along(grid.ray([x, y]), 1.0)).expect("ahead");
         if u >= 0.0 && v >= 0.0 && u < f64::from(columns) && v < f64::from(rows) {
             let at = v as u32 * columns + u as u32;
             grid.depth[site] = f64::from(truth[at as usize]);

@@ -252,10 +252,7 @@ impl View<'_> {
                 continue;
             }
             let at = [site as u32 % self.grid.columns, site as u32 / self.grid.columns];
-            let ray = self.grid.ray(at);
-            let Some(point) = self.camera.project(crate::multiview::lift(self.camera, ray, 1.0).to_array()) else {
-                continue;
-            };
+            let Some(point) = self.camera.project(self.camera.along(self.grid.ray(at), 1.0)) else { continue };
             // A site and those that a pixel asks around it.
             let across = f64::from(w) / f64::from(self.grid.columns) * (REACH + 2) as f64;
             let block = |v: f64, most: u32| (v / f64::from(BLOCK)).floor().clamp(0.0, f64::from(most - 1)) as u32;

@@ -4,7 +4,7 @@ use glam::{DMat3, DVec3};
 use rand::RngExt as _;
 use rand_pcg::Pcg64;
 
-use crate::multiview::{DepthGrid, lift};
+use crate::multiview::DepthGrid;
 use crate::scene::Camera;
 
 /// The surface at a pixel is looked for within these shares of the picture's longer side, the nearest first.
@@ -69,7 +69,7 @@ pub fn find(
     let mut nearest: Vec<f64> = near.iter().take(9).map(|(_, z)| *z).collect();
     nearest.sort_unstable_by(f64::total_cmp);
     let z = nearest[nearest.len() / 2];
-    let seen = lift(camera, ray, z);
+    let seen = DVec3::from(camera.along(ray, z));
     let height = share * f64::from(camera.size[1]) * z / f64::from(camera.focal[1]);
     let eye = DVec3::from(camera.center());
 

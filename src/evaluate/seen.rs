@@ -118,15 +118,9 @@ impl Shown<'_> {
 
     /// The world point at every pixel; `None` where the model shows nothing at all, or the lens has no ray.
     pub(super) fn points(&self) -> Vec<Option<[f64; 3]>> {
-        let (center, rotation) = (self.camera.center(), self.camera.rotation);
-        let width = self.surface.size[0];
-        let point = |(i, z): (usize, &f32)| {
-            let [a, b] = self.camera.unproject([(i % width) as f64 + 0.5, (i / width) as f64 + 0.5])?;
-            let z = f64::from(*z);
-            let ray = [a * z, b * z, z];
-            z.is_finite().then(|| {
-                std::array::from_fn(|k| center[k] + (0..3).map(|i| f64::from(rotation[i][k]) * ray[i]).sum::<f64>())
-            })
+        let point = |(pixel, z): (usize, &f32)| {
+            let place = || self.camera.lift(self.camera.pixel_center(pixel), f64::from(*z));
+            z.is_finite().then(place).flatten()
         };
         self.surface.filled().par_iter().enumerate().map(point).collect()
     }

@@ -62,7 +62,7 @@ impl DepthGrid {
     pub fn point(&self, site: usize) -> Option<DVec3> {
         let z = self.depth[site];
         let at = [site as u32 % self.columns, site as u32 / self.columns];
-        z.is_finite().then(|| lift(&self.camera, self.ray(at), z))
+        z.is_finite().then(|| DVec3::from(self.camera.along(self.ray(at), z)))
     }
 
     /// Replaces depths that hardly any of the sites around share by the median of these.
@@ -84,14 +84,6 @@ impl DepthGrid {
         };
         self.depth = (0..self.depth.len()).map(one).collect();
     }
-}
-
-/// The world point at normalised coordinates and a depth.
-pub fn lift(camera: &Camera, ray: [f64; 2], z: f64) -> DVec3 {
-    let seen = [ray[0] * z, ray[1] * z, z];
-    let turned: [f64; 3] =
-        std::array::from_fn(|i| (0..3).map(|k| f64::from(camera.rotation[k][i]) * seen[k]).sum::<f64>());
-    DVec3::from(camera.center()) + DVec3::from(turned)
 }
 
 /// The depth of every train view, by PatchMatch where other views confirm it, of the sparse model's points, and from around

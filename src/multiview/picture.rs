@@ -81,10 +81,9 @@ impl Picture {
 
     /// The world point at a pixel and a depth.
     pub fn lift(&self, pixel: [f64; 2], depth: f64) -> [f64; 3] {
-        let Camera { rotation, focal, principal, .. } = &self.camera;
+        let Camera { focal, principal, .. } = &self.camera;
         let normalised = |a: usize| (pixel[a] - f64::from(principal[a])) / f64::from(focal[a]);
-        let ray = [normalised(0) * depth, normalised(1) * depth, depth];
-        std::array::from_fn(|i| self.center[i] + (0..3).map(|k| f64::from(rotation[k][i]) * ray[k]).sum::<f64>())
+        self.camera.along([normalised(0), normalised(1)], depth)
     }
 
     /// Pixel and depth of a world point that is in the picture.

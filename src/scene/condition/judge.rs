@@ -11,7 +11,7 @@
 use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 
-use super::points::{lift, pixel_of};
+use super::points::pixel_of;
 use super::reference::Surroundings;
 use super::sparse::deviation;
 use super::stereo::bilinear;
@@ -153,7 +153,7 @@ fn judge(scene: &Scene, at: usize, mask: &GrayImage, wide: &[Option<GrayImage>])
         .collect();
     let depths = Depths::new(&surroundings, view.camera.size, distances.iter().map(|(pixel, _)| *pixel));
     let off = |&(pixel, distance): &(usize, i32)| {
-        let place = lift(&view.camera, pixel, depths.at(pixel))?;
+        let place = view.camera.lift(view.camera.pixel_center(pixel), depths.at(pixel))?;
         let seen = consensus(&others, place)?;
         let color = &view.image.as_raw()[3 * pixel..3 * pixel + 3];
         let off: [[f64; 2]; 3] = std::array::from_fn(|c| [f64::from(color[c]) - seen[c][0], seen[c][1]]);

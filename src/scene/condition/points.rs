@@ -15,15 +15,6 @@ pub(super) fn pixel_of(camera: &Camera, position: [f64; 3]) -> Option<usize> {
     inside.then(|| v as usize * w as usize + u as usize)
 }
 
-/// Where the world is that a pixel's centre shows at this depth z; `None` where the lens has no inverse.
-pub(super) fn lift(camera: &Camera, pixel: usize, depth: f64) -> Option<[f64; 3]> {
-    let w = camera.size[0] as usize;
-    let [x, y] = camera.unproject([(pixel % w) as f64 + 0.5, (pixel / w) as f64 + 0.5])?;
-    let center = camera.center();
-    let ray = [x * depth, y * depth, depth];
-    Some(std::array::from_fn(|i| center[i] + (0..3).map(|k| f64::from(camera.rotation[k][i]) * ray[k]).sum::<f64>()))
-}
-
 /// Whether a point falls into the mask in more than this share of the views that have it in the picture.
 pub(crate) fn on_object(views: &[View], share: f64) -> impl Fn(&Point) -> bool + Sync {
     let views: Vec<_> = views.iter().filter_map(|v| Some((&v.camera, v.mask.as_ref()?))).collect();
@@ -75,7 +66,7 @@ pub(super) fn seed_holes(scene: &mut Scene, depths: &[Option<Vec<f32>>]) {
         let Some(depth) = depth else { continue };
         let camera = &scene.train[reference.view].camera;
         for (pixel, z) in depth.iter().enumerate().filter(|(_, z)| z.is_finite()) {
-            let Some(position) = lift(camera, pixel, f64::from(*z)) else { continue };
+            let Some(position) = camera.lift(camera.pixel_center(pixel), f64::from(*z)) else { continue };
             if seeded.iter().any(|(other, depth)| pixel_of(other, position).is_some_and(|p| depth[p].is_finite())) {
                 continue;
             }
@@ -124,7 +115,8 @@ pub(super) fn seed_behind_edges(scene: &mut Scene, depths: &[Option<Vec<f32>>]) 
                 let edge = at(x + step[0], y + step[1]).filter(|&pixel| beyond(pixel))?;
                 Some((*step, edge))
             })?;
-            let (front, back) = (lift(camera, pixel, near)?, lift(camera, pixel, f64::from(depth[edge]))?);
+            let ray = camera.unproject(camera.pixel_center(pixel))?;
+            let (front, back) = (camera.along(ray, near), camera.along(ray, f64::from(depth[edge])));
             let uncovered = scene.train.iter().any(|view| {
                 let (Some(a), Some(b)) = (view.camera.project(front), view.camera.project(back)) else { return false };
                 let scale = f64::from(w) / f64::from(view.camera.size[0]);
@@ -242,19 +234,5 @@ mod tests {
         let flat: Vec<f32> = depth.iter().map(|z| if *z == far { 1.01 * near } else { *z }).collect();
         seed_behind_edges(&mut scene, &[Some(flat)]);
         assert_eq!(scene.points.len(), left);
-    }
-
-    #[test]
-    fn lifting_is_the_inverse_of_projecting() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let dir = folder.path().join("scene");
-        synthetic::write(&dir, &synthetic::Options { width: 64, height: 48, ..Default::default() }).expect("a scene");
-        let scene = load(&dir, &Config::default()).expect("it loads");
-        let camera = &scene.train[3].camera;
-        for pixel in [0, 77, 64 * 48 - 1] {
-            let at = lift(camera, pixel, 2.5).expect("the lens has an inverse");
-            assert_eq!(pixel_of(camera, at), Some(pixel));
-            assert!((camera.to_camera(at)[2] - 2.5).abs() < 1e-6);
-        }
     }
 }

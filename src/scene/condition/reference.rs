@@ -3,7 +3,7 @@
 use image::{GrayImage, Luma};
 use rayon::prelude::*;
 
-use super::points::{lift, pixel_of};
+use super::points::pixel_of;
 use super::sparse::{Sample, deviation, fit, samples};
 use crate::scene::{Camera, Point, Prior, PriorKind, Reference, Scene};
 
@@ -235,7 +235,9 @@ fn outranked(scene: &Scene, reference: &Reference, depth: &[f32], enough: u32) -
         scene.train.iter().enumerate().filter(|(i, _)| *i != reference.view).map(|(_, view)| view).collect();
     let views = |pixel: usize| -> usize {
         let z = depth[pixel];
-        let Some(position) = z.is_finite().then(|| lift(&view.camera, pixel, f64::from(z))).flatten() else { return 0 };
+        let camera = &view.camera;
+        let place = || camera.lift(camera.pixel_center(pixel), f64::from(z));
+        let Some(position) = z.is_finite().then(place).flatten() else { return 0 };
         let sees = |other: &&&crate::scene::View| {
             pixel_of(&other.camera, position).is_some_and(|p| other.blend().is_none_or(|w| w.as_raw()[p] == 0))
         };

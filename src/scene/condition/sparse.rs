@@ -218,7 +218,7 @@ mod tests {
         let point = |_| {
             let pixel = rng.random_range(0..640 * 480);
             let z = 10.0 * rng.random_range(0.95..1.05);
-            let position = super::super::points::lift(&camera, pixel, z).expect("ahead").map(|v| v as f32);
+            let position = camera.lift(camera.pixel_center(pixel), z).expect("ahead").map(|v| v as f32);
             Point { position, color: [0; 3] }
         };
         let points: Vec<Point> = (0..60_000).map(point).collect();

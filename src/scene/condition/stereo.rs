@@ -9,7 +9,6 @@
 use image::RgbImage;
 use rayon::prelude::*;
 
-use super::points::lift;
 use super::sparse::samples;
 use crate::scene::{Camera, Prior, PriorKind, Scene};
 
@@ -60,7 +59,7 @@ fn sweep(camera: &Camera, picture: &RgbImage, others: &[(&Camera, &RgbImage)], [
     let kept = (others.len() * 2).div_ceil(3).max(FEWEST_VIEWS);
     let cost = |plane: usize| -> Vec<f32> {
         let z = 1.0 / inverse(plane);
-        let at = |pixel: usize| lift(camera, pixel, z);
+        let at = |pixel: usize| camera.lift(camera.pixel_center(pixel), z);
         let places: Vec<Option<[f64; 3]>> = (0..w * h).map(at).collect();
         let mut costs: Vec<Vec<f32>> = vec![];
         for (other, image) in others {
