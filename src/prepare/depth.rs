@@ -65,14 +65,6 @@ impl DepthMap {
     }
 }
 
-/// The world point at a depth behind a pixel position; nothing where the lens has no ray.
-pub fn point(camera: &Camera, pixel: [f64; 2], depth: f64) -> Option<[f64; 3]> {
-    let [x, y] = camera.unproject(pixel)?;
-    let seen = [x * depth, y * depth, depth];
-    let shifted: [f64; 3] = std::array::from_fn(|i| seen[i] - camera.translation[i]);
-    Some(std::array::from_fn(|i| (0..3).map(|k| f64::from(camera.rotation[k][i]) * shifted[k]).sum()))
-}
-
 /// How a depth map sees a point that some other view claims.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Witness {
@@ -122,10 +114,8 @@ pub fn agreed(maps: &[DepthMap], of: usize) -> Vec<f32> {
     let cameras: Vec<Camera> = maps.iter().map(|map| map.camera).collect();
     let witnesses: Vec<usize> = neighbours(&cameras, of).into_iter().take(WITNESSES).collect();
     let map = &maps[of];
-    let w = map.camera.size[0] as usize;
     let keep = |i: usize, depth: f32| {
-        let pixel = [(i % w) as f64 + 0.5, (i / w) as f64 + 0.5];
-        let Some(point) = point(&map.camera, pixel, f64::from(depth)) else { return false };
+        let Some(point) = map.camera.lift(map.camera.pixel_center(i), f64::from(depth)) else { return false };
         let said: Vec<Witness> = witnesses.iter().map(|j| maps[*j].witness(point, AGREE)).collect();
         let count = |what| said.iter().filter(|s| **s == what).count();
         count(Witness::Agrees) >= 2 && 2 * count(Witness::Contradicts) < count(Witness::Agrees)
@@ -275,7 +265,7 @@ mod tests {
     #[test]
     fn points_lie_where_they_are_seen() {
         let map = map(1.0, 4.0);
-        let p = point(&map.camera, [12.0, 8.0], 4.0).unwrap();
+        let p = map.camera.lift([12.0, 8.0], 4.0).unwrap();
         // Two pixels to the right at focal length 20 and depth 4, from x = 1.
         assert!((p[0] - 1.4).abs() < 1e-12 && p[1].abs() < 1e-12 && (p[2] - 4.0).abs() < 1e-12);
         assert_eq!(map.smooth([3.3, 4.7]), 4.0);

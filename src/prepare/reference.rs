@@ -147,7 +147,7 @@ fn seen_elsewhere(of: usize, behind: &DepthMap, maps: &[DepthMap], masks: &[Gray
     let looked_into = |i: usize| {
         let pixel = [(i % w) as f64 + 0.5, (i / w) as f64 + 0.5];
         let z = f64::from(behind.depth[i]);
-        let Some(point) = z.is_finite().then(|| depth::point(&behind.camera, pixel, z)).flatten() else { return false };
+        let Some(point) = z.is_finite().then(|| behind.camera.lift(pixel, z)).flatten() else { return false };
         let others = maps.iter().zip(masks).enumerate().filter(|(j, _)| *j != of);
         let seeing = others.filter(|(_, (map, mask))| {
             let open = map.camera.project(point).is_some_and(|[x, y]| {
@@ -462,7 +462,7 @@ fn fill(
 fn world(camera: &Camera, i: usize, disparity: f64) -> Option<[f64; 3]> {
     let w = camera.size[0] as usize;
     let pixel = [(i % w) as f64 + 0.5, (i / w) as f64 + 0.5];
-    (disparity > 0.0 && disparity.is_finite()).then(|| depth::point(camera, pixel, 1.0 / disparity)).flatten()
+    (disparity > 0.0 && disparity.is_finite()).then(|| camera.lift(pixel, 1.0 / disparity)).flatten()
 }
 
 /// For each pixel of the region the plane at which the photographs agree best.

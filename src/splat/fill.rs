@@ -10,7 +10,6 @@ use super::views::{Artist, Seen};
 use crate::gpu::Gpu;
 use crate::math::harmonics::ZEROTH;
 use crate::model::gaussians::{Cloud, logit};
-use crate::prepare::depth;
 use crate::prepare::fit::Fit;
 use crate::prepare::masks::{self, Votes};
 use crate::prepare::splats::Splats;
@@ -87,7 +86,7 @@ pub fn begin(gpu: &Gpu, scene: &Scene, root: &Path, rest: &Cloud, fit: &Fit) -> 
         if (off < DIFFERS && drawn.transmittance[i] < OPEN) || !z.is_finite() || z <= 0.0 {
             continue;
         }
-        let Some(point) = depth::point(camera, [f64::from(x) + 0.5, f64::from(y) + 0.5], z) else { continue };
+        let Some(point) = camera.lift(camera.pixel_center(i), z) else { continue };
         let width = WIDTH * z / f64::from(camera.focal[0].min(camera.focal[1]));
         cloud.position.push(point.map(|v| v as f32));
         cloud.log_scale.push([width.ln() as f32; 3]);

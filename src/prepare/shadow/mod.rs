@@ -197,10 +197,9 @@ fn some(sizes: impl Iterator<Item = usize>, wanted: usize) -> usize {
 }
 
 fn world(map: &DepthMap, pixel: usize) -> Option<DVec3> {
-    let w = map.camera.size[0] as usize;
     let z = f64::from(map.depth[pixel]);
-    let at = [(pixel % w) as f64 + 0.5, (pixel / w) as f64 + 0.5];
-    z.is_finite().then(|| depth::point(&map.camera, at, z)).flatten().map(DVec3::from)
+    let place = || map.camera.lift(map.camera.pixel_center(pixel), z);
+    z.is_finite().then(place).flatten().map(DVec3::from)
 }
 
 /// Places of the object: what the fit has within the masks, where the masks of most views agree.
