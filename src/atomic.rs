@@ -11,6 +11,8 @@ use std::io::{self, Write};
 use std::ops::{Deref, DerefMut};
 use std::path::{Path, PathBuf};
 
+use serde::Serialize;
+
 /// Bytes of a file's name on all common file systems.
 pub const LONGEST_NAME: usize = 255;
 /// Letters behind the name.
@@ -104,6 +106,35 @@ impl Write for AtomicWriteFile {
     fn flush(&mut self) -> io::Result<()> {
         self.file.flush()
     }
+}
+
+/// Writes a file that appears with all of these bytes or not at all.
+///
+/// # Errors
+/// As [`AtomicWriteFile::open`] and [`AtomicWriteFile::commit`].
+pub fn write(path: impl AsRef<Path>, bytes: impl AsRef<[u8]>) -> io::Result<()> {
+    let mut file = AtomicWriteFile::open(path)?;
+    file.write_all(bytes.as_ref())?;
+    file.commit()
+}
+
+/// As [`write`], in a folder that is made if it is missing.
+///
+/// # Errors
+/// As [`write`], and when the folder cannot be made.
+pub fn write_below(path: &Path, bytes: impl AsRef<[u8]>) -> io::Result<()> {
+    if let Some(folder) = path.parent() {
+        std::fs::create_dir_all(folder)?;
+    }
+    write(path, bytes)
+}
+
+/// Writes a value as indented JSON that ends with a line break; the file appears whole or not at all.
+///
+/// # Errors
+/// As [`write`], and of a value that JSON cannot say.
+pub fn write_json(path: impl AsRef<Path>, value: &impl Serialize) -> io::Result<()> {
+    write(path, serde_json::to_string_pretty(value)? + "\n")
 }
 
 /// A name of which [`LONGEST_NAME`] leaves room for two dots and the letters. A name that is too long keeps its beginning

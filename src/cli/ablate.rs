@@ -1,9 +1,8 @@
 //! `gscream-vk ablate`.
 
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
-use crate::atomic::AtomicWriteFile;
+use crate::atomic;
 use anyhow::{Context as _, bail, ensure};
 use serde::Serialize;
 
@@ -371,12 +370,7 @@ fn of_scene(
 }
 
 fn write(path: &Path, value: &impl Serialize) -> anyhow::Result<()> {
-    let write = || {
-        let mut file = AtomicWriteFile::open(path)?;
-        file.write_all((serde_json::to_string_pretty(value)? + "\n").as_bytes())?;
-        file.commit()
-    };
-    write().with_context(|| format!("{}: cannot be written", path.display()))
+    atomic::write_json(path, value).with_context(|| format!("{}: cannot be written", path.display()))
 }
 
 #[cfg(test)]

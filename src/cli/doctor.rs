@@ -1,7 +1,6 @@
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
-use crate::atomic::AtomicWriteFile;
+use crate::atomic;
 use anyhow::{Context as _, bail};
 
 use super::{next, pictures};
@@ -51,7 +50,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         let rgb: Vec<[f32; 3]> = sheet.picture.pixels().map(|p| p.0.map(|v| f32::from(v) / 255.0)).collect();
         pictures::write_png(&folder.join(sheet::PICTURE), [sheet.picture.width(), sheet.picture.height()], &rgb)?;
         let page = folder.join(sheet::PAGE);
-        write(&page, &sheet::page(&args.scene.display().to_string(), &sheet, &report))
+        atomic::write(&page, sheet::page(&args.scene.display().to_string(), &sheet, &report))
             .with_context(|| format!("{}: cannot be written", page.display()))?;
         eprintln!("wrote {} and {} in {}", sheet::PICTURE, sheet::PAGE, folder.display());
     }
@@ -90,10 +89,4 @@ pub(super) fn text(report: &Report) -> String {
         text += "nothing wrong was found\n";
     }
     text
-}
-
-fn write(path: &Path, text: &str) -> std::io::Result<()> {
-    let mut file = AtomicWriteFile::open(path)?;
-    file.write_all(text.as_bytes())?;
-    file.commit()
 }

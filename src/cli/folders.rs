@@ -12,10 +12,9 @@
 //! RUN/checkpoints/    until the run is complete: what it goes on from
 //! ```
 
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
-use crate::atomic::AtomicWriteFile;
+use crate::atomic;
 use anyhow::{Context as _, bail};
 use serde::{Deserialize, Serialize};
 
@@ -101,12 +100,7 @@ impl Record {
     /// A folder that cannot be written.
     pub fn write(&self, run: &Path) -> anyhow::Result<()> {
         let path = run.join(RECORD);
-        let write = || {
-            let mut file = AtomicWriteFile::open(&path)?;
-            file.write_all((serde_json::to_string_pretty(self)? + "\n").as_bytes())?;
-            file.commit()
-        };
-        write().with_context(|| format!("{}: cannot be written", path.display()))
+        atomic::write_json(&path, self).with_context(|| format!("{}: cannot be written", path.display()))
     }
 
     /// Reads the run folder's `run.json`.

@@ -1,9 +1,9 @@
 //! Rendered views on disk: PNG for colour, OpenEXR for depth and transmittance.
 
-use std::io::{self, Cursor, Write as _};
+use std::io::{self, Cursor};
 use std::path::{Path, PathBuf};
 
-use crate::atomic::AtomicWriteFile;
+use crate::atomic;
 use exr::prelude::{
     AnyChannel, AnyChannels, Encoding, FlatSamples, Layer, LayerAttributes, SmallVec, WritableImage as _,
 };
@@ -37,7 +37,9 @@ pub fn path(folder: &Path, name: &str, extension: &str) -> PathBuf {
 pub fn write_png(path: &Path, size: [u32; 2], rgb: &[[f32; 3]]) -> Result<(), Error> {
     let mut bytes = Cursor::new(Vec::new());
     let encoded = to_rgb8(size, rgb).write_to(&mut bytes, ImageFormat::Png).map_err(io::Error::other);
-    encoded.and_then(|()| write(path, bytes.get_ref())).map_err(|source| Error { path: path.to_owned(), source })
+    encoded
+        .and_then(|()| atomic::write_below(path, bytes.get_ref()))
+        .map_err(|source| Error { path: path.to_owned(), source })
 }
 
 /// Writes a picture as JPEG, for pages, making the folder if it is missing. The file appears complete or not at all.
@@ -47,7 +49,7 @@ pub fn write_png(path: &Path, size: [u32; 2], rgb: &[[f32; 3]]) -> Result<(), Er
 pub fn write_jpeg(path: &Path, picture: &image::RgbImage) -> Result<(), Error> {
     let mut bytes = vec![];
     let encoded = picture.write_with_encoder(JpegEncoder::new_with_quality(&mut bytes, 92)).map_err(io::Error::other);
-    encoded.and_then(|()| write(path, &bytes)).map_err(|source| Error { path: path.to_owned(), source })
+    encoded.and_then(|()| atomic::write_below(path, &bytes)).map_err(|source| Error { path: path.to_owned(), source })
 }
 
 /// Writes a grey picture as PNG, making the folder if it is missing. The file appears complete or not at all.
@@ -57,7 +59,9 @@ pub fn write_jpeg(path: &Path, picture: &image::RgbImage) -> Result<(), Error> {
 pub fn write_mask(path: &Path, mask: &image::GrayImage) -> Result<(), Error> {
     let mut bytes = Cursor::new(Vec::new());
     let encoded = mask.write_to(&mut bytes, ImageFormat::Png).map_err(io::Error::other);
-    encoded.and_then(|()| write(path, bytes.get_ref())).map_err(|source| Error { path: path.to_owned(), source })
+    encoded
+        .and_then(|()| atomic::write_below(path, bytes.get_ref()))
+        .map_err(|source| Error { path: path.to_owned(), source })
 }
 
 /// Writes an OpenEXR file with two float32 channels, making the folder if it is missing. The file appears complete or not
@@ -84,16 +88,9 @@ pub fn write_exr(path: &Path, size: [u32; 2], depth: &[f32], transmittance: &[f3
     );
     let mut bytes = Cursor::new(Vec::new());
     let encoded = exr::prelude::Image::from_layer(layer).write().to_buffered(&mut bytes).map_err(io::Error::other);
-    encoded.and_then(|()| write(path, bytes.get_ref())).map_err(|source| Error { path: path.to_owned(), source })
-}
-
-fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    if let Some(folder) = path.parent() {
-        std::fs::create_dir_all(folder)?;
-    }
-    let mut file = AtomicWriteFile::open(path)?;
-    file.write_all(bytes)?;
-    file.commit()
+    encoded
+        .and_then(|()| atomic::write_below(path, bytes.get_ref()))
+        .map_err(|source| Error { path: path.to_owned(), source })
 }
 
 #[cfg(test)]

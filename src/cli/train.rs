@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use crate::atomic::AtomicWriteFile;
+use crate::atomic;
 use anyhow::{Context as _, bail, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -363,7 +363,7 @@ pub(super) fn train(
     let run = start(gpu, scene, settings, &verdict)?;
     clear(folder)?;
     let path = folder.join(SETTINGS);
-    write(&path, &settings.to_toml()).with_context(|| format!("{}: cannot be written", path.display()))?;
+    atomic::write(&path, settings.to_toml()).with_context(|| format!("{}: cannot be written", path.display()))?;
     let record = Record { asked: reduced.map(|_| Asked::of(asked)), ..Record::new(&gpu.info().name, name) };
     record.write(folder)?;
     for left in &run.step().plan.left_out {
@@ -534,13 +534,6 @@ fn sweep(folder: &Path) {
     folder::sweep_below(&folder.join(index::PICTURES), &|name| name.ends_with(".jpg"));
 }
 
-/// Writes a file that appears complete or not at all.
-fn write(path: &Path, text: &str) -> std::io::Result<()> {
-    let mut file = AtomicWriteFile::open(path)?;
-    std::io::Write::write_all(&mut file, text.as_bytes())?;
-    file.commit()
-}
-
 const METRICS: &str = "metrics.json";
 const TRACE: &str = "trace.json";
 
@@ -621,7 +614,7 @@ impl Observer for Watch {
     fn corrected(&mut self, corrections: &[[u32; 2]]) {
         let Some((_, path, settings)) = &mut self.clock else { return };
         settings.train.corrections = corrections.to_vec();
-        if let Err(error) = write(path, &settings.to_toml()) {
+        if let Err(error) = atomic::write(&*path, settings.to_toml()) {
             let line = format!("warning: {}: cannot be written: {error}", path.display());
             self.say(&line);
         }

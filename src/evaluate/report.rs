@@ -1,8 +1,7 @@
 use std::fmt::Write as _;
-use std::io::Write as _;
 use std::path::Path;
 
-use crate::atomic::AtomicWriteFile;
+use crate::atomic;
 use serde::{Deserialize, Serialize};
 
 use super::fid::Frechet;
@@ -216,14 +215,7 @@ impl Report {
     /// # Errors
     /// A path that cannot be written.
     pub fn write_json(&self, path: &Path) -> Result<(), Error> {
-        let write = || {
-            let mut file = AtomicWriteFile::open(path)?;
-            let mut text = serde_json::to_string_pretty(self)?;
-            text.push('\n');
-            file.write_all(text.as_bytes())?;
-            file.commit()
-        };
-        write().map_err(|source| Error::Write { path: path.to_owned(), source })
+        atomic::write_json(path, self).map_err(|source| Error::Write { path: path.to_owned(), source })
     }
 }
 

@@ -3,7 +3,6 @@
 //! Drivers read what they stored without doubt: a file that was cut short or written by another one may end the program.
 //! So a hash stands before the driver's words, and their header must name the device that is opened.
 
-use std::io::Write as _;
 use std::path::Path;
 
 use super::physical::Identity;
@@ -29,14 +28,7 @@ pub(super) fn read(path: &Path, identity: Identity) -> Vec<u8> {
 /// # Errors
 /// When the folder or file cannot be written.
 pub(super) fn write(path: &Path, data: &[u8]) -> std::io::Result<()> {
-    if let Some(folder) = path.parent() {
-        std::fs::create_dir_all(folder)?;
-    }
-    let mut file = crate::atomic::AtomicWriteFile::open(path)?;
-    file.write_all(MAGIC)?;
-    file.write_all(blake3::hash(data).as_bytes())?;
-    file.write_all(data)?;
-    file.commit()
+    crate::atomic::write_below(path, [MAGIC, blake3::hash(data).as_bytes(), data].concat())
 }
 
 fn unpack(file: &[u8]) -> Option<&[u8]> {

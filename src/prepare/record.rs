@@ -6,10 +6,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
-use std::io::{self, Cursor, Write as _};
+use std::io::{self, Cursor};
 use std::path::{Component, Path, PathBuf};
 
-use crate::atomic::{AtomicWriteFile, shortened};
+use crate::atomic::{self, AtomicWriteFile, shortened};
 use image::{GrayImage, ImageFormat, RgbImage};
 use serde::{Deserialize, Serialize};
 use tempfile::TempDir;
@@ -310,18 +310,17 @@ impl Folder {
         self.save()?;
         for (path, content) in todo {
             let target = self.root.join(&path);
-            let write = || -> io::Result<()> {
-                if let Some(folder) = target.parent() {
-                    std::fs::create_dir_all(folder)?;
-                }
+            let copy = |source: &Path| {
+                std::fs::create_dir_all(target.parent().unwrap_or(&self.root))?;
                 let mut file = AtomicWriteFile::open(&target)?;
-                match &content {
-                    Content::Bytes(bytes) => file.write_all(bytes)?,
-                    Content::Copy(source) => drop(io::copy(&mut File::open(source)?, &mut file)?),
-                }
+                io::copy(&mut File::open(source)?, &mut file)?;
                 file.commit()
             };
-            write().map_err(|source| Error::Io { path: target.clone(), source })?;
+            let written = match &content {
+                Content::Bytes(bytes) => atomic::write_below(&target, bytes),
+                Content::Copy(source) => copy(source),
+            };
+            written.map_err(|source| Error::Io { path: target.clone(), source })?;
         }
         let old: BTreeSet<String> =
             self.record.steps.get(step).map(|old| old.files.keys().cloned().collect()).unwrap_or_default();
@@ -344,13 +343,7 @@ impl Folder {
     fn save(&mut self) -> Result<(), Error> {
         env!("CARGO_PKG_VERSION").clone_into(&mut self.record.version);
         let path = self.root.join(RECORD);
-        let text = serde_json::to_string_pretty(&self.record).expect("plain maps and strings") + "\n";
-        let write = || -> io::Result<()> {
-            let mut file = AtomicWriteFile::open(&path)?;
-            file.write_all(text.as_bytes())?;
-            file.commit()
-        };
-        write().map_err(|source| Error::Io { path: path.clone(), source })
+        atomic::write_json(&path, &self.record).map_err(|source| Error::Io { path: path.clone(), source })
     }
 }
 

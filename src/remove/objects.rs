@@ -1,13 +1,13 @@
 //! The files that keep what is marked: `NAME.png`, a mask as `prepare --mask` takes it, and `NAME.json`, the marks it was made
 //! of and the hash of the mask they made. A mask that has another hash was changed by hand, and counts as it is.
 
-use std::io::{self, Cursor, Write as _};
+use std::io::{self, Cursor};
 use std::path::{Path, PathBuf};
 
 use image::{GrayImage, ImageFormat};
 use serde::{Deserialize, Serialize};
 
-use crate::atomic::AtomicWriteFile;
+use crate::atomic;
 use crate::prepare::click::Mark;
 use crate::prepare::masks;
 use crate::scene;
@@ -73,9 +73,7 @@ pub fn write(folder: &Path, name: &str, size: [u32; 2], marks: &[Mark], mask: Op
     // A mask without its marks is one that was made by hand, which is the lesser loss.
     for (path, bytes) in [(mask_path, bytes), (marks_path, serde_json::to_vec_pretty(&kept).map_err(io::Error::other)?)]
     {
-        let mut file = AtomicWriteFile::open(&path)?;
-        file.write_all(&bytes)?;
-        file.commit()?;
+        atomic::write(&path, &bytes)?;
     }
     Ok(())
 }

@@ -13,10 +13,9 @@
 //! their metadata and tensors, so that one is either whole or refused.
 
 use std::collections::{BTreeMap, HashMap};
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
-use crate::atomic::AtomicWriteFile;
+use crate::atomic;
 use image::GrayImage;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -594,10 +593,7 @@ pub fn write(run: &Path, owner: &Owner, state: &State) -> Result<PathBuf, WriteE
             .map_err(std::io::Error::other)?;
         let metadata: HashMap<String, String> = metadata.into_iter().collect();
         let bytes = safetensors::serialize(views, Some(metadata)).map_err(std::io::Error::other)?;
-        std::fs::create_dir_all(run.join(FOLDER))?;
-        let mut file = AtomicWriteFile::open(&path)?;
-        file.write_all(&bytes)?;
-        file.commit()
+        atomic::write_below(&path, &bytes)
     };
     attempt().map_err(failed)?;
     // Newer ones are none of this run's: they were refused when it went on, or it would have gone on from them.

@@ -1,7 +1,6 @@
 //! From photographs and their object to files for viewers: what prepare, doctor, train and export do, one after the other.
 //! A part whose inputs have not changed since it ended is not done again; one that was cut off is gone on with.
 
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
@@ -11,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use super::Args;
 use super::splat::Source;
-use crate::atomic::AtomicWriteFile;
+use crate::atomic;
 use crate::cli::folders::{MODEL, Record as RunRecord};
 use crate::cli::prepare::Bars;
 use crate::cli::shared::{SceneArgs, add_dense};
@@ -112,12 +111,7 @@ impl Record {
     fn write(&mut self, root: &Path) -> anyhow::Result<()> {
         env!("CARGO_PKG_VERSION").clone_into(&mut self.version);
         let path = root.join(RECORD);
-        let write = || {
-            let mut file = AtomicWriteFile::open(&path)?;
-            file.write_all((serde_json::to_string_pretty(self)? + "\n").as_bytes())?;
-            file.commit()
-        };
-        write().with_context(|| format!("{}: cannot be written", path.display()))
+        atomic::write_json(&path, self).with_context(|| format!("{}: cannot be written", path.display()))
     }
 }
 

@@ -1,9 +1,8 @@
 //! The same numbers as JSON and as CSV.
 
-use std::io::Write as _;
 use std::path::Path;
 
-use crate::atomic::AtomicWriteFile;
+use crate::atomic;
 
 use super::kernels::Kernels;
 use super::training::Training;
@@ -14,12 +13,7 @@ use super::{Error, Report};
 /// # Errors
 /// A path that cannot be written.
 pub fn write(path: &Path, contents: &[u8]) -> Result<(), Error> {
-    let write = || {
-        let mut file = AtomicWriteFile::open(path)?;
-        file.write_all(contents)?;
-        file.commit()
-    };
-    write().map_err(|source| Error::Write { path: path.to_owned(), source })
+    atomic::write(path, contents).map_err(|source| Error::Write { path: path.to_owned(), source })
 }
 
 /// Everything as JSON. A number that is not finite is null.

@@ -4,7 +4,7 @@ mod error;
 mod observer;
 mod vain;
 
-use crate::atomic::AtomicWriteFile;
+use crate::atomic;
 use crate::config::Settings;
 use crate::evaluate::{self, Report, ViewMetrics};
 use crate::gpu::{self, Buffer, Gpu, NotFinite, Submission, Timing, Timings};
@@ -104,9 +104,7 @@ impl<'f> Session<'f> {
     fn new(folder: &'f Path, history: &History) -> Result<Self, Error> {
         let path = folder.join(LOG);
         let open = || {
-            let mut file = AtomicWriteFile::open(&path)?;
-            file.write_all(history.log.as_bytes())?;
-            file.commit()?;
+            atomic::write(&path, &history.log)?;
             File::options().append(true).open(&path)
         };
         let log = open().map_err(|source| Error::Io { path: path.clone(), source })?;
