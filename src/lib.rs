@@ -57,6 +57,7 @@ pub mod remove;
 pub mod render;
 pub mod scene;
 mod sentence;
+pub mod signal;
 #[cfg(test)]
 #[path = "../tests/common/skip.rs"]
 mod skip;

@@ -16,8 +16,9 @@ use gscream_vk::model::files::{POINT_CLOUD, WEIGHTS};
 use gscream_vk::model::stored::Stored;
 use gscream_vk::render::forward::Capacity;
 use gscream_vk::scene::Scene;
+use gscream_vk::signal::Signal;
 use gscream_vk::train::plan::Plan;
-use gscream_vk::train::run::{Observer, Progress, Run, Signal};
+use gscream_vk::train::run::{Observer, Progress, Run};
 use gscream_vk::train::{checkpoint, forecast};
 
 /// Rounds behind every second step from the fourth to the twelfth.

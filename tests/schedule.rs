@@ -8,7 +8,7 @@ mod common;
 
 use common::skip::{Lack, skip};
 use gscream_vk::gpu::{Command, Entry, Form, Gpu, testing};
-use gscream_vk::render::bin::Tiling;
+use gscream_vk::render::tiling::Tiling;
 use gscream_vk::scene::Scene;
 use gscream_vk::train::run::Run;
 

@@ -15,8 +15,9 @@ use gscream_vk::model::files;
 use gscream_vk::render::forward::Capacity;
 use gscream_vk::render::view::Renderer;
 use gscream_vk::scene::{self, Scene, synthetic};
+use gscream_vk::signal::Signal;
 use gscream_vk::train::config::Coarse;
-use gscream_vk::train::run::{Observer, Progress, Run, Signal, Summary};
+use gscream_vk::train::run::{Observer, Progress, Run, Summary};
 use gscream_vk::train::{checkpoint, forecast};
 
 /// What a run ends with.

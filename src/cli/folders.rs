@@ -24,6 +24,8 @@ use crate::model::files::POINT_CLOUD;
 
 /// The record's file within a run folder.
 pub const RECORD: &str = "run.json";
+/// The run's folder within what `remove` makes.
+pub const RUN: &str = "run";
 /// The resolved settings within a run folder.
 pub const SETTINGS: &str = "settings.toml";
 /// The model's folder within a run folder.

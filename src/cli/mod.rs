@@ -36,7 +36,7 @@ mod view;
 use std::fmt::Write as _;
 use std::process::ExitCode;
 
-use crate::train::run::Signal;
+use crate::signal::Signal;
 
 /// Removes an object from a 3D Gaussian scene, on any Vulkan 1.3 device.
 ///

@@ -7,7 +7,7 @@ use super::shared::DeviceArgs;
 use super::{next, signals};
 use crate::prepare::shadow::Answer;
 use crate::prepare::{self, Evidence, Request, Step, Watch};
-use crate::train::run::Signal;
+use crate::signal::Signal;
 
 /// Make a scene of photographs and one mask: cameras, masks for all views, depth, a reference view without the object
 ///

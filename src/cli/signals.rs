@@ -10,7 +10,7 @@ use std::sync::{Arc, LazyLock, Mutex, PoisonError};
 use anyhow::Context as _;
 use signal_hook::flag;
 
-use crate::train::run::Signal;
+use crate::signal::Signal;
 
 /// The number of the last signal; 0 before the first.
 static CAUGHT: LazyLock<Arc<AtomicUsize>> = LazyLock::new(Arc::default);

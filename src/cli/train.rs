@@ -22,10 +22,11 @@ use crate::model::files::{POINT_CLOUD, WEIGHTS};
 use crate::render::view::Rendered;
 use crate::scene::doctor::{self, Severity};
 use crate::scene::{Camera, Scene};
+use crate::signal::Signal;
 use crate::splat;
 use crate::train::checkpoint::{self, Owner, Search};
 use crate::train::forecast::{self, Fitting, Question};
-use crate::train::run::{LOG, Observer, Progress, Run, Signal, Summary};
+use crate::train::run::{LOG, Observer, Progress, Run, Summary};
 use crate::view::live::{Board, Host};
 use crate::view::server;
 

@@ -104,7 +104,7 @@ fn page(args: &Args) -> anyhow::Result<Page> {
         None => most_upright(&cameras.cameras).with_context(|| format!("{}: names no camera", figures.display()))?,
     };
     // What `remove` makes has its run in a folder of its own.
-    let origin = Origin::find(run).or_else(|_| Origin::find(&run.join(super::remove::RUN))).ok();
+    let origin = Origin::find(run).or_else(|_| Origin::find(&run.join(super::folders::RUN))).ok();
     let photograph = origin.filter(|_| !args.no_photograph).and_then(|origin| {
         let jpeg = photograph(&origin, pose);
         if let Err(error) = &jpeg {

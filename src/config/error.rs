@@ -1,6 +1,8 @@
 use std::fmt;
 use std::path::PathBuf;
 
+use super::Invalid;
+
 /// Where a value was written.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Origin {
@@ -35,33 +37,6 @@ impl fmt::Display for Origin {
             Self::Flag(flag) => f.write_str(flag),
             Self::Default => f.write_str("default settings"),
         }
-    }
-}
-
-/// A setting whose value makes no sense. [`Error::Invalid`] is this with its origin.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("`{key}` is {value}, but {reason}")]
-pub struct Invalid {
-    /// Key, dotted, relative to the section that refused it.
-    pub key: String,
-    /// The value as text.
-    pub value: String,
-    /// What it must be.
-    pub reason: String,
-    /// The key it was compared with, if any: where the fault lies when `key` itself has its default.
-    pub against: Option<String>,
-}
-
-impl Invalid {
-    /// The same with its keys put inside `section`.
-    pub fn inside(self, section: &str) -> Self {
-        let inside = |key: String| format!("{section}.{key}");
-        Self { key: inside(self.key), against: self.against.map(inside), ..self }
-    }
-
-    /// The same, naming the key that the value was compared with.
-    pub fn against(self, key: &str) -> Self {
-        Self { against: Some(key.to_owned()), ..self }
     }
 }
 

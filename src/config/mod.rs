@@ -7,6 +7,7 @@
 
 mod arguments;
 mod error;
+mod invalid;
 mod layer;
 mod removed;
 
@@ -17,7 +18,8 @@ use serde::{Deserialize, Serialize};
 use crate::optimizer::Group;
 
 pub use arguments::SettingsArgs;
-pub use error::{Error, Invalid, Origin};
+pub use error::{Error, Origin};
+pub use invalid::{Invalid, ensure};
 use layer::Layers;
 pub use removed::without_removed;
 
@@ -198,16 +200,3 @@ const SHORTEST_ROUND: u32 = 25;
 /// Learning rates go with the number of steps to minus this power. On spin-1 without masks 600 steps gain 0.4, 0.7 and 0.9
 /// dB with 2, 3 and 5 times the paper's rates, which are for 30,000.
 const RATE_EXPONENT: f64 = 0.4;
-
-/// `Err` naming `key` and `value` unless the condition holds; `reason` completes "is VALUE, but ...".
-pub fn ensure(
-    holds: bool,
-    key: &str,
-    value: impl std::fmt::Display,
-    reason: impl std::fmt::Display,
-) -> Result<(), Invalid> {
-    if holds {
-        return Ok(());
-    }
-    Err(Invalid { key: key.to_owned(), value: value.to_string(), reason: reason.to_string(), against: None })
-}

@@ -26,7 +26,7 @@ pub use crate::model::ply;
 use crate::model::stored::Stored;
 use crate::render::view::Renderer;
 use crate::scene::{Camera, Scene};
-use crate::train::run::Signal;
+use crate::signal::Signal;
 
 /// Why an export, or one of its files, cannot be written or read.
 #[derive(Debug, thiserror::Error)]

@@ -8,11 +8,8 @@ use rand::{RngExt as _, SeedableRng as _};
 use rayon::prelude::*;
 
 use super::Sites;
-use super::fuse::Surface;
+use super::fuse::{Filled, Surface};
 use super::picture::Picture;
-
-/// Depth z of the sites of a view that are not confirmed, NaN elsewhere and where nothing around tells.
-pub(super) type Filled = Vec<f64>;
 
 /// Colours (8-bit, root of the sum over channels) by which a segment of one site may differ from its neighbour; one of n
 /// sites by an n-th of that more than it does within itself.

@@ -3,7 +3,6 @@
 use rayon::prelude::*;
 
 use super::depth::Map;
-use super::fill::Filled;
 use super::picture::Picture;
 use crate::scene::Point;
 
@@ -22,6 +21,8 @@ const BEFORE: f64 = 0.08;
 
 /// Depth z of a view's sites that other views confirm, NaN elsewhere.
 pub(super) type Surface = Vec<f64>;
+/// Depth z of the sites of a view that are not confirmed, NaN elsewhere and where nothing around tells.
+pub(super) type Filled = Vec<f64>;
 
 /// Depth at a place in a picture, if it matches well there.
 fn depth_at(picture: &Picture, map: &Map, pixel: [f64; 2]) -> Option<f64> {

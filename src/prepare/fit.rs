@@ -9,7 +9,8 @@ use crate::gpu::Gpu;
 use crate::model::files::{POINT_CLOUD, WEIGHTS};
 use crate::model::stored::Stored;
 use crate::scene::Scene;
-use crate::train::run::{Observer, Progress, Run, Signal};
+use crate::signal::Signal;
+use crate::train::run::{Observer, Progress, Run};
 
 /// The fit's folder within a prepared scene.
 pub const FOLDER: &str = "prepare/fit";

@@ -25,8 +25,8 @@ use image::GrayImage;
 use crate::gpu::{self, Gpu};
 use crate::scene::{self, PriorKind, Scene, resample};
 use crate::sentence::one_line;
+use crate::signal::Signal;
 use crate::train::checkpoint::Fingerprint;
-use crate::train::run::Signal;
 
 use fit::Fit;
 use network::Inpainting;

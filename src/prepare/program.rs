@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::Duration;
 
-use crate::train::run::Signal;
+use crate::signal::Signal;
 
 /// Time between two looks at a program and at the signals.
 const POLL: Duration = Duration::from_millis(20);

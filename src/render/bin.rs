@@ -6,11 +6,11 @@
 //! tile and run, and a pair is touched 9 times, not 30.
 
 use super::method::Method;
-use super::project::listed;
-use super::rasterize::Projected;
+use super::project::{Projected, listed};
 use super::slots::Slots;
+use super::tiling::Tiling;
 use crate::gpu::kernels::render::{bin_count, bin_depth_keys, bin_expand, bin_ranges, bin_rank, cpu};
-use crate::gpu::{Buffer, Check, Error, Form, Gpu, Groups, Recorder, Reference};
+use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
 use crate::math::tiles::Support;
 use crate::primitives::compact::Compact;
 use crate::primitives::dispatch::Shape;
@@ -133,47 +133,6 @@ impl Reference for cpu::bin_tally_ranges::Kernel {
         for tile in 0..push.tiles {
             host.ranges[tile as usize] = [first(tile), first(tile + 1)];
         }
-    }
-}
-
-/// Shape of the rasteriser's tiles.
-#[derive(Clone, Copy, PartialEq, Eq, Debug, Hash)]
-pub enum Tiling {
-    /// 16 x 16 pixels, 64 threads: any subgroup size.
-    Wide,
-    /// 8 x 8 pixels, one subgroup of 8 threads: CPU drivers.
-    Narrow,
-}
-
-impl Tiling {
-    /// The better shape for a device: narrow where kernels of lanes are taken.
-    pub fn of(gpu: &Gpu) -> Self {
-        if gpu.lanes() { Self::Narrow } else { Self::Wide }
-    }
-    /// The form of the kernels that work on such tiles.
-    pub fn form(self) -> Form {
-        match self {
-            Self::Wide => Form::Gpu,
-            Self::Narrow => Form::Cpu,
-        }
-    }
-    /// Side of a tile in pixels.
-    pub fn side(self) -> u32 {
-        match self {
-            Self::Wide => 16,
-            Self::Narrow => 8,
-        }
-    }
-    /// Threads per tile.
-    pub fn threads(self) -> u32 {
-        match self {
-            Self::Wide => 64,
-            Self::Narrow => 8,
-        }
-    }
-    /// Tiles in x and y of a picture.
-    pub fn grid(self, size: [u32; 2]) -> [u32; 2] {
-        size.map(|n| n.div_ceil(self.side()))
     }
 }
 

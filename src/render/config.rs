@@ -1,7 +1,12 @@
 use serde::{Deserialize, Serialize};
 
-use super::rasterize::{ALPHA_MIN, TRANSMITTANCE_MIN};
 use crate::config::{Invalid, ensure};
+
+/// Samples below this alpha are skipped, unless the settings say otherwise.
+pub const ALPHA_MIN: f64 = 1.0 / 255.0;
+
+/// A pixel is finished before its transmittance falls below this, unless the settings say otherwise.
+pub const TRANSMITTANCE_MIN: f64 = 1e-4;
 
 /// How anchors become a picture. The low-pass (0.3 px^2) and the largest alpha (0.99) define the picture and are not
 /// settings.

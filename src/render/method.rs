@@ -1,7 +1,7 @@
 //! How a picture is computed on a device: the choices of [`super::Config`] that trade accuracy for time, resolved.
 
-use super::bin::Tiling;
 use super::config::{Config, Tiles};
+use super::tiling::Tiling;
 use crate::gpu::{Error, Gpu};
 
 /// What binning and blending are specialised for. Forward and backward passes of a picture must agree on it.

@@ -11,6 +11,7 @@ pub mod project;
 pub mod rasterize;
 pub mod session;
 pub mod slots;
+pub mod tiling;
 pub mod view;
 pub mod visible;
 pub mod widen;

@@ -11,9 +11,29 @@ use crate::gpu::kernels::render::{project, project_backward};
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::math::camera::{Camera, Lens, Splat};
 use crate::math::camera::{project as project_one, project_backward as project_one_backward};
+use crate::primitives::Count;
 
 /// Camera z of the near plane, scene units (the release's value).
 pub const NEAR: f32 = 0.2;
+
+/// Gaussians in screen space, per slot.
+#[derive(Clone, Copy)]
+pub struct Projected<'a> {
+    /// How many slots there are.
+    pub slots: Count<'a>,
+    /// Those whose Gaussian exists; the others hold nothing.
+    pub existing: &'a Slots,
+    /// `[slot]` px.
+    pub mean: &'a Buffer<[f32; 2]>,
+    /// `[slot]` factored: variance of x given y in px^2, slope of x on y, variance of y in px^2.
+    pub covariance: &'a Buffer<[f32; 3]>,
+    /// `[slot]` camera z, 0 where there is no Gaussian.
+    pub depth: &'a Buffer<f32>,
+    /// `[slot]`
+    pub opacity: &'a Buffer<f32>,
+    /// `[slot]` linear rgb.
+    pub color: &'a Buffer<[f32; 3]>,
+}
 
 /// A kernel's push constants from a [`Camera`], a near plane and further fields; the kernels spell the camera alike.
 macro_rules! camera_push {

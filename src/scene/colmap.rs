@@ -350,7 +350,7 @@ fn binary_cameras(path: &Path, models: usize) -> Result<Lenses, Error> {
         let (width, height) = (file.u64(&record)?, file.u64(&record)?);
         if model as usize >= models {
             let name = MODELS.get(model as usize).map_or_else(|| format!("model number {model}"), |m| m.0.to_string());
-            return Err(Error::CameraModel { path: path.to_path_buf(), id, model: name });
+            return Err(Error::CameraModel { path: path.to_path_buf(), id, model: name, hint: unsupported_hint() });
         }
         let mut parameters = [0.0; 12];
         let used = MODELS[model as usize].1;
@@ -489,7 +489,7 @@ fn text_cameras(path: &Path, models: usize) -> Result<Lenses, Error> {
         let name: String = fields.next("the camera model")?;
         let size = [fields.next("the width")?, fields.next("the height")?];
         let Some(model) = MODELS[..models].iter().position(|m| m.0 == name) else {
-            return Err(Error::CameraModel { path: path.to_path_buf(), id, model: name });
+            return Err(Error::CameraModel { path: path.to_path_buf(), id, model: name, hint: unsupported_hint() });
         };
         let mut parameters = [0.0; 12];
         let used = MODELS[model].1;
@@ -637,6 +637,6 @@ fn ply_points(path: &Path) -> Result<Points, Error> {
 }
 
 /// What to do about a camera model that is not projected with.
-pub(super) fn unsupported_hint() -> String {
+fn unsupported_hint() -> String {
     format!("{SUPPORTED} are supported; `gscream-vk prepare` resamples the photographs of other lenses")
 }

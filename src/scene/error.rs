@@ -1,6 +1,5 @@
 use std::path::PathBuf;
 
-use super::colmap;
 use crate::sentence::one_line;
 
 /// Why a scene cannot be read. Each message is one sentence that names the file, what is wrong and what to do.
@@ -26,8 +25,8 @@ pub enum Error {
     )]
     Truncated { path: PathBuf, length: u64, offset: u64, record: String },
     /// A camera model that is not projected with.
-    #[error("{}: camera {id} uses {}; {}", path.display(), one_line(model), colmap::unsupported_hint())]
-    CameraModel { path: PathBuf, id: u32, model: String },
+    #[error("{}: camera {id} uses {}; {}", path.display(), one_line(model), hint)]
+    CameraModel { path: PathBuf, id: u32, model: String, hint: String },
     /// No sparse model.
     #[error("{0}: no COLMAP model; sparse/0/ (or sparse/) must hold cameras and images, both .bin or both .txt; gscream-vk prepare {0}/images --out SCENE makes one, where colmap is installed", scene.display())]
     NoModel { scene: PathBuf },

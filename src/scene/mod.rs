@@ -647,7 +647,7 @@ impl Reader<'_> {
             return Err(Error::ImageSize { path: entry.image.clone(), size: picture, camera: intrinsics.size });
         }
         let image = decode(&entry.image)?.into_rgb8();
-        let size = picture.map(|n| reduced(n, self.config.downscale));
+        let size = reduced(picture, self.config.downscale);
         let mut image = if size == picture { image } else { resample::photograph(&image, size) };
         if let Some(map) = &entry.relight {
             relight::apply(map, picture, &mut image)?;
@@ -691,9 +691,9 @@ impl Reader<'_> {
     }
 }
 
-/// A side divided by `by`, rounded to the nearest pixel and never 0.
-pub(crate) fn reduced(side: u32, by: u32) -> u32 {
-    ((u64::from(side) + u64::from(by) / 2) / u64::from(by)).max(1) as u32
+/// A size with each side divided by `by`, rounded to the nearest pixel and never 0.
+pub(crate) fn reduced(size: [u32; 2], by: u32) -> [u32; 2] {
+    size.map(|side| ((u64::from(side) + u64::from(by) / 2) / u64::from(by)).max(1) as u32)
 }
 
 /// Whether one scale takes `calibrated` to `picture` with each side rounded up or down to whole pixels.
@@ -740,14 +740,14 @@ pub(crate) fn depth_maps(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Err
 /// A picture at 1 / `downscale` of its size, reduced as [`load`] reduces photographs.
 pub(crate) fn photograph(path: &Path, downscale: u32) -> Result<RgbImage, Error> {
     let image = decode(path)?.into_rgb8();
-    let size = [image.width(), image.height()].map(|n| reduced(n, downscale));
+    let size = reduced(image.dimensions().into(), downscale);
     Ok(if downscale == 1 { image } else { resample::photograph(&image, size) })
 }
 
 /// A mask at 1 / `downscale` of its size, reduced as [`load`] reduces masks: 255 inside, 0 elsewhere.
 pub(crate) fn mask(path: &Path, downscale: u32) -> Result<GrayImage, Error> {
     let mask = object_mask(path, false)?;
-    let size = [mask.width(), mask.height()].map(|n| reduced(n, downscale));
+    let size = reduced(mask.dimensions().into(), downscale);
     Ok(if downscale == 1 { mask } else { resample::mask(&mask, size) })
 }
 

@@ -57,11 +57,6 @@ pub fn mask_box(mask: &GrayImage) -> Option<[u32; 4]> {
     })
 }
 
-/// The size of a picture reduced by this factor.
-pub fn reduced_size(size: [u32; 2], reduction: u32) -> [u32; 2] {
-    size.map(|n| reduced(n, reduction))
-}
-
 /// Uploads all training views, reduced by this factor (1: as they are). Priors stay behind that no loss looks at.
 ///
 /// # Errors
@@ -76,7 +71,7 @@ pub fn upload(gpu: &Gpu, scene: &Scene, plan: &Plan, reduction: u32) -> Result<V
             None => view.prior.as_ref(),
         };
         let full = view.camera.size;
-        let size = reduced_size(full, reduction);
+        let size = reduced(full, reduction);
         let smaller = size != full;
         let picture = if smaller { Cow::Owned(resample::photograph(picture, size)) } else { Cow::Borrowed(picture) };
         let mask = match view.blend() {

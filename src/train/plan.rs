@@ -1,6 +1,5 @@
 //! What a scene needs: every stage that is present, from which step to which, and for each that is left out the reason.
 
-use super::photographs::reduced_size;
 use crate::config::Settings;
 use crate::losses;
 use crate::model::arrays::ARRAYS;
@@ -8,7 +7,7 @@ use crate::model::config::Form;
 use crate::model::parameter::DECODERS;
 use crate::optimizer::Group;
 use crate::render::rasterize::Outputs;
-use crate::scene::{Prior, Scene};
+use crate::scene::{Prior, Scene, reduced};
 use crate::stage;
 
 /// Something a scene does not need.
@@ -272,7 +271,7 @@ impl Plan {
 
     /// The distinct sizes of the training pictures reduced by this factor.
     pub fn reduced_sizes(scene: &Scene, reduction: u32) -> Vec<[u32; 2]> {
-        let mut sizes: Vec<_> = scene.train.iter().map(|v| reduced_size(v.camera.size, reduction)).collect();
+        let mut sizes: Vec<_> = scene.train.iter().map(|v| reduced(v.camera.size, reduction)).collect();
         sizes.sort_unstable();
         sizes.dedup();
         sizes

@@ -4,9 +4,11 @@ use gscream_vk::gpu::{Check, Gpu, testing};
 use gscream_vk::math::camera::{factors, factors_backward};
 use gscream_vk::primitives::Count;
 use gscream_vk::primitives::limit::Limits;
-use gscream_vk::render::bin::{Bin, Tiling};
-use gscream_vk::render::rasterize::{self, Backward, Outputs, Picture, PictureGradient, Projected};
+use gscream_vk::render::bin::Bin;
+use gscream_vk::render::project::Projected;
+use gscream_vk::render::rasterize::{self, Backward, Outputs, Picture, PictureGradient};
 use gscream_vk::render::slots::Slots;
+use gscream_vk::render::tiling::Tiling;
 
 use super::support::{Case, cases};
 

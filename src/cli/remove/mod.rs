@@ -19,9 +19,6 @@ use crate::remove::objects;
 use crate::splat::read;
 use work::{Job, Places};
 
-/// The run's folder within what is made.
-pub(super) const RUN: &str = "run";
-
 /// Remove an object from photographs: point at it in the browser, and it is gone
 ///
 /// Does what prepare, doctor, train and export do, one after the other. Without --mask, --box, --strokes and --yes it opens a

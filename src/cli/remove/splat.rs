@@ -8,7 +8,7 @@ use anyhow::{Context as _, bail};
 use serde::Serialize;
 
 use super::Args;
-use super::work::{Audience, Job, Places, Record};
+use super::work::{Audience, Job, Places, Record, Source};
 use crate::cli::export::{Cameras, FIGURES, STEM};
 use crate::cli::folders::MODEL;
 use crate::config::{Settings, SettingsArgs};
@@ -21,7 +21,7 @@ use crate::prepare::fit::{Fit, Ready};
 use crate::prepare::record::{self, Inputs};
 use crate::scene::Camera;
 use crate::splat::cameras::{self, Posed};
-use crate::splat::read::{self, Container, Splat, append};
+use crate::splat::read::{self, Container, append};
 use crate::splat::views::{self, Seen};
 use crate::splat::{Error, fill};
 
@@ -41,16 +41,6 @@ const REFERENCE_SHARE: f64 = 0.5;
 const SIDE: u32 = 256;
 /// Gaussians of the fill that are fainter than this at the end are left out.
 const FAINT: f64 = 0.02;
-
-/// A splat, what is seen of it, and what it is as a fit.
-pub struct Source {
-    splat: Splat,
-    seen: Seen,
-    /// For `prepare`.
-    pub ready: Arc<Ready>,
-    /// The folder of its pictures.
-    pub views: PathBuf,
-}
 
 /// The contents of `changes.json`: rows by number, as first and one past the last.
 #[derive(Serialize)]

@@ -9,9 +9,8 @@ use anyhow::{Context as _, bail};
 use serde::{Deserialize, Serialize};
 
 use super::Args;
-use super::splat::Source;
 use crate::atomic;
-use crate::cli::folders::{MODEL, Record as RunRecord};
+use crate::cli::folders::{self, MODEL, Record as RunRecord};
 use crate::cli::prepare::Bars;
 use crate::cli::shared::{SceneArgs, add_dense};
 use crate::cli::train::{self, Manner, Stop, Trained};
@@ -21,12 +20,15 @@ use crate::evaluate::Judge;
 use crate::export::{Observer, Options};
 use crate::gpu::Gpu;
 use crate::model::files::{POINT_CLOUD, WEIGHTS};
+use crate::prepare::fit::Ready;
 use crate::prepare::record::{self, Inputs};
 use crate::prepare::shadow::Answer;
 use crate::prepare::{self, Evidence, Request, Step, Watch};
 use crate::scene::doctor::Report;
+use crate::signal::Signal;
+use crate::splat::read::Splat;
+use crate::splat::views::Seen;
 use crate::train::checkpoint::{self, Fingerprint};
-use crate::train::run::Signal;
 use crate::view::live::Board;
 
 /// The folders of a removal.
@@ -44,7 +46,7 @@ pub struct Places {
 impl Places {
     /// Below this folder.
     pub fn new(root: PathBuf) -> Self {
-        let [scene, run, objects] = ["scene", super::RUN, "objects"].map(|name| root.join(name));
+        let [scene, run, objects] = ["scene", folders::RUN, "objects"].map(|name| root.join(name));
         Self { root, scene, run, objects }
     }
 
@@ -53,6 +55,18 @@ impl Places {
         let figures = |name: &String| name.as_str() != export::FIGURES;
         export::files().filter(figures).map(|name| (name.clone(), self.root.join(name))).collect()
     }
+}
+
+/// A splat, what is seen of it, and what it is as a fit.
+pub struct Source {
+    /// The file's Gaussians.
+    pub(super) splat: Splat,
+    /// Those that the cameras see.
+    pub(super) seen: Seen,
+    /// For `prepare`.
+    pub ready: Arc<Ready>,
+    /// The folder of its pictures.
+    pub views: PathBuf,
 }
 
 /// A removal and where it goes.

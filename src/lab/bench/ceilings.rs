@@ -6,7 +6,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::step::Rates;
 use crate::gpu::kernels::lab::bench::{ceilings_copy, ceilings_empty, ceilings_exp, ceilings_fma};
 use crate::gpu::{Buffer, Check, Error, Gpu, Reference, Timing};
 use crate::lab::statistics::Spread;
@@ -25,6 +24,19 @@ const FMAS: u32 = 64 * 8;
 const EXPS: u32 = 16 * 4;
 /// Dispatches in a row.
 const DISPATCHES: usize = 128;
+
+/// The rates that floors are taken at.
+#[derive(Clone, Copy, Debug)]
+pub struct Rates {
+    /// 1e9 bytes per second.
+    pub bandwidth: f64,
+    /// 1e9 operations per second.
+    pub operations: f64,
+    /// 1e9 exponentials per second.
+    pub exponentials: f64,
+    /// Milliseconds of a dispatch.
+    pub dispatch: f64,
+}
 
 impl Reference for ceilings_copy::Kernel {
     fn reference(host: ceilings_copy::Host<'_>, push: ceilings_copy::Push, (): ()) {

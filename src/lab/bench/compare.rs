@@ -6,8 +6,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::loads::LoadFigures;
-use super::text::digits;
-use super::{Device, Record};
+use super::{Device, Record, digits};
 use crate::lab::report::SceneFacts;
 use crate::lab::statistics::Spread;
 

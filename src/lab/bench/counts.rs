@@ -8,8 +8,8 @@ pub use crate::cost::Counts;
 use crate::gpu::form::without_form;
 use crate::gpu::{Entry, Schedule};
 use crate::math::tiles::{support_bands, support_bound};
-use crate::render::bin::Tiling;
 use crate::render::method::Method;
+use crate::render::tiling::Tiling;
 
 /// The buffers that are read back.
 pub const WANTED: [&str; 12] = [

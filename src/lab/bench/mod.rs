@@ -33,6 +33,16 @@ use crate::scene::Scene;
 use crate::train::photographs;
 use crate::train::plan::Plan;
 
+/// Digits behind the point so that three or four count.
+fn digits(value: f64) -> String {
+    match value.abs() {
+        v if v >= 100.0 => format!("{value:.0}"),
+        v if v >= 10.0 => format!("{value:.1}"),
+        v if v >= 1.0 => format!("{value:.2}"),
+        _ => format!("{value:.3}"),
+    }
+}
+
 /// The device that was measured.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Device {

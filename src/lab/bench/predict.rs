@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::step::{Bound, Rates, StepFigures, floor};
-use super::text::digits;
+use super::ceilings::Rates;
+use super::digits;
+use super::step::{Bound, StepFigures, floor};
 
 /// The list that comes with the program, by this word.
 pub const PUBLISHED: &str = "published";

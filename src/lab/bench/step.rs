@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::ceilings::{Ceilings, STAGE, span};
+use super::ceilings::{Ceilings, Rates, STAGE, span};
 use super::cost::{self, Dispatch, Work};
 use super::counts::{self, Counts, Known};
 use crate::config::Settings;
@@ -38,19 +38,6 @@ impl Bound {
             Self::Dispatch => "dispatch",
         }
     }
-}
-
-/// The rates that floors are taken at.
-#[derive(Clone, Copy, Debug)]
-pub struct Rates {
-    /// 1e9 bytes per second.
-    pub bandwidth: f64,
-    /// 1e9 operations per second.
-    pub operations: f64,
-    /// 1e9 exponentials per second.
-    pub exponentials: f64,
-    /// Milliseconds of a dispatch.
-    pub dispatch: f64,
 }
 
 /// Milliseconds that work takes at these rates, in so many dispatches, and what holds it back.

@@ -2,23 +2,13 @@
 
 use std::fmt::Write as _;
 
-use super::Record;
 use super::ceilings::Ceilings;
 use super::loads::{Loads, Sweep};
 use super::predict;
 use super::step::StepFigures;
 use super::tune::ChoiceFigures;
+use super::{Record, digits};
 use crate::lab::statistics::Spread;
-
-/// Digits behind the point so that three or four count.
-pub(super) fn digits(value: f64) -> String {
-    match value.abs() {
-        v if v >= 100.0 => format!("{value:.0}"),
-        v if v >= 10.0 => format!("{value:.1}"),
-        v if v >= 1.0 => format!("{value:.2}"),
-        _ => format!("{value:.3}"),
-    }
-}
 
 fn quartiles(spread: &Spread) -> String {
     format!("{}..{}", digits(spread.lower), digits(spread.upper))

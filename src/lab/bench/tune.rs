@@ -16,8 +16,8 @@ use crate::math::attention::{FEATURE, WEIGHTS};
 use crate::model::attention::{Attention, Pair, Sharing};
 use crate::primitives::Count;
 use crate::primitives::sort::{self, Pairs, Sort, Tuning};
-use crate::render::bin::Tiling;
 use crate::render::config::Tiles;
+use crate::render::tiling::Tiling;
 
 /// One way to do it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

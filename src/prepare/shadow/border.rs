@@ -6,8 +6,8 @@
 
 use rayon::prelude::*;
 
-use super::detect::{Ground, brightened};
-use super::mixture::{Color, Mixture};
+use super::Ground;
+use super::mixture::{Color, Mixture, brightened};
 
 /// Distance of each cell from the border of a mask, in cells: positive inside, negative outside, no farther than `reach`.
 fn depths(mask: &[bool], side: usize, reach: f64) -> Vec<f64> {

@@ -9,8 +9,9 @@
 
 use rayon::prelude::*;
 
+use super::Ground;
 use super::border::{Amounts, amounts};
-use super::mixture::{Color, Mixture, channels, color};
+use super::mixture::{Color, Mixture, brightened, channels, color};
 use crate::prepare::graph_cut::Grid;
 
 /// Directions of the light around the object, and how far a place one high is moved.
@@ -46,18 +47,6 @@ const MOST: f64 = 3.0;
 /// Costs are whole numbers of this fraction.
 const UNIT: f64 = 256.0;
 const NEIGHBOURS: [[isize; 2]; 8] = [[-1, -1], [0, -1], [1, -1], [-1, 0], [1, 0], [-1, 1], [0, 1], [1, 1]];
-
-/// A rectified surface and what stands on it, in cells.
-pub struct Ground<'a> {
-    /// Cells on each side.
-    pub side: usize,
-    /// `[cell]` logarithms of the channels; not a number where nothing is known.
-    pub log: &'a [[f32; 3]],
-    /// Places of the object: along both sides and above the surface, cells.
-    pub object: &'a [[f64; 3]],
-    /// The object's height, cells.
-    pub height: f64,
-}
 
 /// A shadow on it.
 #[derive(Clone, Debug)]
@@ -326,11 +315,6 @@ fn closely(ground: &Ground<'_>, best: &Hypothesis) -> Verdict {
     }
     let lit: Cells = (0..seen.len()).map(|i| seen[i] && near[i] && !rim[i] && !band[i]).collect();
     Verdict::Found(Box::new(Shadow { ratio, amount, region, lit, expected, shift: best.shift, alike, gain }))
-}
-
-/// A colour in shadow as it is in light.
-pub(super) fn brightened(color: Color, drop: Color) -> Color {
-    std::array::from_fn(|i| color[i] + drop[i])
 }
 
 /// The drop that makes colours with so much shadow on them likeliest, by expectation and maximisation.

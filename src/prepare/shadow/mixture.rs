@@ -22,6 +22,11 @@ pub fn color([r, g, b]: [f32; 3]) -> Color {
     [(r + g + b) / 3.0, r - g, 0.5 * (r + g) - b]
 }
 
+/// A colour in shadow as it is in light.
+pub fn brightened(color: Color, drop: Color) -> Color {
+    std::array::from_fn(|i| color[i] + drop[i])
+}
+
 /// The channels' logarithms of a colour.
 pub fn channels([y, u, v]: Color) -> [f64; 3] {
     // r + g + b = 3 y; r - g = u; (r + g) / 2 - b = v.

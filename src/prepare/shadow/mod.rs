@@ -22,9 +22,21 @@ use super::splats::Splats;
 use super::{Error, Watch};
 use crate::export::up;
 use crate::scene::{Camera, Scene};
-use detect::{Ground, Shadow, Verdict};
+use detect::{Shadow, Verdict};
 use plane::Support;
 use texture::{Photograph, Texture};
+
+/// A rectified surface and what stands on it, in cells.
+pub struct Ground<'a> {
+    /// Cells on each side.
+    pub side: usize,
+    /// `[cell]` logarithms of the channels; not a number where nothing is known.
+    pub log: &'a [[f32; 3]],
+    /// Places of the object: along both sides and above the surface, cells.
+    pub object: &'a [[f64; 3]],
+    /// The object's height, cells.
+    pub height: f64,
+}
 
 /// The longer side of the photographs that a shadow is looked for in, pixels.
 pub const SIDE: u32 = 1024;

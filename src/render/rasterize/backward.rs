@@ -3,9 +3,11 @@
 use super::*;
 use crate::gpu::kernels::render::{rasterize_backward, rasterize_gather};
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
-use crate::render::bin::{Binned, Tiling};
+use crate::render::bin::Binned;
 use crate::render::method::Method;
+use crate::render::project::Projected;
 use crate::render::slots::Slots;
+use crate::render::tiling::Tiling;
 
 /// Gradients of one pair.
 #[derive(Clone, Copy, Default)]

@@ -3,8 +3,10 @@
 use super::*;
 use crate::gpu::kernels::render::rasterize;
 use crate::gpu::{Check, Recorder, Reference};
-use crate::render::bin::{Binned, Tiling};
+use crate::render::bin::Binned;
 use crate::render::method::Method;
+use crate::render::project::Projected;
+use crate::render::tiling::Tiling;
 
 /// Pictures compared with the twin's: a sample within float32 rounding of a threshold may flip, which changes a pixel
 /// by up to the alpha threshold times a colour. The exponential is good to a few units in the last place, so about one sample in 1e5 is

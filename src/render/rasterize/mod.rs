@@ -18,20 +18,12 @@ mod gather;
 #[cfg(test)]
 mod tests;
 
-use super::slots::Slots;
 use crate::gpu::{Buffer, Error, Gpu};
-use crate::primitives::Count;
 pub use backward::{Backward, PictureGradient};
 pub use forward::forward;
 
 /// Largest alpha of a sample.
 pub const ALPHA_MAX: f64 = 0.99;
-
-/// Samples below this alpha are skipped, unless the settings say otherwise.
-pub const ALPHA_MIN: f64 = 1.0 / 255.0;
-
-/// A pixel is finished before its transmittance falls below this, unless the settings say otherwise.
-pub const TRANSMITTANCE_MIN: f64 = 1e-4;
 
 /// One sample of a Gaussian at a pixel: what forward and backward twins share. The decisions are float32 operations.
 struct Sample {
@@ -101,25 +93,6 @@ impl Splats<'_> {
         }
         transmittance
     }
-}
-
-/// Gaussians in screen space, per slot.
-#[derive(Clone, Copy)]
-pub struct Projected<'a> {
-    /// How many slots there are.
-    pub slots: Count<'a>,
-    /// Those whose Gaussian exists; the others hold nothing.
-    pub existing: &'a Slots,
-    /// `[slot]` px.
-    pub mean: &'a Buffer<[f32; 2]>,
-    /// `[slot]` factored: variance of x given y in px^2, slope of x on y, variance of y in px^2.
-    pub covariance: &'a Buffer<[f32; 3]>,
-    /// `[slot]` camera z, 0 where there is no Gaussian.
-    pub depth: &'a Buffer<f32>,
-    /// `[slot]`
-    pub opacity: &'a Buffer<f32>,
-    /// `[slot]` linear rgb.
-    pub color: &'a Buffer<[f32; 3]>,
 }
 
 /// What a loss or a file needs of the picture.

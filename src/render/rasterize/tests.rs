@@ -4,7 +4,8 @@ use crate::gpu::kernels::render::{rasterize, rasterize_backward, rasterize_gathe
 use crate::gpu::testing::{self, UNWRITTEN};
 use crate::math::camera::factors;
 use crate::math::tiles::Support;
-use crate::render::bin::Tiling;
+use crate::render::config::ALPHA_MIN;
+use crate::render::tiling::Tiling;
 use crate::skip::{Lack, skip};
 use rand::{RngExt, SeedableRng};
 

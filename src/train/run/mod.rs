@@ -22,7 +22,7 @@ use crate::train::order::Order;
 use crate::train::photographs::{self, Photograph};
 use crate::train::plan::Plan;
 use crate::train::step::{Rates, Step};
-pub use error::{Error, Signal};
+pub use error::Error;
 use observer::StepsLeft;
 pub use observer::{Observer, Progress, Silent, Summary};
 use serde::Serialize;

@@ -1,11 +1,11 @@
 //! Who watches a run, and what it is told.
 
-use super::error::Signal;
 use crate::config::Settings;
 use crate::evaluate::Report;
 use crate::gpu::{self, Timing, Timings};
 use crate::render::view::Rendered;
 use crate::scene::Camera;
+use crate::signal::Signal;
 use serde::Serialize;
 
 /// What the host learns of a step, once it has ended.
