@@ -4,9 +4,9 @@
 //! this scene needs, and then repeats one straight line of compute passes: [`render`] the anchors of the [`model`],
 //! compare with the photograph in [`losses`], walk back, and let the [`optimizer`] and [`densify`] change the model.
 //! [`multiview`] finds points where the capture has none, [`evaluate`] measures the result, [`export`] bakes it into
-//! static Gaussians for any viewer, [`view`] shows them in the browser, [`compose`] makes scenes whose truth is known,
-//! [`prepare`] makes a scene of photographs and one mask, [`remove`] is the page to point at an object in, and [`lab`] holds
-//! the instruments: speed, error against run time.
+//! static Gaussians for any viewer ([`formats`] are its files), [`view`] shows them in the browser, [`compose`] makes
+//! scenes whose truth is known, [`prepare`] makes a scene of photographs and one mask, [`remove`] is the page to point
+//! at an object in, and [`lab`] holds the instruments: speed, error against run time.
 //! Kernels live in `glsl/`, mirrored by path and stem in `src/`; each has a CPU twin in float64 beside the code that
 //! dispatches it. [`gpu`] is the only place that knows Vulkan; [`primitives`] are sorts, scans and sums that know nothing of
 //! splats. [`cli`] has one file per command.
@@ -44,6 +44,7 @@ pub mod densify;
 pub mod evaluate;
 pub mod export;
 pub mod folder;
+pub mod formats;
 pub mod gpu;
 pub mod lab;
 pub mod losses;

@@ -8,7 +8,8 @@ use std::path::Path;
 
 use common::Watch;
 use gscream_vk::config::{Settings, Source};
-use gscream_vk::export::{self, Observer as Export, Options as ExportOptions, ply};
+use gscream_vk::export::{self, Observer as Export, Options as ExportOptions};
+use gscream_vk::formats::ply;
 use gscream_vk::gpu::form::without_form;
 use gscream_vk::gpu::{Gpu, testing};
 use gscream_vk::model::config::Form;

@@ -6,7 +6,7 @@ mod common;
 use std::path::Path;
 
 use gscream_vk::config::Settings;
-use gscream_vk::export::{gltf, ply as own, spz};
+use gscream_vk::formats::{gltf, ply as own, spz};
 use gscream_vk::gpu::testing;
 use gscream_vk::math::harmonics::{ZEROTH, coefficients};
 use gscream_vk::model::config::Form;

@@ -12,8 +12,9 @@ use super::folders::Origin;
 use super::next;
 use super::shared::{self, DeviceArgs};
 use crate::config::{Settings, Source};
-use crate::export::{self, Cloud, Export, Observer, Options, gltf, low_pass, measure, ply, spz, up};
+use crate::export::{self, Cloud, Export, Observer, Options, low_pass, measure, up};
 use crate::folder::{self, Lock};
+use crate::formats::{gltf, ply, spz};
 use crate::gpu::Gpu;
 use crate::model::stored::Stored;
 use crate::render::widen;
@@ -111,14 +112,16 @@ impl Format {
             Self::Spz => spz::encode(cloud),
             Self::Glb => gltf::encode(cloud),
         }
+        .map_err(export::Error::Format)
     }
 
     fn decode(self, bytes: &[u8]) -> Result<Cloud, export::Error> {
         match self {
-            Self::Ply => ply::decode(bytes).map_err(export::Error::Format),
+            Self::Ply => ply::decode(bytes),
             Self::Spz => spz::decode(bytes),
             Self::Glb => gltf::decode(bytes),
         }
+        .map_err(export::Error::Format)
     }
 }
 

@@ -2,12 +2,10 @@
 
 pub mod bake;
 pub mod draw;
-pub mod gltf;
 pub mod low_pass;
 pub mod measure;
 pub mod poses;
 pub mod refine;
-pub mod spz;
 pub mod up;
 
 use std::io::{self, Write as _};
@@ -22,7 +20,6 @@ use crate::math::harmonics::coefficients;
 use crate::model::files;
 use crate::model::gaussians::Static;
 pub use crate::model::gaussians::{Cloud, logit, sigmoid};
-pub use crate::model::ply;
 use crate::model::stored::Stored;
 use crate::render::view::Renderer;
 use crate::scene::{Camera, Scene};
@@ -268,7 +265,6 @@ pub fn make(
 
 #[cfg(test)]
 pub(crate) mod tests {
-    use glam::DVec3;
     use rand::{RngExt as _, SeedableRng as _};
     use rand_pcg::Pcg64;
 
@@ -292,112 +288,6 @@ pub(crate) mod tests {
             cloud.logit.push(rng.random_range(-5.0..8.0));
         }
         cloud
-    }
-
-    /// Angle between two rotations, radians.
-    pub(crate) fn angle(a: [f32; 4], b: [f32; 4]) -> f64 {
-        let dot: f64 = a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(b)).sum();
-        2.0 * (1.0 - dot * dot).max(0.0).sqrt().asin()
-    }
-
-    /// Largest distance of two arrays' values.
-    pub(crate) fn distance(a: &[[f32; 3]], b: &[[f32; 3]]) -> f32 {
-        assert_eq!(a.len(), b.len());
-        a.as_flattened().iter().zip(b.as_flattened()).fold(0.0, |m, (a, b)| m.max((a - b).abs()))
-    }
-
-    #[test]
-    fn a_ply_keeps_every_bit() {
-        for degree in 0..=3 {
-            let cloud = cloud(37, degree);
-            let bytes = ply::encode(&cloud);
-            assert_eq!(ply::decode(&bytes).expect("our own file"), cloud);
-            let text = String::from_utf8_lossy(&bytes[..2000]);
-            assert_eq!(text.matches("property float ").count(), 62);
-            assert!(!text.contains("comment"), "some readers take no comments");
-            assert!(ply::decode(&bytes[..bytes.len() - 1]).is_err(), "cut off");
-        }
-        assert!(ply::decode(b"ply\n").is_err());
-    }
-
-    /// Float32 exponentials and logarithms, and a logit that is flat where the opacity is near 1.
-    #[test]
-    fn a_glb_keeps_what_float32_keeps() {
-        for degree in 0..=3 {
-            let cloud = cloud(41, degree);
-            let bytes = gltf::encode(&cloud).expect("it is small");
-            assert_eq!(bytes.len() % 4, 0);
-            let back = gltf::decode(&bytes).expect("our own file");
-            assert_eq!((&back.position, &back.harmonics, back.degree), (&cloud.position, &cloud.harmonics, degree));
-            assert!(distance(&back.log_scale, &cloud.log_scale) < 1e-5);
-            assert!(back.rotation == cloud.rotation, "turning there and back moves components and signs");
-            for (a, b) in back.logit.iter().zip(&cloud.logit) {
-                assert!((sigmoid(*a) - sigmoid(*b)).abs() < 1e-6, "{a} {b}");
-            }
-            assert!(gltf::decode(&bytes[..bytes.len() - 4]).is_err(), "cut off");
-        }
-    }
-
-    /// The turn into glTF's axes is a rotation: the Gaussians' covariances turn with their positions.
-    #[test]
-    fn a_glb_stands_the_other_way_up() {
-        let mut turned = cloud(9, 0);
-        let bytes = gltf::encode(&turned).expect("it is small");
-        turned.turn(DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0)));
-        // What a reader sees that knows nothing of the turn.
-        let as_written = {
-            let mut back = gltf::decode(&bytes).expect("our own file");
-            for (p, q) in back.position.iter_mut().zip(&mut back.rotation) {
-                *p = [p[0], -p[1], -p[2]];
-                *q = [-q[1], q[0], -q[3], q[2]];
-            }
-            back
-        };
-        assert!(distance(&as_written.position, &turned.position) == 0.0);
-        for (a, b) in as_written.rotation.iter().zip(&turned.rotation) {
-            assert!(angle(*a, *b) < 1e-3, "{a:?} {b:?}");
-        }
-    }
-
-    /// What a byte or 24 bits round, and no more.
-    #[test]
-    fn an_spz_keeps_what_its_bits_keep() {
-        for degree in 0..=3 {
-            let cloud = cloud(53, degree);
-            let bytes = spz::encode(&cloud).expect("it fits");
-            let back = spz::decode(&bytes).expect("our own file");
-            // 6 units leave 20 fractional bits of 24 signed ones.
-            assert!(distance(&back.position, &cloud.position) <= 0.5 / f32::from(1u16 << 10).powi(2));
-            assert!(distance(&back.log_scale, &cloud.log_scale) <= 0.5 / 16.0 + 1e-6);
-            let each = coefficients(degree);
-            for i in 0..cloud.len() {
-                // 1.77 units of the coefficient of degree 0 on either side in 255 steps.
-                let (a, b) = (&back.harmonics[i * each..][..each], &cloud.harmonics[i * each..][..each]);
-                assert!(distance(&a[..1], &b[..1]) <= 0.5 / 255.0 / 0.15 + 1e-6);
-                assert!(distance(&a[1..], &b[1..]) <= 0.5 / 128.0 + 1e-6);
-                assert!((sigmoid(back.logit[i]) - sigmoid(cloud.logit[i])).abs() <= 0.5 / 255.0 + 1.1e-4);
-                // Three components of half a step of 1.38e-3 each, and the fourth that follows from them.
-                assert!(angle(back.rotation[i], cloud.rotation[i]) < 6e-3);
-            }
-            assert_eq!(&bytes[..2], &[0x1f, 0x8b], "gzip");
-            assert!(spz::decode(&bytes[..bytes.len() / 2]).is_err(), "cut off");
-        }
-    }
-
-    #[test]
-    fn an_spz_takes_any_unit() {
-        for unit in [1e-3f32, 1.0, 1e3, 1e6] {
-            let mut cloud = cloud(50, 0);
-            cloud.position.iter_mut().for_each(|p| *p = p.map(|v| v * unit));
-            let back = spz::decode(&spz::encode(&cloud).expect("it fits")).expect("our own file");
-            // 22 bits of the farthest coordinate, or the 24 fractional ones that JavaScript's shifts allow.
-            let step = (12.0 * unit / (1 << 22) as f32).max(0.6 / (1 << 24) as f32);
-            assert!(distance(&back.position, &cloud.position) <= step, "{unit}");
-        }
-        let mut far = cloud(2, 0);
-        far.position[1][2] = 1e7;
-        let error = spz::encode(&far).expect_err("24 bits do not hold it").to_string();
-        assert!(error.contains("--formats"), "{error}");
     }
 
     #[test]

@@ -9,7 +9,6 @@ pub mod gaussians;
 pub mod init;
 pub mod learnt;
 pub mod parameter;
-pub mod ply;
 pub mod stored;
 
 pub use config::Config;

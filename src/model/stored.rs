@@ -5,7 +5,7 @@ use std::path::Path;
 
 use super::files::{self, Anchors, Error, POINT_CLOUD, Weights};
 use super::gaussians::Cloud;
-use super::ply;
+use crate::formats::ply;
 
 /// A model.
 #[derive(Debug, Clone, PartialEq)]

@@ -2,7 +2,7 @@
 //! compressed form.
 //!
 //! A row has `x y z f_dc_0..2 opacity scale_0..2 rot_0..3`, in any order and of any scalar type, `f_rest_*` of degree 1 to 3
-//! as in [`crate::model::ply`], and whatever else its program put there. The compressed form (`packed_*`, as
+//! as in [`crate::formats::ply`], and whatever else its program put there. The compressed form (`packed_*`, as
 //! splat-transform documents it by its reader) has the bounds of every 256 Gaussians in the element `chunk`.
 
 use crate::math::harmonics::{ZEROTH, coefficients};

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::Error;
 use super::ply::{self, Rows};
-use crate::export::{gltf, spz};
+use crate::formats::{gltf, spz};
 use crate::math::harmonics::coefficients;
 use crate::model::gaussians::Cloud;
 use crate::sentence::one_line;
@@ -64,14 +64,13 @@ pub fn decode(bytes: Vec<u8>) -> Result<Splat, String> {
 }
 
 fn decoded(bytes: Vec<u8>) -> Result<Splat, String> {
-    let told = |error: crate::export::Error| error.to_string();
     let (container, cloud, rows) = match bytes.get(..4) {
         Some(b"ply\n" | b"ply\r") => {
             let (cloud, rows) = ply::read(bytes)?;
             (if rows.is_some() { Container::Ply } else { Container::CompressedPly }, cloud, rows)
         }
-        Some(b"glTF") => (Container::Glb, gltf::decode(&bytes).map_err(told)?, None),
-        Some([0x1f, 0x8b, ..]) => (Container::Spz, spz::decode(&bytes).map_err(told)?, None),
+        Some(b"glTF") => (Container::Glb, gltf::decode(&bytes)?, None),
+        Some([0x1f, 0x8b, ..]) => (Container::Spz, spz::decode(&bytes)?, None),
         _ => return Err("it is none of PLY, SPZ and GLB; splats come in these".into()),
     };
     if cloud.is_empty() {
@@ -128,7 +127,7 @@ impl Splat {
         if let Some(rows) = &self.rows {
             return rows.spliced(kept, added);
         }
-        crate::model::ply::encode(&self.joined(kept, added))
+        crate::formats::ply::encode(&self.joined(kept, added))
     }
 
     /// The Gaussians of `kept` in their order, as they are drawn, and those of `added` behind them.

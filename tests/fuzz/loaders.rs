@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use gscream_vk::config::{Settings, Source};
 use gscream_vk::evaluate::network::Weights;
-use gscream_vk::export::{gltf, ply, spz};
+use gscream_vk::formats::{gltf, ply, spz};
 use gscream_vk::gpu::testing;
 use gscream_vk::model::{files, init};
 use gscream_vk::prepare::graph_cut::Strokes;

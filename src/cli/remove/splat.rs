@@ -12,10 +12,10 @@ use super::work::{Audience, Job, Places, Record, Source};
 use crate::cli::export::{Cameras, FIGURES, STEM};
 use crate::cli::folders::MODEL;
 use crate::config::{Settings, SettingsArgs};
-use crate::export::{self, gltf, spz};
+use crate::export;
+use crate::formats::{gltf, ply, spz};
 use crate::gpu::Gpu;
 use crate::model::gaussians::{Cloud, sigmoid};
-use crate::model::ply;
 use crate::model::stored::Stored;
 use crate::prepare::fit::{Fit, Ready};
 use crate::prepare::record::{self, Inputs};
@@ -168,7 +168,7 @@ impl Job<'_> {
             (root.join(OBJECT), source.splat.spliced(&gone, &Cloud::default())),
             (root.join(CHANGES), serde_json::to_vec_pretty(&changes)?),
             (root.join(FIGURES), serde_json::to_vec_pretty(&cameras)?),
-            (root.join(format!("{STEM}.glb")), gltf::encode(&joined)?),
+            (root.join(format!("{STEM}.glb")), gltf::encode(&joined).map_err(export::Error::Format)?),
         ];
         match spz::encode(&joined) {
             Ok(bytes) => files.push((root.join(format!("{STEM}.spz")), bytes)),

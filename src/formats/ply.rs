@@ -4,8 +4,8 @@
 //! then green, then blue, those beyond the cloud's degree 0; opacity as logit, scales as natural logarithms, the unit
 //! quaternion as w x y z.
 
-use super::gaussians::Cloud;
 use crate::math::harmonics::coefficients;
+use crate::model::gaussians::Cloud;
 
 /// Floats of a Gaussian.
 pub const FLOATS: usize = 62;

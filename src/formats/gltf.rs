@@ -7,8 +7,8 @@
 
 use serde_json::{Value, json};
 
-use super::{Cloud, Error, logit, sigmoid};
 use crate::math::harmonics::{HALF_TURN_ABOUT_X, ZEROTH, coefficients};
+use crate::model::gaussians::{Cloud, logit, sigmoid};
 
 /// The extension's name, and the prefix of its attributes.
 pub const EXTENSION: &str = "KHR_gaussian_splatting";
@@ -65,7 +65,7 @@ fn bounds(values: &[f32], components: usize) -> (Vec<f32>, Vec<f32>) {
 ///
 /// # Errors
 /// More than the format's 4 GiB.
-pub fn encode(cloud: &Cloud) -> Result<Vec<u8>, Error> {
+pub fn encode(cloud: &Cloud) -> Result<Vec<u8>, String> {
     let attributes = attributes(cloud);
     let (mut views, mut accessors, mut names) = (vec![], vec![], serde_json::Map::new());
     let mut bin: Vec<u8> = vec![];
@@ -106,10 +106,10 @@ pub fn encode(cloud: &Cloud) -> Result<Vec<u8>, Error> {
     text.resize(text.len().next_multiple_of(4), b' ');
     let length = 12 + 8 + text.len() + 8 + bin.len();
     let length = u32::try_from(length).map_err(|_| {
-        Error::Format(format!(
+        format!(
             "glTF holds at most 4 GiB and {} Gaussians need {length} bytes: leave glb out of --formats",
             cloud.len()
-        ))
+        )
     })?;
     let mut file = Vec::with_capacity(length as usize);
     for word in [MAGIC, 2, length, text.len() as u32, JSON] {
@@ -127,8 +127,8 @@ pub fn encode(cloud: &Cloud) -> Result<Vec<u8>, Error> {
 ///
 /// # Errors
 /// Any other file, or one that is cut off.
-pub fn decode(bytes: &[u8]) -> Result<Cloud, Error> {
-    let broken = |what: &str| Error::Format(format!("not a glTF file as `gscream-vk export` writes it: {what}"));
+pub fn decode(bytes: &[u8]) -> Result<Cloud, String> {
+    let broken = |what: &str| format!("not a glTF file as `gscream-vk export` writes it: {what}");
     let word = |at: usize| {
         let word = bytes.get(at..at + 4).and_then(|w| <[u8; 4]>::try_from(w).ok());
         word.map(u32::from_le_bytes).ok_or_else(|| broken("it is cut off"))
@@ -141,7 +141,7 @@ pub fn decode(bytes: &[u8]) -> Result<Cloud, Error> {
     let document: Value = serde_json::from_slice(text).map_err(|e| broken(&e.to_string()))?;
     let bin = bytes.get(end + 8..end + 8 + word(end)? as usize).ok_or_else(|| broken("it is cut off"))?;
     let primitive = &document["meshes"][0]["primitives"][0];
-    let floats = |name: &str| -> Result<Vec<f32>, Error> {
+    let floats = |name: &str| -> Result<Vec<f32>, String> {
         let missing = || broken(&format!("it has no attribute {name}"));
         let at = primitive["attributes"][name].as_u64().ok_or_else(missing)? as usize;
         let view =

@@ -18,8 +18,8 @@ use flate2::Compression;
 use flate2::read::GzDecoder;
 use flate2::write::GzEncoder;
 
-use super::{Cloud, Error, logit, sigmoid};
 use crate::math::harmonics::coefficients;
+use crate::model::gaussians::{Cloud, logit, sigmoid};
 
 const MAGIC: u32 = 0x5053_474e;
 const VERSION: u32 = 3;
@@ -74,7 +74,7 @@ fn unpack_rotation(mut word: u32) -> [f32; 4] {
 ///
 /// # Errors
 /// A position that 24 bits cannot hold: farther than 8 million scene units from the origin.
-pub fn encode(cloud: &Cloud) -> Result<Vec<u8>, Error> {
+pub fn encode(cloud: &Cloud) -> Result<Vec<u8>, String> {
     let bits = fractional_bits(cloud);
     let unit = f64::from(1u32 << bits);
     let count = cloud.len() as u32;
@@ -86,9 +86,9 @@ pub fn encode(cloud: &Cloud) -> Result<Vec<u8>, Error> {
     for value in cloud.position.as_flattened() {
         let fixed = (f64::from(*value) * unit).round();
         if fixed.abs() >= f64::from(1 << 23) {
-            return Err(Error::Format(format!(
+            return Err(format!(
                 "SPZ cannot hold a Gaussian {value} units from the origin: leave it out of --formats, or move the scene"
-            )));
+            ));
         }
         raw.extend_from_slice(&(fixed as i32).to_le_bytes()[..3]);
     }
@@ -107,7 +107,7 @@ pub fn encode(cloud: &Cloud) -> Result<Vec<u8>, Error> {
     }
     let mut out = GzEncoder::new(vec![], Compression::best());
     let packed = out.write_all(&raw).and_then(|()| out.finish());
-    packed.map_err(|error| Error::Format(format!("the Gaussians cannot be compressed: {error}")))
+    packed.map_err(|error| format!("the Gaussians cannot be compressed: {error}"))
 }
 
 /// Standard deviations that the format cannot tell from its smallest or largest.
@@ -120,8 +120,8 @@ pub fn beyond_range(cloud: &Cloud) -> usize {
 ///
 /// # Errors
 /// Any other file, or one that is cut off.
-pub fn decode(bytes: &[u8]) -> Result<Cloud, Error> {
-    let broken = |what: String| Error::Format(format!("not an SPZ file of version {VERSION}: {what}"));
+pub fn decode(bytes: &[u8]) -> Result<Cloud, String> {
+    let broken = |what: String| format!("not an SPZ file of version {VERSION}: {what}");
     let cut = || broken("it is cut off".to_owned());
     let mut unpacked = GzDecoder::new(bytes);
     let mut header = [0; HEADER];
