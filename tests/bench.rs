@@ -201,3 +201,78 @@ fn shapes_are_tuned() {
         choices.iter().any(|c| c["choice"] == "sort") && choices.iter().any(|c| c["choice"] == "attention kernels")
     );
 }
+
+/// Runs the program in `folder`; whether it went well, what it printed, and what it said of an error.
+fn program(folder: &Path, arguments: &str) -> (bool, String, String) {
+    let mut command = cargo_bin_cmd!("gscream-vk");
+    command.current_dir(folder).env("XDG_CACHE_HOME", folder.join("cache")).env_remove("RUST_LOG");
+    let output = command.args(arguments.split_whitespace()).output().expect("the program starts");
+    let [stdout, stderr] = [output.stdout, output.stderr].map(|bytes| String::from_utf8(bytes).expect("UTF-8"));
+    (output.status.success(), stdout, stderr)
+}
+
+/// A room whose truth is known is prepared once, trained under two seeds and judged; what is there is not made again.
+#[test]
+#[ignore = "long; .ci/run has it"]
+fn holes_are_judged_and_gone_on_with() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = folder.path();
+    let made = program(folder, "synth room --width 96 --height 72 --train-views 8 --test-views 0 --points 400 --bare");
+    assert!(made.0, "{}", made.2);
+    let judge = "bench --hole room --preset lavapipe --downscale 1 --iterations 40 --out judged";
+    let first = program(folder, judge);
+    assert!(first.0, "{}", first.2);
+    let runs = |count: usize| {
+        let record = json(&folder.join("judged/hole.json"));
+        let runs = record["runs"].as_array().expect("runs").clone();
+        assert_eq!(runs.len(), count);
+        runs
+    };
+    let one = runs(1);
+    assert_eq!((&one[0]["scene"], &one[0]["seed"], &one[0]["steps"]), (&"room".into(), &0.into(), &40.into()));
+    for figure in ["masked_psnr", "seen_psnr", "unseen_psnr", "rim_psnr", "outside_psnr", "residue", "iou", "iou_worst"]
+    {
+        assert!(number(&one[0]["figures"][figure]).is_finite(), "{figure}: {}", one[0]);
+    }
+    let picture = folder.join("judged/room/seed-0.png");
+    let before = fs::metadata(&picture).expect("a picture").modified().expect("a time");
+    // Another seed takes the same preparation and leaves the first run alone.
+    let prepared =
+        fs::metadata(folder.join("judged/room/prepared.json")).expect("a record").modified().expect("a time");
+    let second = program(folder, &format!("{judge} --seeds 2"));
+    assert!(second.0, "{}", second.2);
+    let two = runs(2);
+    assert_eq!((&two[0], &two[1]["seed"]), (&one[0], &1.into()));
+    assert_eq!(fs::metadata(&picture).expect("a picture").modified().expect("a time"), before);
+    let again = fs::metadata(folder.join("judged/room/prepared.json")).expect("a record").modified().expect("a time");
+    assert_eq!(again, prepared);
+    assert!(second.1.contains("| room | 2 | 8 |"), "{}", second.1);
+    let third = program(folder, &format!("{judge} --seeds 2"));
+    assert_eq!((third.0, third.1), (true, second.1));
+    // Runs of other settings do not belong into one table.
+    let other = program(folder, &judge.replace("40", "41"));
+    assert!(
+        !other.0 && other.2.contains("holds a run of room with other settings; choose another --out"),
+        "{}",
+        other.2
+    );
+}
+
+#[test]
+fn what_is_no_composed_scene_is_told_in_a_sentence() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = folder.path();
+    let made = program(folder, "synth room --width 32 --height 24 --train-views 3 --test-views 0 --points 50");
+    assert!(made.0, "{}", made.2);
+    let refused = |arguments: &str| {
+        let (well, stdout, stderr) = program(folder, arguments);
+        assert!(!well && stdout.is_empty(), "{arguments}");
+        stderr.lines().last().expect("a line").to_owned()
+    };
+    assert_eq!(refused("bench --hole nowhere"), "error: --hole nowhere: there is no such folder");
+    assert_eq!(
+        refused("bench --hole room"),
+        "error: room: no composed scene to judge by, for it has no photographs without the object (test_images/)"
+    );
+    assert!(!folder.join("runs").exists(), "nothing is left of it");
+}

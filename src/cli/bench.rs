@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, bail};
 
 use super::folders::last_part;
+use super::hole::{self, HoleArgs};
 use super::next;
 use super::next::command_line;
 use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, add_dense, load_scene, only_anchors, with_gpu};
@@ -33,6 +34,9 @@ use crate::train::plan::Plan;
 /// every pass, of the step and of train.iterations steps like it, on paper. --form gpu measures the kernels that a GPU
 /// would run.
 ///
+/// With --hole what is measured is not time: composed scenes, whose truth is known, are prepared from one mask, trained and
+/// judged.
+///
 /// With --out writes bench.json, the tables as CSV and the plots as SVG.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
@@ -41,10 +45,11 @@ use crate::train::plan::Plan;
   gscream-vk bench garden --preset lavapipe --warm-up 200 --repetitions 15 --against before/bench.json
   gscream-vk bench --loads --seconds 600 --preset lavapipe --out loads
   gscream-vk bench --tune --preset lavapipe
-  gscream-vk bench garden --preset paper --form gpu --warm-up 20 --repetitions 1 --predict published")]
+  gscream-vk bench garden --preset paper --form gpu --warm-up 20 --repetitions 1 --predict published
+  gscream-vk bench --hole set/* --seeds 3 --iterations 800 --out before")]
 pub(super) struct Args {
     /// Folder of the scene, or the word `synthetic` for the built-in one
-    #[arg(value_name = "SCENE", required_unless_present_any = ["loads", "tune"])]
+    #[arg(value_name = "SCENE", required_unless_present_any = ["loads", "tune", "hole"])]
     scene: Option<PathBuf>,
     #[command(flatten)]
     settings: SettingsArgs,
@@ -72,12 +77,17 @@ pub(super) struct Args {
     #[command(flatten)]
     measure: MeasureArgs,
     #[command(flatten)]
+    hole: HoleArgs,
+    #[command(flatten)]
     device: DeviceArgs,
 }
 
 const JSON: &str = "bench.json";
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
+    if !args.hole.hole.is_empty() {
+        return hole::run(&args.hole, &args.settings, &args.device, args.out.as_deref());
+    }
     if let Some(out) = &args.out
         && out.join(JSON).exists()
         && !args.overwrite

@@ -13,6 +13,7 @@ mod doctor;
 mod eval;
 mod export;
 pub mod folders;
+mod hole;
 mod index;
 mod instruments;
 mod kernels;
@@ -158,7 +159,8 @@ fn signal(error: &(dyn std::error::Error + 'static)) -> Option<Signal> {
         crate::export::Error::Interrupted { signal } => Some(*signal),
         _ => None,
     };
-    stopped.or_else(run).or_else(capture).or_else(export)
+    let hole = || error.downcast_ref::<crate::lab::hole::Error>()?.signal();
+    stopped.or_else(run).or_else(capture).or_else(export).or_else(hole)
 }
 
 #[cfg(test)]

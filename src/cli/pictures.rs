@@ -35,8 +35,16 @@ pub fn path(folder: &Path, name: &str, extension: &str) -> PathBuf {
 /// # Panics
 /// Unless there is one colour per pixel of `size` (width, height).
 pub fn write_png(path: &Path, size: [u32; 2], rgb: &[[f32; 3]]) -> Result<(), Error> {
+    write_rgb8(path, &to_rgb8(size, rgb))
+}
+
+/// Writes a picture as PNG, making the folder if it is missing. The file appears complete or not at all.
+///
+/// # Errors
+/// A path that cannot be written.
+pub fn write_rgb8(path: &Path, picture: &image::RgbImage) -> Result<(), Error> {
     let mut bytes = Cursor::new(Vec::new());
-    let encoded = to_rgb8(size, rgb).write_to(&mut bytes, ImageFormat::Png).map_err(io::Error::other);
+    let encoded = picture.write_to(&mut bytes, ImageFormat::Png).map_err(io::Error::other);
     encoded
         .and_then(|()| atomic::write_below(path, bytes.get_ref()))
         .map_err(|source| Error { path: path.to_owned(), source })

@@ -37,10 +37,26 @@ fn choose(device: &DeviceInfo, scene: &Path, longest: Option<u32>) -> Choice {
 /// # Errors
 /// As [`SceneArgs::load`]; without a usable device.
 pub(super) fn load(given: &SceneArgs, device: &DeviceArgs) -> anyhow::Result<(Scene, Settings)> {
+    let Some((chosen, choice, device)) = choice(given, device)? else { return given.load() };
+    let (scene, settings) = chosen.load()?;
+    eprintln!("{}", describe(&choice, &device, &settings));
+    Ok((scene, settings))
+}
+
+/// The arguments with the preset that [`load`] takes.
+///
+/// # Errors
+/// Settings that make no sense; without a usable device.
+pub(super) fn chosen(given: &SceneArgs, device: &DeviceArgs) -> anyhow::Result<SceneArgs> {
+    Ok(choice(given, device)?.map_or_else(|| given.clone(), |(chosen, ..)| chosen))
+}
+
+/// Nothing where the arguments name a preset, or there is no scene.
+fn choice(given: &SceneArgs, device: &DeviceArgs) -> anyhow::Result<Option<(SceneArgs, Choice, DeviceInfo)>> {
     let named = given.settings.preset.is_some() || given.settings.config.is_some();
     let synthetic = given.scene == Path::new(SYNTHETIC);
     if named || !(synthetic || given.scene.is_dir()) {
-        return given.load();
+        return Ok(None);
     }
     // A mistake in the settings is one of theirs, and not of a preset that nobody asked for.
     given.settings.resolve()?;
@@ -50,9 +66,7 @@ pub(super) fn load(given: &SceneArgs, device: &DeviceArgs) -> anyhow::Result<(Sc
     chosen.settings.preset = Some(choice.preset.to_owned());
     let own = choice.downscale.map(|n| format!("scene.downscale={n}"));
     chosen.settings.set.splice(0..0, own);
-    let (scene, settings) = chosen.load()?;
-    eprintln!("{}", describe(&choice, &device, &settings));
-    Ok((scene, settings))
+    Ok(Some((chosen, choice, device)))
 }
 
 fn describe(choice: &Choice, device: &DeviceInfo, settings: &Settings) -> String {

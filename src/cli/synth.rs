@@ -56,6 +56,9 @@ pub(super) struct Args {
     /// Largest change of a train view's brightness in room360, as a share; 0.05 is a few per cent
     #[arg(long, value_name = "SHARE", default_value_t = 0.0, conflicts_with = "into", value_parser = drift)]
     exposure_drift: f64,
+    /// Also write what the train views would show without the object, as test views of their names: for bench --hole
+    #[arg(long, conflicts_with = "into")]
+    bare: bool,
 
     /// Scene to stand an object in: a folder as `train` reads it; masks are not needed
     #[arg(long, value_name = "SCENE", requires = "stand", help_heading = "An object in a real scene")]
@@ -136,11 +139,18 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let (seed, exposure_drift) = (args.seed, args.exposure_drift);
     match args.scene {
         Made::Room => {
-            synthetic::write(dir, &synthetic::Options { seed, width, height, train_views, test_views, points })?;
+            let options = synthetic::Options { seed, width, height, train_views, test_views, points };
+            synthetic::write(dir, &options)?;
+            if args.bare {
+                synthetic::write_bare(dir, &options)?;
+            }
         }
         Made::Room360 => {
             let options = room360::Options { seed, width, height, train_views, test_views, points, exposure_drift };
             room360::write(dir, &options)?;
+            if args.bare {
+                room360::write_bare(dir, &options)?;
+            }
         }
     }
     println!(

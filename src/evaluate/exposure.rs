@@ -9,7 +9,7 @@ use super::{Error, Figures, Protocol, measure};
 
 /// The rendered view with the gain and offset, per channel, that bring it nearest to the photograph over the pixels outside
 /// the mask (least squares), rounded to 8 bits. A channel that is the same everywhere keeps its gain.
-fn fitted(rendered: &RgbImage, truth: &RgbImage, mask: Option<&GrayImage>) -> RgbImage {
+pub fn in_exposure_of(rendered: &RgbImage, truth: &RgbImage, mask: Option<&GrayImage>) -> RgbImage {
     let outside = |i: usize| mask.is_none_or(|mask| mask.as_raw().get(i).is_none_or(|value| *value == 0));
     let table: [[u8; 256]; 3] = std::array::from_fn(|c| {
         let pairs = rendered.pixels().zip(truth.pixels()).enumerate().filter(|(i, _)| outside(*i));
@@ -34,7 +34,7 @@ fn fitted(rendered: &RgbImage, truth: &RgbImage, mask: Option<&GrayImage>) -> Rg
 /// # Errors
 /// Images of different sizes, or without pixels.
 pub fn with_fitted_exposure(rendered: &RgbImage, truth: &RgbImage, mask: Option<&GrayImage>) -> Result<Figures, Error> {
-    Ok(measure(&fitted(rendered, truth, mask), truth, None, None, Protocol::Plain)?.full)
+    Ok(measure(&in_exposure_of(rendered, truth, mask), truth, None, None, Protocol::Plain)?.full)
 }
 
 #[cfg(test)]
@@ -55,7 +55,7 @@ mod tests {
         let mask = GrayImage::from_fn(32, 24, |x, _| Luma([if x < 8 { 255 } else { 0 }]));
         let mut painted = truth.clone();
         painted.enumerate_pixels_mut().filter(|(x, _, _)| *x < 8).for_each(|(_, _, p)| p.0 = [0; 3]);
-        let both = [fitted(&painted, &truth, Some(&mask)), painted];
+        let both = [in_exposure_of(&painted, &truth, Some(&mask)), painted];
         assert!(both[0] == both[1]);
     }
 }

@@ -23,7 +23,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::scene::resample;
 
-pub use exposure::with_fitted_exposure;
+pub use exposure::{in_exposure_of, with_fitted_exposure};
 pub use hole::Geometry;
 pub use lpips::Perceptual;
 pub use protocol::{Judge, Judging, PUBLISHED_ROWS, Protocol, Published};

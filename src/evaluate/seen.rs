@@ -11,13 +11,17 @@ const SURFACE: f32 = 0.5;
 /// By how much farther than what a train view shows a point may lie and still be what it shows, relative to its depth. A
 /// trained surface is thin fog rather than a sheet, and its depth in two views differs by a few per cent.
 const BEHIND: f64 = 0.05;
+/// The same where depth was measured between photographs or is known: within this share two of them are of one surface.
+const BEHIND_MEASURED: f64 = 0.02;
 
-/// The first surface of a rendered view: its depth divided by its coverage.
+/// The first surface of a view: of a rendered one its depth divided by its coverage.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Surface {
     size: [usize; 2],
-    /// `[row-major pixel]` depth z, scene units; NaN where less than half of the pixel is covered.
+    /// `[row-major pixel]` depth z, scene units; NaN where less than half of the pixel is covered, or nothing is known.
     depth: Vec<f32>,
+    /// A point farther by more than this share is hidden.
+    behind: f64,
 }
 
 impl Surface {
@@ -32,7 +36,19 @@ impl Surface {
             let coverage = 1.0 - t;
             if coverage >= SURFACE { z / coverage } else { f32::NAN }
         };
-        Self { size, depth: depth.iter().zip(transmittance).map(normalised).collect() }
+        Self { size, depth: depth.iter().zip(transmittance).map(normalised).collect(), behind: BEHIND }
+    }
+
+    /// Of the depth of a photograph of `size` (width, height) that was measured or is known, `[row-major pixel]` z in scene
+    /// units; not positive or not finite where nothing is known.
+    ///
+    /// # Panics
+    /// Unless there is one depth per pixel.
+    pub fn measured(size: [u32; 2], depth: &[f32]) -> Self {
+        let size = size.map(|n| n as usize);
+        assert!(depth.len() == size[0] * size[1], "one depth per pixel");
+        let known = |z: &f32| if z.is_finite() && *z > 0.0 { *z } else { f32::NAN };
+        Self { size, depth: depth.iter().map(known).collect(), behind: BEHIND_MEASURED }
     }
 
     /// `[row-major pixel]` depth z, scene units; NaN where there is no surface.
@@ -105,7 +121,7 @@ impl Shown<'_> {
                 return None;
             }
         }
-        let behind = |surface: f32| z > f64::from(surface) * (1.0 + BEHIND);
+        let behind = |surface: f32| z > f64::from(surface) * (1.0 + self.surface.behind);
         let hidden = self.surface.around([px as usize, py as usize]).is_some_and(behind);
         (!hidden).then_some([px, py])
     }
@@ -199,9 +215,13 @@ mod tests {
         let post = Surface::new([20, 10], &depth, &[0.0; 200]);
         let hiding = Shown { surface: &post, ..view };
         assert_eq!(columns(&seen_map(view, &[hiding])), [(0..11).collect::<Vec<_>>(), (12..20).collect()].concat());
-        // A surface within the tolerance hides nothing.
+        // A surface within the tolerance hides nothing, and that of a measured one is narrower.
         let near = flat(9.6);
         assert_eq!(columns(&seen_map(view, &[Shown { surface: &near, ..view }])).len(), 20);
+        let measured = Surface::measured([20, 10], &[9.6; 200]);
+        assert_eq!(columns(&seen_map(view, &[Shown { surface: &measured, ..view }])), [0; 0]);
+        let unknown = Surface::measured([20, 10], &[0.0; 200]);
+        assert_eq!(columns(&seen_map(view, &[Shown { surface: &unknown, ..view }])).len(), 20);
         // A view in which the model shows nothing hides nothing; a pixel without a surface takes its neighbour's.
         let empty = Surface::new([20, 10], &[0.0; 200], &[1.0; 200]);
         assert_eq!(columns(&seen_map(view, &[Shown { surface: &empty, ..view }])).len(), 20);

@@ -190,7 +190,7 @@ pub(crate) fn compare(
 }
 
 /// A Markdown table of cells, the first row its head.
-fn markdown(rows: impl IntoIterator<Item = Vec<String>>) -> String {
+pub(crate) fn markdown(rows: impl IntoIterator<Item = Vec<String>>) -> String {
     let mut text = String::new();
     for (i, row) in rows.into_iter().enumerate() {
         writeln!(text, "| {} |", row.join(" | ")).expect("a string takes everything");

@@ -15,7 +15,7 @@ use rand_distr::{Distribution as _, StandardNormal};
 use rand_pcg::Pcg64;
 
 use super::Error;
-use super::synthetic::{Material, Pattern, Room, Shape, Shot, checked, to_rgb8, write_room};
+use super::synthetic::{Material, Pattern, Room, Shape, Shot, checked, to_rgb8, write_room, write_tests};
 
 /// Options of the scene. The same options give the same files.
 #[derive(Clone, Debug, PartialEq)]
@@ -70,6 +70,15 @@ pub fn write(dir: &Path, options: &Options) -> Result<(), Error> {
     let exposures = if exposure_drift > 0.0 { exposures(options) } else { vec![] };
     let cloud = cloud(&room, &train, points, seed);
     write_room(dir, seed, &room, [&train, &test], &exposures, &cloud)
+}
+
+/// As [`synthetic::write_bare`](super::synthetic::write_bare); the views have the exposure of their photographs.
+///
+/// # Errors
+/// A file that cannot be written.
+pub fn write_bare(dir: &Path, options: &Options) -> Result<(), Error> {
+    let exposures = if options.exposure_drift > 0.0 { exposures(options) } else { vec![] };
+    write_tests(dir, &room(options.seed), &shots(options).0, &exposures)
 }
 
 /// Bare walls and a tiled floor are the first two shapes.

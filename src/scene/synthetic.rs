@@ -71,6 +71,15 @@ pub fn write(dir: &Path, options: &Options) -> Result<(), Error> {
     write_room(dir, seed, &room, [&train, &test], &[], &cloud)
 }
 
+/// Adds to a scene that [`write`] has written with the same options what its train views would show without the object:
+/// photographs, masks and depth as test views of the same names.
+///
+/// # Errors
+/// A file that cannot be written.
+pub fn write_bare(dir: &Path, options: &Options) -> Result<(), Error> {
+    write_tests(dir, &Room::new(options.seed), &Shot::all(options).0, &[])
+}
+
 /// Refuses what no room can be drawn with.
 pub(super) fn checked([width, height]: [u32; 2], train_views: u32, points: u32) -> Result<(), Error> {
     if !(16..=16384).contains(&width) || !(16..=16384).contains(&height) {
@@ -93,49 +102,62 @@ pub(super) fn write_room(
     exposures: &[f64],
     cloud: &[(DVec3, Rgb<u8>)],
 ) -> Result<(), Error> {
-    let exposed = |i: usize, picture: RgbImage| match exposures.get(i) {
-        Some(exposure) => brightened(picture, *exposure),
-        None => picture,
-    };
     if dir.read_dir().is_ok_and(|mut entries| entries.next().is_some()) {
         return Err(Error::File { path: dir.to_path_buf(), what: "the folder is not empty; name a new one".into() });
     }
-    let folders = ["images", "masks", "depth", "reference", "sparse/0"];
-    let test_folders = ["test_images", "test_masks", "test_depth"];
-    for folder in folders.iter().chain(test_folders.iter().filter(|_| !test.is_empty())) {
-        let path = dir.join(folder);
-        std::fs::create_dir_all(&path).map_err(|source| Error::Io { path, source })?;
-    }
+    make(dir, &["images", "masks", "depth", "reference", "sparse/0"])?;
     let reference = train.len() / 2;
     (0..train.len()).into_par_iter().try_for_each(|i| {
         let shot = &train[i];
         let name = format!("{}.png", shot.name);
-        save(dir.join("images").join(&name), |path| exposed(i, room.photograph(shot, true)).save(path))?;
+        save(dir.join("images").join(&name), |path| exposed(room.photograph(shot, true), exposures.get(i)).save(path))?;
         save(dir.join("masks").join(&name), |path| room.mask(shot).save(path))?;
         let mut rng = Pcg64::new(seed.into(), (PRIORS + 2 * i as u64).into());
         save_prior(&dir.join("depth").join(format!("{}.npy", shot.name)), &room.depth(shot, true), shot, &mut rng)?;
         if i == reference {
-            save(dir.join("reference").join(&name), |path| exposed(i, room.photograph(shot, false)).save(path))?;
+            save(dir.join("reference").join(&name), |path| {
+                exposed(room.photograph(shot, false), exposures.get(i)).save(path)
+            })?;
             let mut rng = Pcg64::new(seed.into(), (PRIORS + 2 * i as u64 + 1).into());
             let path = dir.join("reference").join(format!("{}_depth.npy", shot.name));
             save_prior(&path, &room.depth(shot, false), shot, &mut rng)?;
         }
         Ok(())
     })?;
-    test.par_iter().try_for_each(|shot| {
+    write_tests(dir, room, test, &[])?;
+    write_model(&dir.join("sparse/0"), train, test, cloud)
+}
+
+/// Writes what views show without the object: photographs, masks of where it would be, exact depth. `exposures` multiply the
+/// colours; none leave them.
+pub(super) fn write_tests(dir: &Path, room: &Room, shots: &[Shot], exposures: &[f64]) -> Result<(), Error> {
+    if shots.is_empty() {
+        return Ok(());
+    }
+    make(dir, &["test_images", "test_masks", "test_depth"])?;
+    shots.par_iter().enumerate().try_for_each(|(i, shot)| {
         let name = format!("{}.png", shot.name);
-        save(dir.join("test_images").join(&name), |path| room.photograph(shot, false).save(path))?;
+        let picture = exposed(room.photograph(shot, false), exposures.get(i));
+        save(dir.join("test_images").join(&name), |path| picture.save(path))?;
         save(dir.join("test_masks").join(&name), |path| room.mask(shot).save(path))?;
         let [w, h] = shot.size.map(|n| n as usize);
         let depth = room.depth(shot, false);
         let depth = Array2::from_shape_fn((h, w), |(y, x)| depth[y * w + x] as f32);
         write_npy(&dir.join("test_depth").join(format!("{}.npy", shot.name)), &depth)
-    })?;
-    write_model(&dir.join("sparse/0"), train, test, cloud)
+    })
 }
 
-fn brightened(mut picture: RgbImage, by: f64) -> RgbImage {
-    picture.pixels_mut().for_each(|pixel| pixel.0 = pixel.0.map(|v| (f64::from(v) * by).round().min(255.0) as u8));
+fn make(dir: &Path, folders: &[&str]) -> Result<(), Error> {
+    folders.iter().try_for_each(|folder| {
+        let path = dir.join(folder);
+        std::fs::create_dir_all(&path).map_err(|source| Error::Io { path, source })
+    })
+}
+
+fn exposed(mut picture: RgbImage, exposure: Option<&f64>) -> RgbImage {
+    if let Some(by) = exposure {
+        picture.pixels_mut().for_each(|pixel| pixel.0 = pixel.0.map(|v| (f64::from(v) * by).round().min(255.0) as u8));
+    }
     picture
 }
 
