@@ -118,10 +118,10 @@ pub fn write(path: impl AsRef<Path>, bytes: impl AsRef<[u8]>) -> io::Result<()> 
     file.commit()
 }
 
-/// As [`write`], in a folder that is made if it is missing.
+/// As [`write()`], in a folder that is made if it is missing.
 ///
 /// # Errors
-/// As [`write`], and when the folder cannot be made.
+/// As [`write()`], and when the folder cannot be made.
 pub fn write_below(path: &Path, bytes: impl AsRef<[u8]>) -> io::Result<()> {
     if let Some(folder) = path.parent() {
         std::fs::create_dir_all(folder)?;
@@ -132,7 +132,7 @@ pub fn write_below(path: &Path, bytes: impl AsRef<[u8]>) -> io::Result<()> {
 /// Writes a value as indented JSON that ends with a line break; the file appears whole or not at all.
 ///
 /// # Errors
-/// As [`write`], and of a value that JSON cannot say.
+/// As [`write()`], and of a value that JSON cannot say.
 pub fn write_json(path: impl AsRef<Path>, value: &impl Serialize) -> io::Result<()> {
     write(path, serde_json::to_string_pretty(value)? + "\n")
 }
