@@ -1,8 +1,6 @@
 //! `bench` as its user meets it: a step pass by pass, a record, and a comparison with an older one.
 
-#[allow(dead_code)]
-mod common;
-
+use crate::common;
 use std::fs;
 use std::path::Path;
 use std::process::Output;
@@ -17,7 +15,11 @@ const FEW: &str = "--set model.voxel=0 --set model.attention.enabled=true --set 
 
 fn bench(folder: &Path, arguments: &str) -> Output {
     let mut command = cargo_bin_cmd!("gscream-vk");
-    command.current_dir(folder).env("XDG_CACHE_HOME", folder.join("cache")).env_remove("RUST_LOG");
+    command
+        .current_dir(folder)
+        .env("XDG_CACHE_HOME", folder.join("cache"))
+        .env("MESA_SHADER_CACHE_DIR", env!("CARGO_TARGET_TMPDIR"))
+        .env_remove("RUST_LOG");
     let arguments = arguments.split_whitespace();
     command.arg("bench").args(arguments).args(FEW.split_whitespace()).output().expect("the program starts")
 }

@@ -1,12 +1,9 @@
 //! The program as its user meets it: help, results, one clear line for every mistake, exit codes.
 
-#[allow(dead_code)]
-#[path = "common/skip.rs"]
-mod skip;
-
 use std::fs;
 use std::path::Path;
 
+use crate::common::skip::{Lack, skip};
 use assert_cmd::Command;
 use assert_cmd::cargo::cargo_bin_cmd;
 use clap::CommandFactory as _;
@@ -16,16 +13,16 @@ use gscream_vk::config::Settings;
 use gscream_vk::model;
 use gscream_vk::scene::synthetic;
 use image::{Rgb, RgbImage};
-use skip::{Lack, skip};
 use tempfile::TempDir;
 
-/// The program, run inside `folder` at a fixed width and with a cache of its own.
+/// The program, run inside `folder` at a fixed width and with a cache of its own, but for what the driver compiles.
 fn program(folder: &Path) -> Command {
     let mut command = cargo_bin_cmd!("gscream-vk");
     command
         .current_dir(folder)
         .env("COLUMNS", "100")
         .env("XDG_CACHE_HOME", folder.join("cache"))
+        .env("MESA_SHADER_CACHE_DIR", env!("CARGO_TARGET_TMPDIR"))
         .env_remove("RUST_LOG");
     command
 }

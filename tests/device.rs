@@ -1,11 +1,8 @@
 //! Devices as they are met: threads that share one, drivers that lack something, drivers on top of something else.
 
-#[allow(dead_code)]
-#[path = "common/skip.rs"]
-mod skip;
-
 use std::path::{Path, PathBuf};
 
+use crate::common::skip::{Lack, skip};
 use assert_cmd::Command;
 use gscream_vk::gpu::kernels::primitives::limit;
 use gscream_vk::gpu::{Descriptors, Gpu, Options, testing};
@@ -13,7 +10,6 @@ use gscream_vk::primitives::dispatch::Count;
 use gscream_vk::primitives::scan::Scan;
 use predicates::prelude::PredicateBooleanExt as _;
 use predicates::str::contains;
-use skip::{Lack, skip};
 
 /// Chromium's software device, which has no push descriptors, and subgroups of 4.
 const SWIFTSHADER: &str = "/usr/lib/chromium/libvk_swiftshader.so";

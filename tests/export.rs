@@ -3,15 +3,12 @@
 //! The other programs are npm packages (`npm ci` in tests/viewer) and Chromium. Where they are not installed, the tests
 //! that need them say so and pass.
 
-#[allow(dead_code)]
-#[path = "common/skip.rs"]
-mod skip;
-
 use std::fs;
 use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use crate::common::skip::{Lack, skip};
 use assert_cmd::cargo::cargo_bin_cmd;
 use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD;
@@ -29,7 +26,6 @@ use gscream_vk::view;
 use rand::{RngExt as _, SeedableRng as _};
 use rand_pcg::Pcg64;
 use serde_json::Value;
-use skip::{Lack, skip};
 use tempfile::TempDir;
 
 const VIEWER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/viewer");
@@ -197,7 +193,11 @@ fn three_reads_the_glb() {
 /// The program, run inside `folder` with a cache of its own.
 fn program(folder: &Path) -> assert_cmd::Command {
     let mut command = cargo_bin_cmd!("gscream-vk");
-    command.current_dir(folder).env("XDG_CACHE_HOME", folder.join("cache")).env_remove("RUST_LOG");
+    command
+        .current_dir(folder)
+        .env("XDG_CACHE_HOME", folder.join("cache"))
+        .env("MESA_SHADER_CACHE_DIR", env!("CARGO_TARGET_TMPDIR"))
+        .env_remove("RUST_LOG");
     command
 }
 

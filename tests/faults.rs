@@ -2,17 +2,15 @@
 //! bytes in the end. `GSCREAM_MOMENTS` says at how many moments each.
 #![cfg(target_os = "linux")]
 
-#[allow(dead_code)]
-mod common;
-
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::sync::LazyLock;
 use std::time::{Duration, Instant};
 
-use common::place::{Files, Place, assert_same, output, succeeds, text};
-use common::skip::{Lack, is_allowed, skip};
+use crate::common;
+use crate::common::place::{Files, Place, assert_same, output, succeeds, text};
+use crate::common::skip::{Lack, is_allowed, skip};
 use gscream_vk::folder::LOCK;
 use rand::{RngExt as _, SeedableRng as _};
 

@@ -1,12 +1,10 @@
 //! Runs of plain Gaussians (`model.form = "gaussians"`): they learn, are the same again, go on from checkpoints, agree with
 //! the reference path, and are written as they are.
 
-#[allow(dead_code)]
-mod common;
-
 use std::path::Path;
 
-use common::Watch;
+use crate::common;
+use crate::common::Watch;
 use gscream_vk::config::{Settings, Source};
 use gscream_vk::export::{self, Observer as Export, Options as ExportOptions};
 use gscream_vk::formats::ply;

@@ -1,13 +1,9 @@
 //! What AMD's compiler makes of the kernels, on Mesa's null device: it needs no GPU and runs nothing.
 
-#[allow(dead_code)]
-#[path = "common/skip.rs"]
-mod skip;
-
 use std::path::Path;
 
+use crate::common::skip::{Lack, skip};
 use assert_cmd::Command;
-use skip::{Lack, skip};
 
 /// Mesa whose figures the snapshots are.
 const DRIVER: &str = "radv Mesa 22.3.6";

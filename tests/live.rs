@@ -1,8 +1,6 @@
 //! Visitors of a running training, at the level of the process: whatever they do, it comes to the same bytes.
 
-#[allow(dead_code)]
-mod common;
-
+use crate::common;
 use std::fs;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::{SocketAddr, TcpStream};

@@ -1,8 +1,6 @@
 //! The plan against what is made: every combination of what a scene may lack, rehearsed; memory as predicted and as used.
 
-#[allow(dead_code)]
-mod common;
-
+use crate::common;
 use std::collections::{BTreeMap, BTreeSet};
 
 use gscream_vk::config::{Settings, Source};

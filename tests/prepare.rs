@@ -1,19 +1,15 @@
 //! From photographs to a scene, on the built-in one: what is made is compared with what is known exactly.
 
-#[allow(dead_code)]
-#[path = "common/skip.rs"]
-mod skip;
-
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use crate::common::skip::{Lack, skip};
 use assert_cmd::cargo::cargo_bin_cmd;
 use gscream_vk::gpu::testing;
 use gscream_vk::prepare::{self, Evidence, Request, Step, Watch};
 use gscream_vk::scene::doctor::{self, Severity};
 use gscream_vk::scene::{self, Camera, Scene, synthetic};
 use image::{GrayImage, Luma, Rgb, RgbImage};
-use skip::{Lack, skip};
 use tempfile::TempDir;
 
 const VIEWS: u32 = 10;
@@ -396,6 +392,7 @@ fn run(folder: &Path, arguments: &str) -> Outcome {
     let output = cargo_bin_cmd!("gscream-vk")
         .current_dir(folder)
         .env("XDG_CACHE_HOME", folder.join("cache"))
+        .env("MESA_SHADER_CACHE_DIR", env!("CARGO_TARGET_TMPDIR"))
         // Without colmap, whether it is installed here or not.
         .env("PATH", folder)
         .env_remove("RUST_LOG")

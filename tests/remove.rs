@@ -1,18 +1,14 @@
 //! `gscream-vk remove`: by files alone, and on its page in a browser.
 
-#[allow(dead_code)]
-#[path = "common/skip.rs"]
-mod skip;
-
 use std::fs;
 use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use crate::common::skip::{Lack, skip};
 use assert_cmd::cargo::cargo_bin;
 use gscream_vk::scene::synthetic;
 use serde_json::Value;
-use skip::{Lack, skip};
 use tempfile::TempDir;
 
 const VIEWER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/viewer");

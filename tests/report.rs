@@ -1,8 +1,6 @@
 //! `report` as its user meets it: every file is there, and all of them say the same.
 
-#[allow(dead_code)]
-mod common;
-
+use crate::common;
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
@@ -17,7 +15,11 @@ const FEW: &str = "--set model.voxel=0 --set model.attention.enabled=true --set 
 
 fn report(folder: &Path, arguments: &[&str]) -> Output {
     let mut command = cargo_bin_cmd!("gscream-vk");
-    command.current_dir(folder).env("XDG_CACHE_HOME", folder.join("cache")).env_remove("RUST_LOG");
+    command
+        .current_dir(folder)
+        .env("XDG_CACHE_HOME", folder.join("cache"))
+        .env("MESA_SHADER_CACHE_DIR", env!("CARGO_TARGET_TMPDIR"))
+        .env_remove("RUST_LOG");
     command.arg("report").args(FEW.split_whitespace()).args(arguments).output().expect("the program starts")
 }
 

@@ -1,8 +1,5 @@
 //! A run is the same again and never lost: killed at any moment, stopped by a signal, out of disk, damaged checkpoints.
 
-#[allow(dead_code)]
-mod common;
-
 use std::fs;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpStream;
@@ -13,9 +10,10 @@ use std::sync::LazyLock;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
+use crate::common;
+use crate::common::place::{Files, Place, assert_same, failed, fails, output, send, succeeds, text, wait_until};
+use crate::common::skip::{Lack, skip};
 use assert_cmd::cargo::cargo_bin;
-use common::place::{Files, Place, assert_same, failed, fails, output, send, succeeds, text, wait_until};
-use common::skip::{Lack, skip};
 use gscream_vk::config::Settings;
 use gscream_vk::train::checkpoint;
 use gscream_vk::train::config::ViewOrder;

@@ -1,12 +1,10 @@
 //! The passes and barriers of a step, as a text whose every line is meant.
 //!
-//! A barrier that is lost or added is a line of the difference. `INSTA_UPDATE=always cargo test --test schedule` takes
+//! A barrier that is lost or added is a line of the difference. `INSTA_UPDATE=always cargo test --test suite schedule` takes
 //! the new text; look at the difference before committing it.
 
-#[allow(dead_code)]
-mod common;
-
-use common::skip::{Lack, skip};
+use crate::common;
+use crate::common::skip::{Lack, skip};
 use gscream_vk::gpu::{Command, Entry, Form, Gpu, testing};
 use gscream_vk::render::tiling::Tiling;
 use gscream_vk::scene::Scene;

@@ -1,8 +1,6 @@
 //! Values that stop being finite are noticed, named, and kept out of the last checkpoint.
 
-#[allow(dead_code)]
-mod common;
-
+use crate::common;
 use std::path::Path;
 
 use gscream_vk::config::Settings;

@@ -2,9 +2,7 @@
 //! loses nothing.
 #![cfg(unix)]
 
-#[allow(dead_code)]
-mod common;
-
+use crate::common;
 use std::fs;
 use std::io::{BufRead as _, BufReader, Write as _};
 use std::os::unix::fs::PermissionsExt as _;

@@ -1,8 +1,6 @@
 //! Splats of other programs: what is read of them, and that of a file only what was meant to changes.
 
-#[allow(dead_code)]
-mod common;
-
+use crate::common;
 use std::path::Path;
 
 use gscream_vk::config::Settings;

@@ -1,8 +1,6 @@
 //! What a scene lacks has no pass and no buffer; barriers are neither too few nor of influence.
 
-#[allow(dead_code)]
-mod common;
-
+use crate::common;
 use gscream_vk::config::Settings;
 use gscream_vk::gpu::form::without_form;
 use gscream_vk::gpu::{Entry, Gpu, Options, testing};

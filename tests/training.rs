@@ -1,12 +1,10 @@
 //! Whole runs: the same bytes again, room that is made, agreement with the reference path, a falling loss, real captures.
 
-#[allow(dead_code)]
-mod common;
-
 use std::path::PathBuf;
 
-use common::Watch;
-use common::skip::{Lack, skip};
+use crate::common;
+use crate::common::Watch;
+use crate::common::skip::{Lack, skip};
 use gscream_vk::config::Settings;
 use gscream_vk::gpu::form::without_form;
 use gscream_vk::gpu::{Descriptors, Form, Gpu, Options, testing};

@@ -7,11 +7,9 @@ use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
-#[allow(dead_code)]
-mod common;
-
+use crate::common;
+use crate::common::skip::{Lack, skip};
 use assert_cmd::cargo::cargo_bin;
-use common::skip::{Lack, skip};
 use gscream_vk::scene::synthetic;
 
 const SCENES: [&str; 3] = ["one", "two", "three"];

@@ -10,7 +10,7 @@ use std::process::Command;
 use assert_cmd::cargo::cargo_bin;
 use image::{GrayImage, ImageEncoder as _, Luma};
 
-use crate::support::scene;
+use super::support::scene;
 
 /// Exit code and error of the doctor or any other command, within 3 GiB.
 fn outcome(folder: &Path, arguments: &[&str]) -> (Option<i32>, String) {

@@ -8,7 +8,7 @@ use gscream_vk::prepare::{self, Request, Silent, Step, Watch};
 use gscream_vk::scene::doctor;
 use serde_json::json;
 
-use crate::support::{VIEWS, copy, load, scene};
+use super::support::{VIEWS, copy, load, scene};
 
 /// `ln -s PHOTOS images` typed twice puts the second link into the photographs.
 #[cfg(unix)]

@@ -9,7 +9,7 @@ use gscream_vk::gpu::testing;
 use gscream_vk::prepare::{self, Request, Silent};
 use gscream_vk::scene::synthetic;
 
-use crate::support::{SIZE, copy, load};
+use super::support::{SIZE, copy, load};
 
 /// Names that shells, pages, URLs, paths and lines of text may stumble on. The same letter in two Unicode forms is two.
 const ODD: [&str; 22] = [
@@ -148,7 +148,7 @@ fn odd_names_go_the_whole_way() {
 /// A photograph whose name leaves no room for what is named after it is refused before anything is written.
 #[test]
 fn names_without_room_are_refused_first() {
-    let folder = crate::support::scene();
+    let folder = super::support::scene();
     let at = folder.path();
     let long = "n".repeat(242);
     fs::rename(at.join("scene/images/train_000.png"), at.join(format!("scene/images/{long}.png"))).expect("a folder");
