@@ -1,9 +1,6 @@
 use rayon::prelude::*;
 
-const RADIUS: usize = 5;
-const SIGMA: f64 = 1.5;
-const C1: f64 = 0.01 * 0.01;
-const C2: f64 = 0.03 * 0.03;
+use crate::math::ssim::{C1, C2, RADIUS, window};
 
 /// SSIM per pixel and channel of two \[height, width, 3\] images with peak 1 (Wang et al. 2004): 11 x 11 Gaussian window of
 /// sigma 1.5, zero outside the image.
@@ -23,17 +20,6 @@ pub fn ssim_map(a: &[f64], b: &[f64], width: usize, height: usize) -> Vec<f64> {
             (2.0 * ma * mb + C1) * (2.0 * vab + C2) / ((ma * ma + mb * mb + C1) * (va + vb + C2))
         })
         .collect()
-}
-
-/// One axis of the window; the window is its outer product with itself.
-fn window() -> [f64; 2 * RADIUS + 1] {
-    let mut weights = [0.0; 2 * RADIUS + 1];
-    for (i, weight) in weights.iter_mut().enumerate() {
-        let x = i as f64 - RADIUS as f64;
-        *weight = (-x * x / (2.0 * SIGMA * SIGMA)).exp();
-    }
-    let sum: f64 = weights.iter().sum();
-    weights.map(|weight| weight / sum)
 }
 
 /// Rows, then columns; taps outside the image add nothing.

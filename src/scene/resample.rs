@@ -150,6 +150,14 @@ pub fn dilate(mask: &GrayImage, radius: u32) -> GrayImage {
 /// Distance of each pixel from the nearest object pixel, rounded up to whole pixels; `reach + 1` where none is as near as
 /// `reach`.
 pub fn distances(mask: &GrayImage, reach: u32) -> Vec<u32> {
+    let squares: Vec<usize> = (0..=reach as usize + 1).map(|d| d * d).collect();
+    let rounded = |square: usize| (squares.partition_point(|s| *s < square) as u32).min(reach + 1);
+    squared_distances(mask, reach).into_iter().map(rounded).collect()
+}
+
+/// Squared distance of each pixel's centre from that of the nearest object pixel, exact up to `reach` pixels; more than
+/// `reach` squared where none is as near.
+pub fn squared_distances(mask: &GrayImage, reach: u32) -> Vec<usize> {
     let (w, h) = (mask.width() as usize, mask.height() as usize);
     let raw = mask.as_raw();
     let reach = reach as usize;
@@ -169,14 +177,12 @@ pub fn distances(mask: &GrayImage, reach: u32) -> Vec<u32> {
             vertical[y * w + x] = vertical[y * w + x].min(last);
         }
     }
-    let squares: Vec<usize> = (0..=far).map(|d| d * d).collect();
-    let distance = |pixel: usize| {
+    let square = |pixel: usize| {
         let (x, row) = (pixel % w, &vertical[pixel / w * w..(pixel / w + 1) * w]);
         let near = x.saturating_sub(reach)..(x + reach + 1).min(w);
-        let square = near.map(|u| row[u] * row[u] + u.abs_diff(x) * u.abs_diff(x)).min().unwrap_or(far * far);
-        squares.partition_point(|s| *s < square).min(far) as u32
+        near.map(|u| row[u] * row[u] + u.abs_diff(x) * u.abs_diff(x)).min().unwrap_or(far * far)
     };
-    (0..w * h).map(distance).collect()
+    (0..w * h).map(square).collect()
 }
 
 #[cfg(test)]

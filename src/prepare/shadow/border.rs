@@ -4,17 +4,17 @@
 //! with those outside; the medians over many places are the drop of full shadow and the profile of the border, which is the
 //! wider the farther the light has come past the object.
 
-use rayon::prelude::*;
-
 use super::Ground;
 use super::mixture::{Color, Mixture, brightened};
+use crate::scene::resample::squared_distances;
 
 /// Distance of each cell from the border of a mask, in cells: positive inside, negative outside, no farther than `reach`.
-fn depths(mask: &[bool], side: usize, reach: f64) -> Vec<f64> {
+fn depths(mask: &[bool], side: usize, reach: u32) -> Vec<f64> {
     let of = |wanted: bool| {
         let bytes = mask.iter().map(|m| if *m == wanted { 255 } else { 0 }).collect();
         let picture = image::GrayImage::from_raw(side as u32, side as u32, bytes).expect("a value per cell");
-        distances(&picture, reach)
+        let squares = squared_distances(&picture, reach).into_iter();
+        squares.map(|square| (square as f64).sqrt().min(f64::from(reach))).collect::<Vec<f64>>()
     };
     let (inside, outside) = (of(false), of(true));
     let raw: Vec<f64> = (0..mask.len()).map(|i| if mask[i] { inside[i] - 0.5 } else { 0.5 - outside[i] }).collect();
@@ -35,27 +35,6 @@ fn depths(mask: &[bool], side: usize, reach: f64) -> Vec<f64> {
         values = smooth(&values, side, &|i| i / side);
     }
     values
-}
-
-/// Exact distances from the nearest cell of a mask up to `reach`.
-fn distances(mask: &image::GrayImage, reach: f64) -> Vec<f64> {
-    let (side, raw) = (mask.width() as isize, mask.as_raw());
-    let far = reach.ceil() as isize;
-    let one = |i: usize| {
-        let (x, y) = (i as isize % side, i as isize / side);
-        if raw[i] != 0 {
-            return 0.0;
-        }
-        let mut least = reach * reach;
-        for (dx, dy) in (-far..=far).flat_map(|dy| (-far..=far).map(move |dx| (dx, dy))) {
-            let (u, v) = (x + dx, y + dy);
-            if u >= 0 && v >= 0 && u < side && v < side && raw[(v * side + u) as usize] != 0 {
-                least = least.min((dx * dx + dy * dy) as f64);
-            }
-        }
-        least.sqrt()
-    };
-    (0..raw.len()).into_par_iter().map(one).collect()
 }
 
 /// Cells across a border that are looked at on each side: least, and this share of the object's height.
@@ -207,7 +186,7 @@ pub(super) fn amounts(
     let side = ground.side;
     let far = shift[0].hypot(shift[1]).max(1e-6);
     let reach = ((ACROSS.1 * ground.height) as usize).max(ACROSS.0);
-    let depth = depths(region, side, reach as f64 + 2.0);
+    let depth = depths(region, side, reach as u32 + 2);
     let middle = 0.5 * side as f64;
     let along = |i: usize| {
         let at = [(i % side) as f64 + 0.5 - middle, (i / side) as f64 + 0.5 - middle];
