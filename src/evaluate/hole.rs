@@ -4,6 +4,7 @@ use image::{GrayImage, RgbImage};
 use serde::{Deserialize, Serialize};
 
 use super::seen::{Shown, Surface};
+use crate::scene::resample;
 
 /// A depth counts as right within this share of the true one.
 const RIGHT: f64 = 0.05;
@@ -129,22 +130,10 @@ pub fn residue(
 /// Unless `picture` is as large as `from`'s view.
 pub fn warped(view: Shown<'_>, from: Shown<'_>, picture: &RgbImage) -> Vec<Option<[f64; 3]>> {
     assert_eq!(picture.dimensions(), (from.camera.size[0], from.camera.size[1]), "the picture is that of the view");
-    view.points().into_iter().map(|point| Some(sample(picture, from.sees(point?)?))).collect()
-}
-
-/// Linear between pixel centres, the border's colour beyond the outermost.
-fn sample(picture: &RgbImage, [x, y]: [f64; 2]) -> [f64; 3] {
-    let axis = |at: f64, size: u32| {
-        let at = (at - 0.5).clamp(0.0, f64::from(size - 1));
-        let low = at.floor() as u32;
-        (low, (low + 1).min(size - 1), at.fract())
-    };
-    let ((x0, x1, u), (y0, y1, v)) = (axis(x, picture.width()), axis(y, picture.height()));
-    let at = |x, y, c: usize| f64::from(picture.get_pixel(x, y).0[c]) / 255.0;
-    std::array::from_fn(|c| {
-        let row = |y| at(x0, y, c) * (1.0 - u) + at(x1, y, c) * u;
-        row(y0) * (1.0 - v) + row(y1) * v
-    })
+    view.points()
+        .into_iter()
+        .map(|point| Some(resample::color_at(picture, from.sees(point?)?).map(|v| v / 255.0)))
+        .collect()
 }
 
 #[cfg(test)]
@@ -262,13 +251,5 @@ mod tests {
         let factor = unit([(&surface, &[0.01f32, 0.01, 0.02, 0.01, 0.0, 0.01][..], Some(&mask))]);
         assert!((factor.expect("one pixel outside") - 1000.0).abs() < 1e-3, "{factor:?}");
         assert_eq!(unit([(&empty, &truth[..], None)]), None);
-    }
-
-    #[test]
-    fn samples_lie_between_pixel_centres() {
-        let picture = RgbImage::from_fn(2, 1, |x, _| Rgb([255 * x as u8, 0, 255]));
-        assert_eq!(sample(&picture, [0.5, 0.5]), [0.0, 0.0, 1.0]);
-        assert_eq!(sample(&picture, [1.0, 0.1]), [0.5, 0.0, 1.0]);
-        assert_eq!(sample(&picture, [2.0, 1.0]), [1.0, 0.0, 1.0]);
     }
 }

@@ -1,7 +1,5 @@
 //! Photographs as if taken without distortion.
 
-use image::RgbImage;
-
 use super::{STRIDE, Sites};
 use crate::scene::{Camera, View, distort, resample};
 
@@ -48,7 +46,7 @@ impl Picture {
         };
         let grey_at = |pixel: usize| {
             let (x, y) = ((pixel % size[0] as usize) as f64 + 0.5, (pixel / size[0] as usize) as f64 + 0.5);
-            source(x, y).map_or(0, |at| grey(bilinear(&image, at)))
+            source(x, y).map_or(0, |at| grey(resample::color_at(&image, at)))
         };
         let pixels = size[0] as usize * size[1] as usize;
         let ratio: [f64; 2] = [f64::from(w) / f64::from(size[0]), f64::from(h) / f64::from(size[1])];
@@ -66,7 +64,7 @@ impl Picture {
             if !(u >= 0.0 && v >= 0.0 && u < f64::from(size[0]) && v < f64::from(size[1])) {
                 continue;
             }
-            picture.colors[site] = bilinear(&image, [u, v]).map(|c| c.round() as u8);
+            picture.colors[site] = resample::color_at(&image, [u, v]).map(|c| c.round() as u8);
             let [u, v] = [(u * ratio[0]) as u32, (v * ratio[1]) as u32];
             let object = view.mask.as_ref().is_some_and(|mask| mask.get_pixel(u.min(w - 1), v.min(h - 1)).0[0] != 0);
             picture.shown[site] = !object;
@@ -118,21 +116,6 @@ fn grey([r, g, b]: [f64; 3]) -> u8 {
     (0.299 * r + 0.587 * g + 0.114 * b).round() as u8
 }
 
-/// The picture at a place in pixels; beyond its border what the border has.
-fn bilinear(image: &RgbImage, [u, v]: [f64; 2]) -> [f64; 3] {
-    let [w, h] = [image.width() as usize, image.height() as usize];
-    let (x, y) = ((u - 0.5).clamp(0.0, (w - 1) as f64), (v - 0.5).clamp(0.0, (h - 1) as f64));
-    let (left, top) = (x as usize, y as usize);
-    let (right, low) = ((left + 1).min(w - 1), (top + 1).min(h - 1));
-    let (a, b) = (x.fract(), y.fract());
-    let at = |x: usize, y: usize, c: usize| f64::from(image.as_raw()[3 * (y * w + x) + c]);
-    std::array::from_fn(|c| {
-        let upper = (1.0 - a) * at(left, top, c) + a * at(right, top, c);
-        let lower = (1.0 - a) * at(left, low, c) + a * at(right, low, c);
-        (1.0 - b) * upper + b * lower
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -142,7 +125,7 @@ mod tests {
     #[test]
     fn a_site_shows_what_the_lens_brings_there() {
         let [w, h] = [120_u32, 90];
-        let image = RgbImage::from_fn(w, h, |x, y| image::Rgb([2 * x as u8, 2 * y as u8, 0]));
+        let image = image::RgbImage::from_fn(w, h, |x, y| image::Rgb([2 * x as u8, 2 * y as u8, 0]));
         for distortion in [[0.0; 4], [-0.2, 0.05, 0.0, 0.0], [0.3, 0.0, 0.004, -0.006]] {
             let camera = Camera {
                 rotation: [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]],

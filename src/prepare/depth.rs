@@ -52,16 +52,8 @@ impl DepthMap {
 
     /// The depth at a pixel position, interpolated where all four neighbours are known.
     pub fn smooth(&self, position: [f64; 2]) -> f32 {
-        let [w, h] = self.camera.size.map(|n| n as usize);
-        let [x, y]: [f64; 2] =
-            std::array::from_fn(|i| (position[i] - 0.5).clamp(0.0, (f64::from(self.camera.size[i]) - 1.001).max(0.0)));
-        let (u, v) = (x as usize, y as usize);
-        let (fx, fy) = ((x - u as f64) as f32, (y - v as f64) as f32);
-        let at = |u: usize, v: usize| self.depth[v.min(h - 1) * w + u.min(w - 1)];
-        let above = at(u, v) * (1.0 - fx) + at(u + 1, v) * fx;
-        let below = at(u, v + 1) * (1.0 - fx) + at(u + 1, v + 1) * fx;
-        let mean = above * (1.0 - fy) + below * fy;
-        if mean.is_finite() { mean } else { self.at(position) }
+        let [mean] = resample::bilinear(self.camera.size, position, |pixel| [f64::from(self.depth[pixel])]);
+        if mean.is_finite() { mean as f32 } else { self.at(position) }
     }
 }
 

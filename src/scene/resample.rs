@@ -74,6 +74,29 @@ fn separable<const C: usize>(row: impl Fn(usize, &mut [f64]), from: [usize; 2], 
     out
 }
 
+/// What a picture has at a position in pixels, linear between the centres of the four pixels around it; beyond the outermost
+/// centres what the border has there. `at` tells the values of a row-major pixel.
+pub fn bilinear<const C: usize>(size: [u32; 2], position: [f64; 2], at: impl Fn(usize) -> [f64; C]) -> [f64; C] {
+    let [w, h] = size.map(|n| n as usize);
+    let place = |axis: usize, length: usize| (position[axis] - 0.5).clamp(0.0, length.saturating_sub(1) as f64);
+    let (x, y) = (place(0, w), place(1, h));
+    let (left, top) = (x as usize, y as usize);
+    let (right, low) = ((left + 1).min(w - 1), (top + 1).min(h - 1));
+    let (a, b) = (x.fract(), y.fract());
+    let corners = [[left, top], [right, top], [left, low], [right, low]].map(|[x, y]| at(y * w + x));
+    std::array::from_fn(|c| {
+        let upper = (1.0 - a) * corners[0][c] + a * corners[1][c];
+        let lower = (1.0 - a) * corners[2][c] + a * corners[3][c];
+        (1.0 - b) * upper + b * lower
+    })
+}
+
+/// The colour of a picture at a position in pixels as [`bilinear`] has it, 8-bit levels.
+pub fn color_at(image: &RgbImage, position: [f64; 2]) -> [f64; 3] {
+    let raw = image.as_raw();
+    bilinear(image.dimensions().into(), position, |pixel| std::array::from_fn(|c| f64::from(raw[3 * pixel + c])))
+}
+
 /// A photograph at another size: the area average of the stored values, rounded to 8 bits.
 pub fn photograph(image: &RgbImage, to: [u32; 2]) -> RgbImage {
     let (w, h) = image.dimensions();
@@ -233,6 +256,18 @@ mod tests {
         assert_eq!(map(&[5.0], [1, 1], [3, 2]), [5.0; 6]);
         // One axis grows while the other shrinks.
         assert_eq!(map(&[0.0, 4.0, 2.0, 6.0], [2, 2], [4, 1]), [1.0, 2.0, 4.0, 5.0]);
+    }
+
+    #[test]
+    fn colors_lie_between_pixel_centres() {
+        let picture = RgbImage::from_fn(4, 3, |x, y| image::Rgb([10 * x as u8, 20 * y as u8, 7]));
+        assert_eq!(color_at(&picture, [0.5, 0.5]), [0.0, 0.0, 7.0]);
+        assert_eq!(color_at(&picture, [2.0, 1.75]), [15.0, 25.0, 7.0]);
+        // Beyond the outermost centres: the border.
+        assert_eq!(color_at(&picture, [0.1, 1.5]), [0.0, 20.0, 7.0]);
+        assert_eq!(color_at(&picture, [4.0, 9.0]), [30.0, 40.0, 7.0]);
+        let one = RgbImage::from_pixel(1, 1, image::Rgb([3; 3]));
+        assert_eq!(color_at(&one, [0.7, 0.2]), [3.0; 3]);
     }
 
     #[test]

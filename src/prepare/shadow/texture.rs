@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use super::plane::Support;
 use crate::prepare::depth::{DepthMap, Witness};
-use crate::scene::Camera;
+use crate::scene::{Camera, resample};
 
 /// Cells on each side of the texture, at most.
 const MOST: usize = 320;
@@ -58,17 +58,8 @@ impl Photograph<'_> {
     }
 
     /// The logarithms of the channels at a pixel position, bilinear; levels of 255.
-    fn log(&self, [x, y]: [f64; 2]) -> [f32; 3] {
-        let (w, h) = self.picture.dimensions();
-        let (x, y) = (x - 0.5, y - 0.5);
-        let (u, v) = (x as u32, y as u32);
-        let (fx, fy) = ((x - f64::from(u)) as f32, (y - f64::from(v)) as f32);
-        let at = |u: u32, v: u32, c: usize| f32::from(self.picture.get_pixel(u.min(w - 1), v.min(h - 1)).0[c]);
-        std::array::from_fn(|c| {
-            let above = at(u, v, c) * (1.0 - fx) + at(u + 1, v, c) * fx;
-            let below = at(u, v + 1, c) * (1.0 - fx) + at(u + 1, v + 1, c) * fx;
-            (above * (1.0 - fy) + below * fy).max(DARK).ln()
-        })
+    fn log(&self, position: [f64; 2]) -> [f32; 3] {
+        resample::color_at(self.picture, position).map(|v| (v as f32).max(DARK).ln())
     }
 }
 
