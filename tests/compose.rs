@@ -24,7 +24,8 @@ fn true_grid(view: &View) -> DepthGrid {
     let truth = view.depth.as_ref().expect("a test view");
     let sites = (columns * rows) as usize;
     let (depth, colors) = (vec![f64::NAN; sites], vec![[0; 3]; sites]);
-    let mut grid = DepthGrid { camera, stride: 1, columns, rows, depth, confirmed: vec![true; sites], colors };
+    let mut grid =
+        DepthGrid { camera, stride: 1, columns, rows, depth, confirmed: vec![true; sites], colors, trusted: true };
     for (x, y) in (0..rows).flat_map(|y| (0..columns).map(move |x| (x, y))) {
         let site = (y * columns + x) as usize;
         let [u, v] = view.camera.project(view.camera.along(grid.ray([x, y]), 1.0)).expect("ahead");

@@ -13,14 +13,14 @@ use image::{GrayImage, Luma, Rgb, RgbImage};
 use tempfile::TempDir;
 
 const VIEWS: u32 = 10;
+const OPTIONS: synthetic::Options =
+    synthetic::Options { seed: 2, width: 112, height: 84, train_views: VIEWS, test_views: 2, points: 2000 };
 
 /// `full/`: a small built-in scene with everything it has; `photos/`: its photographs and its model alone.
 fn capture() -> TempDir {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let full = folder.path().join("full");
-    let options =
-        synthetic::Options { seed: 2, width: 112, height: 84, train_views: VIEWS, test_views: 2, points: 2000 };
-    synthetic::write(&full, &options).expect("a writable folder");
+    synthetic::write(&full, &OPTIONS).expect("a writable folder");
     for part in ["images", "sparse/0"] {
         let to = folder.path().join("photos").join(part);
         fs::create_dir_all(&to).expect("a writable folder");
@@ -127,6 +127,22 @@ fn one_box_becomes_a_scene() {
     let (ours, before) = (difference(found, &exact, hole), difference(object, &exact, hole));
     println!("reference: {ours:.1} levels off the truth, the photograph {before:.1}");
     assert!(ours < 0.5 * before, "{ours:.1} of {before:.1}");
+    // All other views' holes are filled from the same surface.
+    let full = folder.path().join("full");
+    synthetic::write_bare(&full, &OPTIONS).expect("a writable folder");
+    assert_eq!(scene.holes.len(), VIEWS as usize - 1);
+    for filled in &scene.holes {
+        let other = &scene.train[filled.view];
+        let exact =
+            image::open(full.join("test_images").join(other.name.clone() + ".png")).expect("a picture").into_rgb8();
+        let hole = mask(&full.join("masks").join(other.name.clone() + ".png"));
+        let (ours, before) = (difference(&filled.image, &exact, &hole), difference(&other.image, &exact, &hole));
+        println!("{}: {ours:.1} levels off the truth, the photograph {before:.1}", other.name);
+        assert!(ours < 0.5 * before, "{}: {ours:.1} of {before:.1}", other.name);
+        let untouched =
+            GrayImage::from_fn(hole.width(), hole.height(), |x, y| Luma([255 - filled.filled.get_pixel(x, y).0[0]]));
+        assert_eq!(difference(&filled.image, &other.image, &untouched), 0.0, "beside the hole the photograph stays");
+    }
     let outside = GrayImage::from_fn(hole.width(), hole.height(), |x, y| {
         let near = (-4..=4i32).any(|dy| {
             (-4..=4i32).any(|dx| {

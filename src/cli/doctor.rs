@@ -4,8 +4,8 @@ use crate::atomic;
 use anyhow::{Context as _, bail};
 
 use super::{next, pictures};
+use crate::prepare::hole::PROVENANCE;
 use crate::prepare::record;
-use crate::prepare::reference::PROVENANCE;
 use crate::scene::doctor::{self, Report, Severity};
 use crate::scene::{Scene, sheet};
 

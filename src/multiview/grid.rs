@@ -3,7 +3,7 @@
 use glam::DVec3;
 
 use super::picture::Picture;
-use super::{STRIDE, Sites, depth, fill, fuse, neighbors};
+use super::{STRIDE, Sites, agree, depth, fill, fuse, neighbors};
 use crate::gpu::{Error, Gpu};
 use crate::scene::{Camera, Point, Scene};
 
@@ -36,6 +36,8 @@ pub struct DepthGrid {
     pub confirmed: Vec<bool>,
     /// 8-bit RGB of a \[site\].
     pub colors: Vec<[u8; 3]>,
+    /// Whether its photograph agrees with the others': the camera is where the model has it.
+    pub trusted: bool,
 }
 
 impl DepthGrid {
@@ -97,19 +99,21 @@ impl DepthGrid {
 pub fn depths(gpu: &Gpu, scene: &Scene) -> Result<Vec<DepthGrid>, Error> {
     use rayon::prelude::*;
     let pictures: Vec<Picture> = scene.train.par_iter().map(Picture::new).collect();
-    let neighbors = neighbors::choose(&pictures, pictures.len(), &scene.points).of;
-    let maps = depth::estimate(gpu, &pictures, &neighbors, &scene.points)?;
-    let mut surfaces = seen_by_most(&pictures, fuse::confirm(&pictures, &neighbors, &maps));
+    let neighbors = neighbors::choose(&pictures, pictures.len(), &scene.points);
+    let maps = depth::estimate(gpu, &pictures, &neighbors.of, &scene.points)?;
+    let confirmed = fuse::confirm(&pictures, &neighbors.of, &maps);
+    let wrong = agree::wrong(&agree::shares(&pictures, &neighbors, &confirmed));
+    let mut surfaces = seen_by_most(&pictures, confirmed);
     pictures.par_iter().zip(&mut surfaces).for_each(|(picture, surface)| add_points(picture, surface, &scene.points));
     let filled = fill::fill(&pictures, &surfaces);
-    let all = pictures.into_par_iter().zip(surfaces).zip(filled);
-    let grids = all.map(|((picture, surface), filled)| {
+    let all = pictures.into_par_iter().zip(surfaces).zip(filled).zip(wrong);
+    let grids = all.map(|(((picture, surface), filled), wrong)| {
         let Sites { columns, rows } = picture.sites;
         let confirmed = surface.iter().map(|z| z.is_finite()).collect();
         let depth = surface.iter().zip(filled).map(|(known, filled)| if known.is_finite() { *known } else { filled });
         let depth = depth.collect();
         let Picture { camera, colors, .. } = picture;
-        let mut grid = DepthGrid { camera, stride: STRIDE, columns, rows, depth, confirmed, colors };
+        let mut grid = DepthGrid { camera, stride: STRIDE, columns, rows, depth, confirmed, colors, trusted: !wrong };
         grid.despeckle();
         grid
     });
@@ -215,7 +219,7 @@ mod tests {
         };
         let depth: Vec<f64> = (0..64).map(|site| if site % 8 < 4 { 2.0 } else { 5.0 }).collect();
         let (confirmed, colors) = (vec![true; 64], vec![[0; 3]; 64]);
-        let mut grid = DepthGrid { camera, stride: 2, columns: 8, rows: 8, depth, confirmed, colors };
+        let mut grid = DepthGrid { camera, stride: 2, columns: 8, rows: 8, depth, confirmed, colors, trusted: true };
         let clean = grid.depth.clone();
         grid.depth[18] = 0.7;
         grid.despeckle();

@@ -336,7 +336,7 @@ pub fn segment(picture: &RgbImage, known: &[Known], smoothness: f64) -> Option<V
 }
 
 /// A picture's size with the longer side at most [`SIDE`].
-fn reduced(size: [u32; 2]) -> [u32; 2] {
+pub(super) fn reduced(size: [u32; 2]) -> [u32; 2] {
     within(size, SIDE)
 }
 

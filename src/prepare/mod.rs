@@ -4,15 +4,15 @@ pub mod click;
 pub mod depth;
 pub mod fit;
 pub mod graph_cut;
+pub mod hole;
 pub mod lens;
 pub mod masks;
 pub mod network;
-pub mod patchmatch;
+pub mod outline;
 pub mod planes;
 pub mod poses;
 mod program;
 pub mod record;
-pub mod reference;
 pub mod shadow;
 pub mod splats;
 
@@ -21,6 +21,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use image::GrayImage;
+use rayon::prelude::*;
 
 use crate::gpu::{self, Gpu};
 use crate::scene::{self, PriorKind, Scene, resample};
@@ -176,7 +177,7 @@ pub struct Request {
     pub depth: bool,
     /// What to do about the object's shadow.
     pub shadow: shadow::Answer,
-    /// A network that fills what nobody saw, instead of PatchMatch: an ONNX file, see [`network`].
+    /// A network that fills what nobody saw, instead of pieces of what is around it: an ONNX file, see [`network`].
     pub inpaint_model: Option<PathBuf>,
     /// A network whose maps become the depth priors, instead of the fit's own depth: likewise.
     pub depth_model: Option<PathBuf>,
@@ -327,7 +328,7 @@ fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(
     }
     if request.wants(Step::Reference) {
         let masks = masked(&preparation)?;
-        preparation.reference(&scene, &fit, &mut splats, &masks)?;
+        preparation.reference(&scene, &masks)?;
     }
     Ok(Some((scene, fit)))
 }
@@ -643,7 +644,7 @@ impl Preparation<'_> {
         splats: &mut Splats,
         given: &BTreeMap<String, Given>,
     ) -> Result<(), Error> {
-        let mut inputs = Inputs::default().with(self.fit_hash());
+        let mut inputs = Inputs::default().with(self.fit_hash()).with(outline::METHOD);
         for (name, Given { mask, from }) in given {
             inputs = inputs.with(name).with(mask.as_raw()).with(from);
         }
@@ -672,35 +673,53 @@ impl Preparation<'_> {
             }
         }
         let colors = masks::colors(splats, &scene.train)?;
-        let shares = votes.count(fit.positions(), &colors);
+        let mut shares = votes.count(fit.positions(), &colors);
         let mut batch = Batch::default();
         let names: Vec<&str> = given.keys().map(String::as_str).collect();
         let from = format!("carried from {}", abridged(&names));
-        let (mut thin, mut shown): (Vec<(f64, &str)>, usize) = (vec![], 0);
-        for view in &scene.train {
-            let path = format!("masks/{}.png", view.name);
-            let mask = match given.get(&view.name) {
-                Some(Given { mask, from }) => {
-                    if from != USERS {
-                        batch.gray(path, mask, from.clone());
-                    }
-                    mask.clone()
-                }
-                None => {
-                    let carried = shares.carry(splats, &view.camera)?;
-                    let mask = masks::threshold(
-                        &carried.object,
-                        view.camera.size,
-                        picture_size(&files[&view.name])?,
-                        masks::OBJECT,
-                    );
-                    let mask = masks::without_specks(&mask, SPECK);
-                    thin.extend(carried.thinness().map(|part| (part, view.name.as_str())));
-                    batch.gray(path, &mask, from.clone());
-                    mask
-                }
-            };
+        let carry = |shares: &masks::Shares, splats: &mut Splats| -> Result<Vec<masks::Carried>, Error> {
+            let others = scene.train.iter().filter(|view| !given.contains_key(&view.name));
+            others.map(|view| Ok(shares.carry(splats, &view.camera)?)).collect()
+        };
+        let others: Vec<&scene::View> = scene.train.iter().filter(|view| !given.contains_key(&view.name)).collect();
+        let pictures: Vec<Result<_, scene::Error>> =
+            others.par_iter().map(|view| scene::photograph_within(&files[&view.name], outline::SIDE)).collect();
+        let pictures = pictures.into_iter().collect::<Result<Vec<_>, _>>()?;
+        let refine = |carried: &[masks::Carried]| -> Vec<GrayImage> {
+            let all = others.par_iter().zip(&pictures).zip(carried);
+            all.map(|((view, picture), carried)| outline::of(picture, &carried.object, view.camera.size)).collect()
+        };
+        let carried = carry(&shares, splats)?;
+        let thin =
+            others.iter().zip(&carried).filter_map(|(view, carried)| Some((carried.thinness()?, view.name.as_str())));
+        let mut thin: Vec<(f64, &str)> = thin.collect();
+        let mut outlines = refine(&carried);
+        // What the first views miss of the object's other sides the masks of all views have between them.
+        for _ in 0..outline::ROUNDS {
+            let mut votes = masks::Votes::new(splats);
+            let every = scene.train.len().div_ceil(outline::VOTERS).max(1);
+            for view in scene.train.iter().step_by(every) {
+                let at = others.iter().position(|other| other.name == view.name);
+                let mask = at.map_or_else(|| &given[&view.name].mask, |at| &outlines[at]);
+                votes.add(splats, &view.camera, &masks::parts(mask, view.camera.size))?;
+                self.watch.go_on()?;
+            }
+            shares = votes.count(fit.positions(), &colors);
+            outlines = refine(&carry(&shares, splats)?);
+        }
+        let mut shown = 0;
+        for (name, Given { mask, from }) in given {
+            if from != USERS {
+                batch.gray(format!("masks/{name}.png"), mask, from.clone());
+            }
             shown += usize::from(mask.as_raw().iter().any(|v| *v != 0));
+        }
+        for (view, mask) in others.iter().zip(&outlines) {
+            let size = picture_size(&files[&view.name])?;
+            let small = [mask.width(), mask.height()];
+            let mask = masks::threshold(&masks::parts(mask, small), small, size, 0.5);
+            shown += usize::from(mask.as_raw().iter().any(|v| *v != 0));
+            batch.gray(format!("masks/{}.png", view.name), &mask, from.clone());
             unit += 1;
             self.watch.turn(unit)?;
         }
@@ -831,28 +850,42 @@ impl Preparation<'_> {
         Ok(())
     }
 
-    fn reference(&mut self, scene: &Scene, fit: &Fit, splats: &mut Splats, masks: &[GrayImage]) -> Result<(), Error> {
+    fn reference(&mut self, scene: &Scene, masks: &[GrayImage]) -> Result<(), Error> {
         let named = self.request.reference.clone().unwrap_or_default();
-        let inputs = self.inputs_behind_masks(masks).with(named).with([u8::from(self.depth)]);
+        let inputs = self.inputs_behind_masks(masks).with(hole::METHOD).with(named).with([u8::from(self.depth)]);
         let inputs = self.shadow_hashes().fold(inputs, |inputs, hash| inputs.with(hash));
-        let inputs = self.networks.inputs(inputs, true).finish();
+        let mut inputs = self.networks.inputs(inputs, true).with(self.request.shadow.name());
+        let mut given = BTreeMap::new();
+        for (at, view) in scene.train.iter().enumerate() {
+            let path = hole::reference_path(&view.name);
+            if self.folder.is_users(&path)? {
+                let hash = record::hash(&self.folder.root().join(&path))?;
+                inputs = inputs.with(&hash);
+                given.insert(at, hash);
+            }
+        }
+        let inputs = inputs.finish();
         if self.skips(Step::Reference, &inputs)? {
             return Ok(());
         }
-        let fine = self.load(reference::SIDE, true)?;
-        self.watch.begin(Step::Reference, 2 * scene.train.len() as u64 + 4);
-        let task = reference::Task {
+        let mut fine = self.load(hole::SIDE, true)?;
+        scene::even_out(&mut fine);
+        self.watch.begin(Step::Reference, 2 * scene.train.len() as u64 + 2);
+        let task = hole::Task {
+            gpu: self.gpu,
             scene,
             fine: &fine,
             root: self.folder.root(),
             masks,
+            given: &given,
+            shade: self.request.shadow == shadow::Answer::Remove,
             named: self.request.reference.as_deref(),
             depth: self.depth,
             inpainting: self.networks.inpainting.as_ref().map(|(network, _)| network),
             depth_network: self.networks.depth.as_ref().map(|(network, _)| (network, self.kind())),
             seed: self.request.seed,
         };
-        let batch = reference::make(&task, fit, splats, self.watch)?;
+        let batch = hole::make(&task, self.watch)?;
         self.write(Step::Reference, inputs, batch)?;
         self.watch.end();
         Ok(())
@@ -861,8 +894,6 @@ impl Preparation<'_> {
 
 /// A view shows a side of the object that no masked view shows if more than this part of the object there is unseen.
 const THIN: f64 = 0.3;
-/// Pieces of a carried mask that are smaller than this share of its largest piece are taken away.
-const SPECK: f64 = 0.02;
 
 /// Folders of depth priors.
 const PRIORS: [&str; 2] = ["depth", "disparity"];

@@ -1,4 +1,4 @@
-//! Networks that the user names, as ONNX files: inpainting in place of PatchMatch, depth in place of the fit's own.
+//! Networks that the user names, as ONNX files: inpainting in place of pieces of the surroundings, depth in place of the fit's own.
 //!
 //! | | inpainting (LaMa's exports) | depth (Depth Anything, DPT, MiDaS, ZoeDepth) |
 //! | --- | --- | --- |

@@ -27,6 +27,8 @@ const SIDE: usize = 320;
 const OFF: f64 = 4.0;
 /// What a pixel without a surface of its own costs: a plane that fits is preferred.
 const REST: f64 = 1.5;
+/// The same in the hole, where nothing fits better or worse.
+const UNKNOWN_REST: f64 = 0.4;
 /// What a pixel costs where its surface is impossible.
 const IMPOSSIBLE: f64 = 40.0;
 /// What a border costs per pixel of its length.
@@ -35,6 +37,8 @@ const BORDER: f64 = 6.0;
 const COINCIDENCE: f64 = 4.0;
 /// Costs are whole numbers of this fraction.
 const UNIT: f64 = 64.0;
+/// Largest cost of a pair of nodes, in these fractions.
+const MOST: f64 = 1e8;
 
 /// The surroundings of a hole.
 pub struct Hole<'a, F> {
@@ -58,14 +62,15 @@ pub struct Surfaces {
     pub label: Vec<u8>,
     /// `[pixel]` inverse depth, the known ones as they were; NaN where nothing is known of the surface.
     pub disparity: Vec<f32>,
-    /// Planes that were found.
-    pub planes: usize,
+    /// The planes that were found: inverse depth by x/z, y/z and 1.
+    pub planes: Vec<Plane>,
 }
 
 /// Inverse depth by x/z, y/z and 1.
-type Plane = [f64; 3];
+pub type Plane = [f64; 3];
 
-fn on(plane: &Plane, [x, y]: [f64; 2]) -> f64 {
+/// Inverse depth of a plane along a ray (x/z, y/z).
+pub fn on(plane: &Plane, [x, y]: [f64; 2]) -> f64 {
     plane[0] * x + plane[1] * y + plane[2]
 }
 
@@ -121,7 +126,7 @@ pub fn surfaces<F: Fn(usize, f64) -> f64>(hole: &Hole<'_, F>, seed: u64) -> Surf
     let planes = planes(points.collect(), &mut Pcg64::new(seed.into(), 41));
     let label = labels(hole, &planes);
     let disparity = continued(hole, &planes, &label);
-    Surfaces { label, disparity, planes: planes.len() }
+    Surfaces { label, disparity, planes }
 }
 
 /// The surface of each pixel.
@@ -140,7 +145,7 @@ fn labels<F: Fn(usize, f64) -> f64>(hole: &Hole<'_, F>, planes: &[Plane]) -> Vec
         let d = f64::from(hole.disparity[i]);
         let is_known = !hole.unknown[i] && d > 0.0 && d.is_finite();
         if label == rest {
-            return REST;
+            return if hole.unknown[i] { UNKNOWN_REST } else { REST };
         }
         let surface = on(&planes[label], ray);
         if is_known {
@@ -156,20 +161,34 @@ fn labels<F: Fn(usize, f64) -> f64>(hole: &Hole<'_, F>, planes: &[Plane]) -> Vec
     let outline: Vec<bool> = (0..nodes).map(|node| hole.outline[middle(node)]).collect();
     let scale = stride as f64;
     // A node stands for stride^2 pixels, an edge of the grid for a border of stride pixels.
-    let units: Vec<Vec<i64>> =
-        (0..=rest).map(|label| (0..nodes).map(|node| (UNIT * scale * cost(node, label)) as i64).collect()).collect();
-    let mut current: Vec<usize> =
-        (0..nodes).map(|node| (0..=rest).min_by_key(|label| units[*label][node]).unwrap_or(rest)).collect();
+    let costs: Vec<Vec<f64>> =
+        (0..=rest).map(|label| (0..nodes).map(|node| scale * cost(node, label)).collect()).collect();
+    let border = |[p, q]: [usize; 2], _: [usize; 2]| BORDER * if outline[p] || outline[q] { COINCIDENCE } else { 1.0 };
+    let current = cheapest(&costs, border, size);
+    (0..w * h).map(|i| current[(i / w / stride) * gw + (i % w) / stride] as u8).collect()
+}
+
+/// The labels of least cost on a grid, by alpha expansion: `costs` `[label][node]`, and for each pair of nodes and their
+/// labels what `border` says, for each unit of a border's length between them; 0 for the same label.
+pub fn cheapest(
+    costs: &[Vec<f64>],
+    border: impl Fn([usize; 2], [usize; 2]) -> f64 + Copy,
+    size: [usize; 2],
+) -> Vec<usize> {
+    let labels = costs.len();
+    let units: Vec<Vec<i64>> = costs.iter().map(|of| of.iter().map(|cost| (UNIT * cost) as i64).collect()).collect();
+    let least = |node: usize| (0..labels).min_by_key(|label| units[*label][node]).unwrap_or(0);
+    let mut current: Vec<usize> = (0..size[0] * size[1]).map(least).collect();
     for _ in 0..3 {
         let before = current.clone();
-        for alpha in 0..=rest {
-            expand(&mut current, alpha, &units, &outline, size);
+        for alpha in 0..labels {
+            expand(&mut current, alpha, &units, border, size);
         }
         if before == current {
             break;
         }
     }
-    (0..w * h).map(|i| current[(i / w / stride) * gw + (i % w) / stride] as u8).collect()
+    current
 }
 
 /// Sixteen neighbours: with eight, the staircases between two points within half a right angle are as short as the line.
@@ -206,7 +225,13 @@ fn length(dx: isize, dy: isize) -> f64 {
 }
 
 /// Every pixel keeps its label or takes `alpha`, as is cheapest: one minimum cut (Kolmogorov and Zabih 2004).
-fn expand(current: &mut [usize], alpha: usize, units: &[Vec<i64>], outline: &[bool], size @ [w, h]: [usize; 2]) {
+fn expand(
+    current: &mut [usize],
+    alpha: usize,
+    units: &[Vec<i64>],
+    border: impl Fn([usize; 2], [usize; 2]) -> f64,
+    size @ [w, h]: [usize; 2],
+) {
     let mut grid = Grid::new(size, &SHIFTS);
     // Of keeping, minus of taking alpha.
     let mut gain: Vec<i64> = (0..current.len()).map(|i| units[current[i]][i] - units[alpha][i]).collect();
@@ -217,14 +242,15 @@ fn expand(current: &mut [usize], alpha: usize, units: &[Vec<i64>], outline: &[bo
                 continue;
             }
             let q = y as usize * w + x as usize;
-            let dear = if outline[p] || outline[q] { COINCIDENCE } else { 1.0 };
-            let border = (UNIT * BORDER * dear * length(dx, dy)) as i64;
-            let differ = |a: usize, b: usize| if a == b { 0 } else { border };
+            let scale = UNIT * length(dx, dy);
+            let differ =
+                |a: usize, b: usize| if a == b { 0 } else { (scale * border([p, q], [a, b])).min(MOST) as i64 };
             let (keep, take_q, take_p) =
                 (differ(current[p], current[q]), differ(current[p], alpha), differ(alpha, current[q]));
             gain[p] += keep - take_p;
             gain[q] += take_p;
-            grid.set_arc(q, SHIFTS.len() - 1 - d, (take_q + take_p - keep) as i32);
+            // A border that is no metric is made one: what would be negative is 0.
+            grid.set_arc(q, SHIFTS.len() - 1 - d, (take_q + take_p - keep).max(0) as i32);
         }
     }
     for (i, gain) in gain.into_iter().enumerate() {
@@ -255,7 +281,7 @@ fn continued<F>(hole: &Hole<'_, F>, planes: &[Plane], label: &[u8]) -> Vec<f32> 
             })
             .collect();
         let wanted = |i: usize| label[i] as usize == surface && hole.unknown[i];
-        super::reference::membrane(&mut off, hole.size, wanted);
+        membrane(&mut off, hole.size, wanted);
         for i in (0..label.len()).filter(|i| wanted(*i)) {
             // A surface that touches the hole nowhere is its plane alone.
             let value = of(i) + if off[i].is_finite() || planes.get(surface).is_none() { off[i] } else { 0.0 };
@@ -263,6 +289,47 @@ fn continued<F>(hole: &Hole<'_, F>, planes: &[Plane], label: &[u8]) -> Vec<f32> 
         }
     }
     out
+}
+
+/// Fills what is not a number with a membrane over what is: values spread inwards, then settle to the mean of their
+/// neighbours. Only pixels for which `wanted` says so are filled.
+pub fn membrane(values: &mut [f32], size: [usize; 2], wanted: impl Fn(usize) -> bool) {
+    let [w, h] = size;
+    let missing: Vec<usize> = (0..w * h).filter(|i| !values[*i].is_finite() && wanted(*i)).collect();
+    let neighbours = |i: usize| {
+        let (x, y) = (i % w, i / w);
+        [(x > 0).then(|| i - 1), (x + 1 < w).then(|| i + 1), (y > 0).then(|| i - w), (y + 1 < h).then(|| i + w)]
+            .into_iter()
+            .flatten()
+    };
+    let mut left = missing.clone();
+    while !left.is_empty() {
+        let mut ring = vec![];
+        for &i in &left {
+            let known: Vec<f32> = neighbours(i).map(|j| values[j]).filter(|v| v.is_finite()).collect();
+            if !known.is_empty() {
+                ring.push((i, known.iter().sum::<f32>() / known.len() as f32));
+            }
+        }
+        if ring.is_empty() {
+            return;
+        }
+        for (i, value) in ring {
+            values[i] = value;
+        }
+        left.retain(|i| !values[*i].is_finite());
+    }
+    for _ in 0..300 {
+        for &i in &missing {
+            let (sum, count) = neighbours(i)
+                .map(|j| values[j])
+                .filter(|v| v.is_finite())
+                .fold((0.0, 0.0), |(sum, count), v| (sum + v, count + 1.0));
+            if count > 0.0 {
+                values[i] = sum / count;
+            }
+        }
+    }
 }
 
 #[cfg(test)]
@@ -316,7 +383,7 @@ mod tests {
             against: |_, _| 0.0,
         };
         let found = surfaces(&hole, 5);
-        assert_eq!(found.planes, 2, "planes");
+        assert_eq!(found.planes.len(), 2, "planes");
         let wrong = (0..truth.len()).filter(|i| unknown[*i] && (found.disparity[*i] / truth[*i] - 1.0).abs() > 0.01);
         let border = |i: usize| {
             let at = 20.0 + (i / SIZE[0]) as f64 / 2.0;
@@ -383,7 +450,24 @@ mod tests {
             against: |_, _| 0.0,
         };
         let found = surfaces(&hole, 0);
-        assert_eq!(found.planes, 0);
+        assert!(found.planes.is_empty());
         assert!(found.disparity.iter().all(|d| d.is_nan()));
+    }
+
+    /// A linear ramp with a gap is linear again: a membrane over it has no curvature.
+    #[test]
+    fn a_membrane_continues_a_slope() {
+        let ramp = |i: usize| (i % 12) as f32 + 1.0;
+        let mut values: Vec<f32> = (0..12 * 9).map(ramp).collect();
+        for y in 2..7 {
+            for x in 4..8 {
+                values[y * 12 + x] = f32::NAN;
+            }
+        }
+        membrane(&mut values, [12, 9], |_| true);
+        assert!(values.iter().enumerate().all(|(i, v)| (v - ramp(i)).abs() < 1e-3));
+        let mut nothing = vec![f32::NAN; 4];
+        membrane(&mut nothing, [2, 2], |_| true);
+        assert!(nothing.iter().all(|v| v.is_nan()));
     }
 }

@@ -141,6 +141,13 @@ impl Batch {
         self.bytes(path, bytes.into_inner(), from);
     }
 
+    /// A picture with alpha as PNG.
+    pub fn rgba(&mut self, path: impl Into<String>, picture: &image::RgbaImage, from: impl Into<String>) {
+        let mut bytes = Cursor::new(vec![]);
+        picture.write_to(&mut bytes, ImageFormat::Png).expect("a picture is encoded into memory");
+        self.bytes(path, bytes.into_inner(), from);
+    }
+
     /// A picture as PNG, one of many large ones: until it is written it waits on disk.
     ///
     /// # Errors
@@ -168,6 +175,14 @@ impl Batch {
         let mut bytes = Cursor::new(vec![]);
         picture.write_to(&mut bytes, ImageFormat::Png).expect("a picture is encoded into memory");
         self.bytes(path, bytes.into_inner(), from);
+    }
+
+    /// The BLAKE3 hash of a file of these bytes, as hexadecimal digits; nothing for a copy.
+    pub fn hash_of(&self, path: &str) -> Option<String> {
+        match &self.files.get(path)?.0 {
+            Content::Bytes(bytes) => Some(blake3::hash(bytes).to_hex().to_string()),
+            Content::Copy(_) => None,
+        }
     }
 
     /// A float32 map (row-major, width and height in `size`) as NumPy file.

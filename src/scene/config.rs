@@ -25,6 +25,8 @@ pub struct Config {
     pub priors: bool,
     /// Take the object's shadow out of the photographs, where `prepare` has found it (`relight/`).
     pub relight: bool,
+    /// Train the other views on their holes as `prepare` has filled them (`hole/`), instead of on nothing there (GScream: off).
+    pub fill_holes: bool,
     /// Use the inpainted reference view.
     pub reference: bool,
     /// Length of the model's that counts as one wherever a setting means a length; 0 takes a third of the median depth of
@@ -122,6 +124,7 @@ impl Default for Config {
             masks: true,
             priors: true,
             relight: true,
+            fill_holes: true,
             reference: true,
             unit: 0.0,
             even_exposures: true,

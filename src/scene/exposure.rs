@@ -212,9 +212,9 @@ fn most_common(values: &mut [f64]) -> Option<[f64; 2]> {
     enough.then(|| [values[from], values[to - 1]])
 }
 
-/// Divides the gains out of the train photographs and of the pictures painted over them, where the photographs differ by
+/// Divides the gains out of the train photographs and of the pictures that were filled in for them, where the photographs differ by
 /// more than their ratios are exact. Test photographs stay as they are. The gains are in [`Scene::gains`] afterwards.
-pub(super) fn even_out(scene: &mut Scene) {
+pub(crate) fn even_out(scene: &mut Scene) {
     let found = exposures(scene);
     let known: Vec<[f64; 3]> = found.iter().flatten().map(|exposure| exposure.channels.map(f64::ln)).collect();
     if known.is_empty() || (known.len() as f64) < LEAST_KNOWN * found.len() as f64 {
@@ -233,7 +233,8 @@ pub(super) fn even_out(scene: &mut Scene) {
     let gains: Vec<[f64; 3]> = found.iter().map(gain).collect();
     let views = scene.train.iter_mut().map(|view| &mut view.image).zip(&gains);
     let painted = scene.references.iter_mut().map(|reference| (&mut reference.image, &gains[reference.view]));
-    for (image, gain) in views.chain(painted) {
+    let filled = scene.holes.iter_mut().map(|hole| (&mut hole.image, &gains[hole.view]));
+    for (image, gain) in views.chain(painted).chain(filled) {
         let table: [[u8; 256]; 3] = gain.map(|gain| std::array::from_fn(|value| (value as f64 / gain).round() as u8));
         image.pixels_mut().for_each(|pixel| pixel.0 = std::array::from_fn(|c| table[c][usize::from(pixel.0[c])]));
     }

@@ -28,6 +28,8 @@ pub(super) struct Entry {
     pub depth: Option<PathBuf>,
     /// What the object's shadow leaves of the light, of train views.
     pub relight: Option<PathBuf>,
+    /// Its hole filled, see [`super::HOLE`].
+    pub hole: Option<PathBuf>,
 }
 
 /// The inpainted picture of one train view.
@@ -122,7 +124,11 @@ fn plain(scene: &Path) -> Result<Layout, Error> {
     let depths = index("test_depth", &priors::EXTENSIONS)?;
     test.iter_mut().for_each(|entry| entry.depth = depths.get(&entry.name).cloned());
     let relight = index(super::RELIGHT, &["png"])?;
-    train.iter_mut().for_each(|entry| entry.relight = relight.get(&entry.name).cloned());
+    let holes = index(super::HOLE, &["png"])?;
+    for entry in &mut train {
+        entry.relight = relight.get(&entry.name).cloned();
+        entry.hole = holes.get(&entry.name).cloned();
+    }
     let mut notes = misspelt(scene)?;
     notes.append(&mut passed_over);
     let of_test =
@@ -383,6 +389,7 @@ fn entries(
             prior: prior(name),
             depth: None,
             relight: None,
+            hole: None,
         })
         .collect()
 }

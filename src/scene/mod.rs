@@ -13,6 +13,7 @@
 //! SCENE/test_images/, SCENE/test_masks/     views without the object, and where the object stood
 //! SCENE/test_depth/NAME.npy|exr|png         true depth z of these, not positive where it is unknown
 //! SCENE/relight/NAME.png                    what the object's shadow leaves of the light, of 255, see `prepare`
+//! SCENE/hole/NAME.png                       the holes of the other views filled, alpha 255 in the hole, see `prepare`
 //! SCENE/sparse/0/                           COLMAP model with poses of all of these
 //! ```
 //!
@@ -27,6 +28,7 @@ mod config;
 pub mod doctor;
 mod error;
 mod exposure;
+mod hole;
 mod layout;
 mod note;
 mod npy;
@@ -52,6 +54,8 @@ pub(crate) use condition::{on_object, samples};
 pub use config::Config;
 use config::{NO_PRIOR, STEREO_PRIOR};
 pub use error::Error;
+pub(crate) use exposure::even_out;
+pub use hole::{HOLE, Hole, MADE_WITH};
 pub(crate) use layout::{PICTURES, stem};
 pub use note::{Note, Notes};
 pub use picture::{decode, dimensions, object_mask};
@@ -113,6 +117,8 @@ pub struct Scene {
     pub test: Vec<View>,
     /// The inpainted views, sorted by [`Reference::view`]: one in most scenes, none where there is no hole to fill.
     pub references: Vec<Reference>,
+    /// The other train views whose holes are filled, sorted by [`Hole::view`].
+    pub holes: Vec<Hole>,
     /// Points of the sparse model; at least one.
     pub points: Vec<Point>,
     /// Points that the photographs add to these, see [`multiview`](crate::multiview): anchors start there, too, and nothing
@@ -314,6 +320,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     }
     let mut references = read_references;
     references.sort_by_key(|r| r.view);
+    let holes = read_holes(dir, config, (&mut train, &train_files), &references, &mut notes)?;
     summarise(&train, &test, &references, points.len(), config, &mut notes);
     let radius = radius(&train);
     if radius.is_none() {
@@ -323,6 +330,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
         train,
         test,
         references,
+        holes,
         points,
         dense: vec![],
         radius: radius.unwrap_or(1.0),
@@ -343,6 +351,11 @@ impl Scene {
     /// The inpainted picture of this train view, if it has one.
     pub fn reference_of(&self, view: usize) -> Option<&Reference> {
         self.references.iter().find(|r| r.view == view)
+    }
+
+    /// The picture of this train view with its hole filled, if it has one and is no reference.
+    pub fn hole_of(&self, view: usize) -> Option<&Hole> {
+        self.holes.iter().find(|hole| hole.view == view)
     }
 
     /// The points that anchors start at.
@@ -691,6 +704,46 @@ impl Reader<'_> {
     }
 }
 
+/// Reads the filled holes, where they go with the reference that is there. The masks become those of what was filled, the
+/// references' too: a hole is a little larger than the object. Returns those of the views that are no references.
+fn read_holes(
+    dir: &Path,
+    config: &Config,
+    (train, files): (&mut [View], &[layout::Entry]),
+    references: &[Reference],
+    notes: &mut Notes,
+) -> Result<Vec<Hole>, Error> {
+    let filled = train
+        .iter()
+        .zip(files)
+        .enumerate()
+        .filter_map(|(at, (view, entry))| Some((at, view, entry.hole.as_ref().filter(|_| view.mask.is_some())?)));
+    let filled: Vec<(usize, &View, &PathBuf)> = filled.collect();
+    if filled.is_empty() {
+        return Ok(vec![]);
+    }
+    if !(config.masks && config.reference && config.fill_holes) {
+        notes.push(format!("{HOLE}/ is ignored, as configured: the other views' holes are not trained on"));
+        return Ok(vec![]);
+    }
+    if !config.truth_reference.is_empty() || !config.reference_file.is_empty() || !hole::are_current(dir) {
+        notes.push(format!(
+            "{HOLE}/ is not used: it was filled with another reference picture; prepare --only reference fills it anew"
+        ));
+        return Ok(vec![]);
+    }
+    let read = |(at, view, path): &(usize, &View, &PathBuf)| hole::read(path, *at, view);
+    let holes: Vec<Result<Hole, Error>> = filled.par_iter().map(read).collect();
+    let mut holes = holes.into_iter().collect::<Result<Vec<_>, Error>>()?;
+    for hole in &holes {
+        let mask = train[hole.view].mask.as_mut().expect("views without a mask were left out");
+        mask.iter_mut().zip(hole.filled.as_raw()).for_each(|(mask, filled)| *mask = (*mask).max(*filled));
+    }
+    holes.retain(|hole| !references.iter().any(|r| r.view == hole.view));
+    notes.push(format!("the holes of {} more views are filled ({HOLE}/)", holes.len()));
+    Ok(holes)
+}
+
 /// A size with each side divided by `by`, rounded to the nearest pixel and never 0.
 pub(crate) fn reduced(size: [u32; 2], by: u32) -> [u32; 2] {
     size.map(|side| ((u64::from(side) + u64::from(by) / 2) / u64::from(by)).max(1) as u32)
@@ -742,6 +795,15 @@ pub(crate) fn photograph(path: &Path, downscale: u32) -> Result<RgbImage, Error>
     let image = decode(path)?.into_rgb8();
     let size = reduced(image.dimensions().into(), downscale);
     Ok(if downscale == 1 { image } else { resample::photograph(&image, size) })
+}
+
+/// A picture whose longer side is at most `side` pixels, reduced as [`load`] reduces photographs.
+pub(crate) fn photograph_within(path: &Path, side: u32) -> Result<RgbImage, Error> {
+    let image = decode(path)?.into_rgb8();
+    let longer = f64::from(image.width().max(image.height()));
+    let size = [image.width(), image.height()];
+    let scale = (f64::from(side) / longer).min(1.0);
+    Ok(resample::photograph(&image, size.map(|n| ((f64::from(n) * scale).round() as u32).max(1))))
 }
 
 /// A mask at 1 / `downscale` of its size, reduced as [`load`] reduces masks: 255 inside, 0 elsewhere.

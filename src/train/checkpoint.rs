@@ -412,6 +412,10 @@ impl Fingerprint {
             hash_prior(&mut hasher, reference.prior.as_ref());
             parts.push((format!("reference picture of {}", scene.train[reference.view].name), hex(hasher)));
         }
+        for hole in &scene.holes {
+            let hash = blake3::hash(hole.image.as_raw());
+            parts.push((format!("filled hole of {}", scene.train[hole.view].name), hash.to_hex().to_string()));
+        }
         let mut hasher = blake3::Hasher::new();
         hasher.update(&scene.radius.to_le_bytes());
         for point in &scene.points {

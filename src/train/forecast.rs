@@ -25,7 +25,7 @@ use crate::model::learnt::Learnt;
 use crate::primitives::limit::{Counter, Limits};
 use crate::render::Method;
 use crate::render::forward::{self, Capacity, Forward, Model};
-use crate::scene::{Camera, Notes, Prior, Reference, Scene, View};
+use crate::scene::{Camera, Hole, Notes, Prior, Reference, Scene, View};
 use crate::stage;
 
 /// Why there is no forecast.
@@ -474,10 +474,15 @@ fn resized(scene: &Scene, from: u32, to: u32) -> Scene {
         let prior = r.prior.as_ref().map(|p| blank(p, size));
         Reference { view: r.view, image: RgbImage::new(w, h), prior, truth: r.truth }
     });
+    let holes = scene.holes.iter().map(|hole| {
+        let [w, h] = scaled([hole.image.width(), hole.image.height()]);
+        Hole { view: hole.view, image: RgbImage::new(w, h), filled: GrayImage::new(w, h) }
+    });
     Scene {
         train: scene.train.iter().map(view).collect(),
         test: scene.test.iter().map(view).collect(),
         references: references.collect(),
+        holes: holes.collect(),
         points: scene.points.clone(),
         dense: scene.dense.clone(),
         gains: scene.gains.clone(),

@@ -65,7 +65,8 @@ pub fn upload(gpu: &Gpu, scene: &Scene, plan: &Plan, reduction: u32) -> Result<V
     let mut all = vec![];
     for (i, view) in scene.train.iter().enumerate() {
         let reference = scene.reference_of(i);
-        let picture = reference.map_or(&view.image, |r| &r.image);
+        let hole = scene.hole_of(i);
+        let picture = reference.map(|r| &r.image).or(hole.map(|hole| &hole.image)).unwrap_or(&view.image);
         let prior = match reference {
             Some(r) => r.prior.as_ref(),
             None => view.prior.as_ref(),
@@ -77,6 +78,21 @@ pub fn upload(gpu: &Gpu, scene: &Scene, plan: &Plan, reduction: u32) -> Result<V
         let mask = match view.blend() {
             Some(mask) if smaller => Some(Cow::Owned(resample::largest(mask, size))),
             mask => mask.map(Cow::Borrowed),
+        };
+        let bounds = mask.as_deref().and_then(mask_box);
+        // What was filled is trained on as the photograph is.
+        let mask = match (mask, hole) {
+            (Some(mask), Some(hole)) => {
+                let filled = if smaller {
+                    Cow::Owned(resample::largest(&hole.filled, size))
+                } else {
+                    Cow::Borrowed(&hole.filled)
+                };
+                let mut left = mask.into_owned();
+                left.iter_mut().zip(filled.as_raw()).filter(|(_, f)| **f != 0).for_each(|(m, _)| *m = 0);
+                Some(Cow::Owned(left))
+            }
+            (mask, _) => mask,
         };
         let mask = mask.as_deref();
         let prior = match prior.filter(|_| plan.depth_losses(reference.is_some()).any()) {
@@ -102,7 +118,7 @@ pub fn upload(gpu: &Gpu, scene: &Scene, plan: &Plan, reduction: u32) -> Result<V
             reference: reference.is_some(),
             picture: gpu.stage(stage::PICTURES, || gpu.upload("picture", &words))?,
             prior,
-            mask_box: mask.and_then(mask_box),
+            mask_box: bounds,
         });
     }
     Ok(all)

@@ -165,6 +165,7 @@ impl Load {
         Scene {
             train: vec![view],
             test: vec![],
+            holes: vec![],
             references: vec![Reference { view: 0, image, prior: Some(prior), truth: false }],
             points: vec![crate::scene::Point { position: [0.0, 0.0, 3.0], color: [0; 3] }],
             dense: vec![],

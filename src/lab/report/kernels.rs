@@ -297,6 +297,7 @@ pub(crate) fn choose_views(scene: &Scene, views: usize) -> Scene {
     Scene {
         train: chosen.iter().map(|i| scene.train[*i].clone()).collect(),
         test: vec![],
+        holes: vec![],
         references: scene.references.iter().take(1).map(|r| Reference { view: 0, ..r.clone() }).collect(),
         ..scene.clone()
     }

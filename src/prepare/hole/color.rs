@@ -1,0 +1,266 @@
+//! What the surface behind the object looks like: from photographs where one shows it, from views that are filled already,
+//! else not known.
+//!
+//! For each site of a hole every photograph that shows its point is a source; which one it is taken from is chosen by alpha
+//! expansion, so that large pieces come from one photograph. Colours are looked up at the full resolution, and sources are
+//! blended over one site where they meet.
+
+use glam::DVec3;
+use image::{GrayImage, RgbImage};
+use rayon::prelude::*;
+
+use super::gradient::{self, Equation};
+use super::surface::{SAME, Sight, Sights};
+use crate::prepare::planes;
+use crate::scene::{Camera, resample};
+
+/// Sources that a view's hole is taken from at most.
+const SOURCES: usize = 12;
+/// Cost of a source per radian between its ray and the view's.
+const ANGLE: f64 = 2.0;
+/// Cost of a source for each factor e that its resolution is coarser.
+const COARSER: f64 = 1.0;
+/// Cost of a source whose colour differs from the median of all sources by the whole range in all channels.
+const UNLIKE: f64 = 8.0;
+/// Cost of a site in a source that does not show it.
+const HIDDEN: f64 = 1e3;
+/// Share of a pixel's sites that must have a source for it to be seen.
+const ENOUGH: f32 = 0.5;
+
+/// A photograph that colours are taken from.
+pub struct Photograph<'a> {
+    /// Its camera, at the picture's size.
+    pub camera: Camera,
+    /// What it shows.
+    pub picture: &'a RgbImage,
+    /// The object with a margin, as large as the picture.
+    pub hole: GrayImage,
+}
+
+/// The colours of a view's hole.
+pub struct Filling {
+    /// `[pixel]` RGB, 0 to 1: of the photograph outside the hole.
+    pub rgb: Vec<[f32; 3]>,
+    /// `[pixel]` whether it is in the hole and nothing has told its colour.
+    pub guessed: Vec<bool>,
+    /// `[pixel]` whether a photograph shows it.
+    pub seen: Vec<bool>,
+}
+
+/// Bilinear, 0 to 1; nothing within half a pixel of the border and outside.
+pub fn sample(at: impl Fn(usize, usize) -> [f32; 3], size: [u32; 2], position: [f64; 2]) -> Option<[f32; 3]> {
+    let inside = (0..2).all(|a| position[a] >= 0.5 && position[a] <= f64::from(size[a]) - 0.5);
+    let width = size[0] as usize;
+    let color = |i: usize| at(i % width, i / width).map(f64::from);
+    inside.then(|| resample::bilinear(size, position, color).map(|v| v as f32))
+}
+
+impl Photograph<'_> {
+    /// The colour, 0 to 1, where it shows a point; nothing outside the picture, and where the object is.
+    pub fn color(&self, point: DVec3) -> Option<[f32; 3]> {
+        let pixel = self.camera.project(point.to_array())?;
+        if !(pixel[0] >= 0.5 && pixel[1] >= 0.5) {
+            return None;
+        }
+        let covered = self.hole.get_pixel_checked(pixel[0] as u32, pixel[1] as u32)?.0[0] != 0;
+        let at = |x: usize, y: usize| self.picture.get_pixel(x as u32, y as u32).0.map(|v| f32::from(v) / 255.0);
+        if covered { None } else { sample(at, self.camera.size, pixel) }
+    }
+}
+
+fn mean_focal(sight: &Sight) -> f64 {
+    let [fx, fy] = sight.grid.camera.focal.map(f64::from);
+    (fx * fy).sqrt()
+}
+
+/// `[site]` in and next to a view's hole the photographs that show it and what each costs.
+fn candidates(sights: &Sights, of: usize) -> Vec<Vec<(usize, f64)>> {
+    let own = &sights.0[of];
+    let eye = DVec3::from(own.grid.camera.center());
+    let one = |site: usize| -> Vec<(usize, f64)> {
+        if !own.near_hole(site) || !own.depth[site].is_finite() {
+            return vec![];
+        }
+        let point = own.point(site, own.depth[site]);
+        let (to, distance) = ((point - eye).normalize(), point.distance(eye));
+        let mut found: Vec<(usize, f64, [u8; 3])> = vec![];
+        for (view, sight) in sights.0.iter().enumerate().filter(|(view, sight)| *view != of && sight.grid.trusted) {
+            let Some((there, z)) = sight.see(point) else { continue };
+            let agrees = (sight.depth[there] / z - 1.0).abs() <= 1.5 * SAME;
+            if sight.hole[there] || !agrees {
+                continue;
+            }
+            let from = DVec3::from(sight.grid.camera.center());
+            let angle = to.dot((point - from).normalize()).clamp(-1.0, 1.0).acos();
+            let finer = (mean_focal(sight) * distance / (mean_focal(own) * point.distance(from))).ln();
+            found.push((view, ANGLE * angle + COARSER * (-finer).max(0.0), sight.grid.colors[there]));
+        }
+        let middle: [f64; 3] = std::array::from_fn(|c| {
+            let mut values: Vec<u8> = found.iter().map(|(_, _, color)| color[c]).collect();
+            values.sort_unstable();
+            values.get(values.len() / 2).map_or(0.0, |v| f64::from(*v))
+        });
+        let unlike = |color: &[u8; 3]| (0..3).map(|c| (f64::from(color[c]) - middle[c]).abs()).sum::<f64>() / 765.0;
+        found.iter().map(|(view, cost, color)| (*view, cost + UNLIKE * unlike(color))).collect()
+    };
+    (0..own.hole.len()).into_par_iter().map(one).collect()
+}
+
+/// `[site]` in and next to a view's hole the photograph that it is taken from.
+fn sources(sights: &Sights, of: usize) -> Vec<Option<usize>> {
+    let own = &sights.0[of];
+    let candidates = candidates(sights, of);
+    // Greedily: each next source is the one that makes the sum of the cheapest costs the least.
+    let mut chosen: Vec<usize> = vec![];
+    let mut best: Vec<f64> = candidates.iter().map(|c| if c.is_empty() { 0.0 } else { 10.0 }).collect();
+    while chosen.len() < SOURCES {
+        let mut gain = vec![0.0; sights.0.len()];
+        for (candidates, best) in candidates.iter().zip(&best) {
+            candidates.iter().for_each(|(view, cost)| gain[*view] += (best - cost).max(0.0));
+        }
+        let next = (0..gain.len()).max_by(|a, b| gain[*a].total_cmp(&gain[*b]).then(b.cmp(a)));
+        let Some(next) = next.filter(|next| gain[*next] > 0.0) else { break };
+        for (candidates, best) in candidates.iter().zip(&mut best) {
+            candidates.iter().filter(|(view, _)| *view == next).for_each(|(_, cost)| *best = best.min(*cost));
+        }
+        chosen.push(next);
+    }
+    // The last label is for what nobody shows.
+    let none = chosen.len();
+    let cost = |label: usize, site: usize| -> f64 {
+        let shown: Vec<&(usize, f64)> = candidates[site].iter().filter(|(view, _)| chosen.contains(view)).collect();
+        match (own.near_hole(site), label == none, shown.is_empty()) {
+            (false, ..) | (true, true, true) => 0.0,
+            (true, true, false) | (true, false, true) => HIDDEN,
+            (true, false, false) => {
+                shown.iter().find(|(view, _)| *view == chosen[label]).map_or(HIDDEN, |(_, cost)| *cost)
+            }
+        }
+    };
+    let sites = own.hole.len();
+    let costs: Vec<Vec<f64>> = (0..=none).map(|label| (0..sites).map(|site| cost(label, site)).collect()).collect();
+    let size = [own.grid.columns as usize, own.grid.rows as usize];
+    let labels = planes::cheapest(&costs, |_, _| SEAM, size);
+    (0..sites).map(|site| chosen.get(labels[site]).copied().filter(|_| costs[labels[site]][site] < HIDDEN)).collect()
+}
+
+/// Cost of a seam between two sources, per site of its length.
+const SEAM: f64 = 0.15;
+
+/// What photographs, and views that were filled before, tell of the colours of a view's hole.
+pub fn gather(sights: &Sights, photographs: &[Photograph<'_>], filled: &[Option<Vec<[f32; 3]>>], of: usize) -> Filling {
+    let (own, sight) = (&photographs[of], &sights.0[of]);
+    let [w, h] = own.camera.size.map(|n| n as usize);
+    let sources = sources(sights, of);
+    let painted: Vec<usize> = (0..filled.len()).filter(|view| *view != of && filled[*view].is_some()).collect();
+    // A pixel's place in sites, and the world point that it shows without the object.
+    let shown = |i: usize| -> Option<([f64; 2], DVec3)> {
+        let ray = own.camera.unproject([(i % w) as f64 + 0.5, (i / w) as f64 + 0.5])?;
+        let place = sight.grid.place(ray);
+        let z = sight.depth_at(place);
+        z.is_finite().then(|| (place, DVec3::from(own.camera.along(ray, z))))
+    };
+    let photographed = |i: usize| -> Vec<Shown> {
+        let mut found: Vec<Shown> = vec![];
+        let Some((place, point)) = shown(i) else { return found };
+        let [x, y] = place.map(|v| v - 0.5);
+        for (dx, dy) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
+            let (u, v) = (x.floor() + f64::from(dx), y.floor() + f64::from(dy));
+            let Some(source) = sight.grid.site(u as i64, v as i64).and_then(|site| sources[site]) else { continue };
+            let weight = ((1.0 - (x - u).abs()) * (1.0 - (y - v).abs())) as f32;
+            match found.iter_mut().find(|shown| shown.source == source) {
+                Some(shown) => shown.weight += weight,
+                None => found.extend(photographs[source].color(point).map(|color| Shown { source, weight, color })),
+            }
+        }
+        if found.iter().map(|shown| shown.weight).sum::<f32>() < ENOUGH {
+            found.clear();
+        }
+        found
+    };
+    let repainted = |i: usize| -> Option<[f32; 3]> {
+        let (_, point) = shown(i)?;
+        painted.iter().find_map(|view| {
+            let (other, there) = (&photographs[*view], &sights.0[*view]);
+            let [a, b, c] = there.grid.camera.to_camera(point.to_array());
+            let place = (c > 0.0).then(|| there.grid.place([a / c, b / c]))?;
+            let agrees = (there.depth_at(place) / c - 1.0).abs() <= SAME;
+            let pixel = other.camera.project(point.to_array()).filter(|_| agrees)?;
+            // Beside its hole it is a photograph, which has been asked.
+            other.hole.get_pixel_checked(pixel[0].max(0.0) as u32, pixel[1].max(0.0) as u32).filter(|p| p.0[0] != 0)?;
+            let rgb = filled[*view].as_ref()?;
+            let width = other.camera.size[0] as usize;
+            sample(|x, y| rgb[y * width + x], other.camera.size, pixel)
+        })
+    };
+    let hole = |i: usize| own.hole.as_raw()[i] != 0;
+    let ring = resample::dilate(&own.hole, RING);
+    let colors: Vec<Vec<Shown>> =
+        (0..w * h).into_par_iter().map(|i| if ring.as_raw()[i] != 0 { photographed(i) } else { vec![] }).collect();
+    let mut filling = Filling {
+        rgb: own.picture.pixels().map(|p| p.0.map(|v| f32::from(v) / 255.0)).collect(),
+        guessed: own.hole.as_raw().iter().map(|v| *v != 0).collect(),
+        seen: vec![false; w * h],
+    };
+    let inside: Vec<usize> = (0..w * h).filter(|i| hole(*i) && !colors[*i].is_empty()).collect();
+    let mixed: Vec<[f32; 3]> = colors.par_iter().map(|shown| mean(shown)).collect();
+    // Beside the hole a photograph differs from the others in brightness alone, or shows something else.
+    let alike = |i: usize| !colors[i].is_empty() && (0..3).all(|c| (filling.rgb[i][c] - mixed[i][c]).abs() <= BRIGHTER);
+    let equation = |i: usize| {
+        let mut equation = Equation::new(i);
+        let (x, y) = (i % w, i / w);
+        let near =
+            [(x > 0).then(|| i - 1), (x + 1 < w).then(|| i + 1), (y > 0).then(|| i - w), (y + 1 < h).then(|| i + w)];
+        for j in near.into_iter().flatten().filter(|j| if hole(*j) { !colors[*j].is_empty() } else { alike(*j) }) {
+            equation.add(j, difference(&colors[i], &colors[j]));
+        }
+        equation
+    };
+    let equations: Vec<Equation> = inside.par_iter().map(|i| equation(*i)).collect();
+    for i in inside {
+        filling.rgb[i] = mixed[i];
+        (filling.guessed[i], filling.seen[i]) = (false, true);
+    }
+    gradient::solve(&mut filling.rgb, &equations);
+    let told: Vec<Option<[f32; 3]>> =
+        (0..w * h).into_par_iter().map(|i| if filling.guessed[i] { repainted(i) } else { None }).collect();
+    for (i, color) in told.into_iter().enumerate() {
+        if let Some(color) = color {
+            filling.rgb[i] = color;
+            filling.guessed[i] = false;
+        }
+    }
+    filling
+}
+
+/// What a photograph shows of a pixel's point.
+struct Shown {
+    source: usize,
+    weight: f32,
+    color: [f32; 3],
+}
+
+/// The colour that photographs show, by their weights.
+fn mean(shown: &[Shown]) -> [f32; 3] {
+    let total: f32 = shown.iter().map(|shown| shown.weight).sum();
+    std::array::from_fn(|c| shown.iter().map(|shown| shown.weight * shown.color[c]).sum::<f32>() / total.max(1e-9))
+}
+
+/// By how much one pixel's colour is above another's: in the photographs that show both, else between those that show one.
+fn difference(one: &[Shown], other: &[Shown]) -> [f32; 3] {
+    let both = || {
+        let pairs = one.iter().flat_map(|a| other.iter().map(move |b| (a, b)));
+        pairs.filter(|(a, b)| a.source == b.source).map(|(a, b)| (a.weight + b.weight, a.color, b.color))
+    };
+    let total: f32 = both().map(|(weight, ..)| weight).sum();
+    if total == 0.0 {
+        let (one, other) = (mean(one), mean(other));
+        return std::array::from_fn(|c| one[c] - other[c]);
+    }
+    std::array::from_fn(|c| both().map(|(weight, a, b)| weight * (a[c] - b[c])).sum::<f32>() / total)
+}
+
+/// Pixels around a hole in which what other photographs show is compared with the view's own.
+const RING: u32 = 2;
+/// Differences beyond this are of something else than brightness.
+const BRIGHTER: f32 = 0.12;

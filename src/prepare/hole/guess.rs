@@ -1,0 +1,260 @@
+//! What no photograph shows: pieces of the same surface.
+//!
+//! A plane is brought into a chart, as if seen straight on, so that what repeats on it repeats at one distance and straight
+//! lines meet; what all views show of the plane is in the chart. What lies on no plane is filled in the picture itself.
+
+use glam::{DVec2, DVec3};
+use rayon::prelude::*;
+
+use super::color::{Filling, Photograph, sample};
+use super::surface::{SAME, Sights};
+use super::texture::{self, Texture};
+use crate::prepare::planes::{Plane, membrane};
+
+/// Longer side of a chart at most, pixels.
+const CHART: f64 = 640.0;
+/// Least margin of a chart around what is to be filled, pixels.
+const MARGIN: f64 = 48.0;
+/// A chart ends where the plane is this many times as far as in the middle of what is to be filled.
+const FARTHEST: f64 = 4.0;
+/// Other views that a chart is filled from.
+const OTHERS: usize = 6;
+
+/// A plane seen straight on. Lengths are in the view's camera coordinates.
+pub struct Chart {
+    normal: DVec3,
+    /// Across and down.
+    axes: [DVec3; 2],
+    /// Distance of the plane from the camera.
+    distance: f64,
+    /// Of the chart's upper left corner along the axes.
+    origin: DVec2,
+    /// Length of a pixel.
+    pub scale: f64,
+    /// Depth z of the plane in the middle of what the chart is around.
+    pub middle: f64,
+    /// Width and height in pixels.
+    pub size: [usize; 2],
+}
+
+impl Chart {
+    /// Of a plane `a x/z + b y/z + c = 1/z`, around what these rays meet there and `margin` times as much on each side, as
+    /// fine as a picture of this focal length shows its middle.
+    pub fn new([a, b, c]: Plane, rays: &[[f64; 2]], focal: f64, margin: f64) -> Option<Self> {
+        let plane = DVec3::new(a, b, c);
+        let (normal, distance) = (plane.normalize(), 1.0 / plane.length());
+        let across = (DVec3::X - normal * normal.x).try_normalize()?;
+        let axes = [across, normal.cross(across)];
+        let mut chart = Self { normal, axes, distance, origin: DVec2::ZERO, scale: 1.0, middle: 0.0, size: [0; 2] };
+        let places: Vec<(DVec2, f64)> = rays.iter().filter_map(|ray| chart.place(*ray)).collect();
+        let mut depths: Vec<f64> = places.iter().map(|(_, z)| *z).collect();
+        depths.sort_unstable_by(f64::total_cmp);
+        let middle = *depths.get(depths.len() / 2)?;
+        let near = places.iter().filter(|(_, z)| *z < FARTHEST * middle).map(|(place, _)| *place);
+        let (low, high) = near.fold((DVec2::MAX, DVec2::MIN), |(low, high), place| (low.min(place), high.max(place)));
+        (chart.scale, chart.middle) = (middle / focal, middle);
+        let margin = (margin * (high - low).max_element()).max(MARGIN * chart.scale);
+        let extent = high - low + 2.0 * margin;
+        chart.scale = chart.scale.max(extent.max_element() / CHART);
+        chart.origin = low - margin;
+        chart.size = [extent.x, extent.y].map(|v| (v / chart.scale).ceil().max(1.0) as usize);
+        Some(chart)
+    }
+
+    /// Where a ray meets the plane, along the axes, and its depth z.
+    fn place(&self, [x, y]: [f64; 2]) -> Option<(DVec2, f64)> {
+        let ray = DVec3::new(x, y, 1.0);
+        let z = self.distance / self.normal.dot(ray);
+        let point = ray * z;
+        (z > 0.0 && z.is_finite()).then(|| (DVec2::new(point.dot(self.axes[0]), point.dot(self.axes[1])), z))
+    }
+
+    /// The chart's pixel position that a ray meets.
+    pub fn pixel(&self, ray: [f64; 2]) -> Option<[f64; 2]> {
+        let (place, _) = self.place(ray)?;
+        Some(((place - self.origin) / self.scale).to_array())
+    }
+
+    /// Camera coordinates of a pixel's centre.
+    pub fn point(&self, i: usize) -> DVec3 {
+        let at = DVec2::new((i % self.size[0]) as f64 + 0.5, (i / self.size[0]) as f64 + 0.5);
+        let place = self.origin + at * self.scale;
+        self.normal * self.distance + self.axes[0] * place.x + self.axes[1] * place.y
+    }
+}
+
+/// Fills what nothing tells of a view's hole.
+pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling: &mut Filling) {
+    let (own, sight) = (&photographs[of], &sights.0[of]);
+    let [w, h] = own.camera.size.map(|n| n as usize);
+    let guessed: Vec<usize> = (0..w * h).filter(|i| filling.guessed[*i]).collect();
+    if guessed.is_empty() {
+        return;
+    }
+    // A few pixels between known ones need no texture.
+    let hole = own.hole.as_raw().iter().filter(|v| **v != 0).count();
+    if guessed.len() as f64 <= SLIVER * hole as f64 {
+        return smooth(filling, [w, h]);
+    }
+    let ray = |i: usize| own.camera.unproject([(i % w) as f64 + 0.5, (i / w) as f64 + 0.5]);
+    let surface = |i: usize| ray(i).map(|ray| sight.surface_at(sight.grid.place(ray)));
+    let focal = f64::from(own.camera.focal[0].max(own.camera.focal[1]));
+    for (number, plane) in sight.planes.iter().enumerate() {
+        let on_it: Vec<(usize, [f64; 2])> = (guessed.par_iter())
+            .filter(|i| filling.guessed[**i] && surface(**i) == Some(number as u8))
+            .filter_map(|i| Some((*i, ray(*i)?)))
+            .collect();
+        let rays: Vec<[f64; 2]> = on_it.iter().map(|(_, ray)| *ray).collect();
+        let Some(chart) = Chart::new(*plane, &rays, focal, 1.0) else { continue };
+        let mut texture = charted(sights, photographs, of, filling, &chart, number as u8);
+        let wanted = texture.hole.clone();
+        if !texture::fill(&mut texture) {
+            continue;
+        }
+        for (i, ray) in on_it {
+            let color = chart.pixel(ray).and_then(|at| texel(&texture, &wanted, at));
+            if let Some(color) = color {
+                filling.rgb[i] = color;
+                filling.guessed[i] = false;
+            }
+        }
+    }
+    in_picture(filling, [w, h], |i| surface(i).unwrap_or(0));
+    // A picture that is nearly all hole has nothing to copy.
+    if filling.guessed.contains(&true) {
+        smooth(filling, [w, h]);
+    }
+}
+
+/// Part of a hole that is so little that it is filled smoothly.
+const SLIVER: f64 = 0.01;
+
+/// Goes on smoothly with the colours around what nothing tells.
+fn smooth(filling: &mut Filling, size: [usize; 2]) {
+    for c in 0..3 {
+        let value = |(rgb, guessed): (&[f32; 3], &bool)| if *guessed { f32::NAN } else { rgb[c] };
+        let mut channel: Vec<f32> = filling.rgb.iter().zip(&filling.guessed).map(value).collect();
+        membrane(&mut channel, size, |i| filling.guessed[i]);
+        filling.rgb.iter_mut().zip(channel).for_each(|(rgb, v)| rgb[c] = if v.is_finite() { v } else { 0.5 });
+    }
+    filling.guessed.fill(false);
+}
+
+/// The colour at a place of a chart: linear between the texels that have one; nothing where the nearest has none.
+fn texel(texture: &Texture, wanted: &[bool], [x, y]: [f64; 2]) -> Option<[f32; 3]> {
+    let [w, h] = texture.size;
+    let at = |x: f64, y: f64| {
+        let inside = x >= 0.0 && y >= 0.0 && (x as usize) < w && (y as usize) < h;
+        let i = inside.then(|| y as usize * w + x as usize)?;
+        (texture.source[i] || wanted[i] && !texture.hole[i]).then(|| texture.rgb[i])
+    };
+    at(x, y)?;
+    let (mut sum, mut total) = ([0f32; 3], 0f32);
+    for (dx, dy) in [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)] {
+        let (u, v) = ((x - 0.5).floor() + dx, (y - 0.5).floor() + dy);
+        let Some(color) = at(u, v) else { continue };
+        let weight = ((1.0 - (x - 0.5 - u).abs()) * (1.0 - (y - 0.5 - v).abs())) as f32;
+        (0..3).for_each(|c| sum[c] += weight * color[c]);
+        total += weight;
+    }
+    (total > 0.0).then(|| sum.map(|v| v / total))
+}
+
+/// What is known of a plane, on its chart; the hole is what is to be filled there.
+fn charted(
+    sights: &Sights,
+    photographs: &[Photograph<'_>],
+    of: usize,
+    filling: &Filling,
+    chart: &Chart,
+    number: u8,
+) -> Texture {
+    let (own, sight) = (&photographs[of], &sights.0[of]);
+    let size @ [w, _] = own.camera.size.map(|n| n as usize);
+    // The views with the most of the surroundings: those that look most alike.
+    let axis = |k: usize| DVec3::from(photographs[k].camera.rotation[2].map(f64::from));
+    let mut others: Vec<usize> = (0..photographs.len()).filter(|k| *k != of && sights.0[*k].grid.trusted).collect();
+    others.sort_by(|a, b| axis(*b).dot(axis(of)).total_cmp(&axis(*a).dot(axis(of))));
+    others.truncate(OTHERS);
+    enum Texel {
+        Known([f32; 3]),
+        Hole,
+        Nothing,
+    }
+    let one = |i: usize| -> Texel {
+        let point = chart.point(i);
+        if point.z <= 0.0 {
+            return Texel::Nothing;
+        }
+        let ray = [point.x / point.z, point.y / point.z];
+        let world = DVec3::from(own.camera.along(ray, point.z));
+        if let Some([x, y]) = own.camera.project(world.to_array()) {
+            let inside = x >= 0.0 && y >= 0.0 && (x as usize) < size[0] && (y as usize) < size[1];
+            if inside && sight.surface_at(sight.grid.place(ray)) == number {
+                let pixel = y as usize * w + x as usize;
+                if filling.guessed[pixel] {
+                    return Texel::Hole;
+                }
+                let z = sight.depth_at(sight.grid.place(ray));
+                if (z / point.z - 1.0).abs() <= SAME {
+                    let color = sample(|x, y| filling.rgb[y * w + x], own.camera.size, [x, y]);
+                    return color.map_or(Texel::Nothing, Texel::Known);
+                }
+            }
+        }
+        let seen = others.iter().find_map(|k| {
+            let (site, z) = sights.0[*k].see(world)?;
+            let there = &sights.0[*k];
+            let agrees = !there.hole[site] && (there.depth[site] / z - 1.0).abs() <= SAME;
+            agrees.then(|| photographs[*k].color(world)).flatten()
+        });
+        seen.map_or(Texel::Nothing, Texel::Known)
+    };
+    let texels: Vec<Texel> = (0..chart.size[0] * chart.size[1]).into_par_iter().map(one).collect();
+    Texture {
+        size: chart.size,
+        rgb: texels.iter().map(|t| if let Texel::Known(color) = t { *color } else { [0.0; 3] }).collect(),
+        hole: texels.iter().map(|t| matches!(t, Texel::Hole)).collect(),
+        source: texels.iter().map(|t| matches!(t, Texel::Known(_))).collect(),
+    }
+}
+
+/// Fills what is left in the picture itself, from the same surface, else from any.
+fn in_picture(filling: &mut Filling, size: [usize; 2], surface: impl Fn(usize) -> u8 + Sync) {
+    for same in [true, false] {
+        let left: Vec<usize> = (0..filling.guessed.len()).filter(|i| filling.guessed[*i]).collect();
+        let mut labels: Vec<u8> = left.iter().map(|i| if same { surface(*i) } else { 0 }).collect();
+        labels.sort_unstable();
+        labels.dedup();
+        for label in labels {
+            let of: Vec<usize> = left.iter().copied().filter(|i| !same || surface(*i) == label).collect();
+            let (cells, [cw, ch]) = surroundings(&of, size);
+            let mut wanted = vec![false; filling.guessed.len()];
+            of.iter().for_each(|i| wanted[*i] = true);
+            let source = |i: &usize| !filling.guessed[*i] && (!same || surface(*i) == label);
+            let mut texture = Texture {
+                size: [cw, ch],
+                rgb: cells.iter().map(|i| filling.rgb[*i]).collect(),
+                hole: cells.iter().map(|i| wanted[*i]).collect(),
+                source: cells.par_iter().map(source).collect(),
+            };
+            if texture::fill(&mut texture) {
+                for (cell, i) in cells.iter().enumerate().filter(|(cell, i)| wanted[**i] && !texture.hole[*cell]) {
+                    filling.rgb[*i] = texture.rgb[cell];
+                    filling.guessed[*i] = false;
+                }
+            }
+        }
+    }
+}
+
+/// The box of some pixels and as much again on each side: its pixels, width and height.
+fn surroundings(of: &[usize], [w, h]: [usize; 2]) -> (Vec<usize>, [usize; 2]) {
+    let bounds = |f: &dyn Fn(usize) -> usize, end: usize| {
+        let (low, high) = of.iter().fold((end, 0), |(low, high), i| (low.min(f(*i)), high.max(f(*i) + 1)));
+        let margin = high.saturating_sub(low).max(MARGIN as usize);
+        (low.saturating_sub(margin), (high + margin).min(end))
+    };
+    let ((x0, x1), (y0, y1)) = (bounds(&|i| i % w, w), bounds(&|i| i / w, h));
+    ((y0..y1).flat_map(|y| (x0..x1).map(move |x| y * w + x)).collect(), [x1 - x0, y1 - y0])
+}

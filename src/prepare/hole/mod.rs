@@ -1,0 +1,336 @@
+//! The scene without the object: one surface behind it, filled once, for every view.
+//!
+//! - [`surface`]: the depth of what is behind the object, in all views.
+//! - [`color`]: what photographs show of it, and what views that were filled before show of it.
+//! - [`guess`]: what nobody shows is filled with pieces of the same surface, seen straight on ([`texture`]), or by a network.
+//!
+//! One view is the reference: its picture goes to `reference/`, where a better one may take its place. All other views'
+//! holes are filled from the same surface, into `hole/`.
+
+mod color;
+mod gradient;
+mod guess;
+mod shade;
+mod surface;
+mod texture;
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use image::{GrayImage, Rgb, RgbImage, Rgba, RgbaImage};
+use rayon::prelude::*;
+
+use super::depth;
+use super::network::{self, Inpainting};
+use super::record::Batch;
+use super::{Error, Watch};
+use crate::gpu::Gpu;
+use crate::multiview;
+use crate::scene::{self, Camera, HOLE, MADE_WITH, PriorKind, Scene, resample};
+use color::{Filling, Photograph};
+use surface::{Sight, Sights};
+
+/// The longer side of the photographs that the hole is filled from, pixels; larger ones are reduced, and the filling is
+/// brought to their size.
+pub const SIDE: u32 = 1024;
+/// The object's masks are enlarged by this part of the picture's longer side: carried masks end a little inside the object.
+const MARGIN: f64 = 0.008;
+/// Depth of the object bleeds over its border by this part of the picture's longer side: half a window of the matching.
+const BLEEDING: f64 = 0.03;
+/// A view is taken for the reference only if its hole is at least this part of the largest one.
+const LEAST_HOLE: f64 = 0.4;
+/// Name of the way in which holes are filled: a scene that was filled in another way is filled anew.
+pub const METHOD: &str = "one surface, all views";
+/// Where each pixel of the reference is from, below the scene's folder.
+pub const PROVENANCE: &str = "prepare/provenance.png";
+
+/// What the holes are filled from.
+pub struct Task<'a> {
+    /// The device that depth is measured on.
+    pub gpu: &'a Gpu,
+    /// The scene at the size that depth is measured at.
+    pub scene: &'a Scene,
+    /// The scene at the size that the holes are filled at.
+    pub fine: &'a Scene,
+    /// The scene's folder.
+    pub root: &'a Path,
+    /// `[train view]` masks, as large as the photographs.
+    pub masks: &'a [GrayImage],
+    /// The user's own reference pictures: the hash of each by the index of its train view. They outrank all guesses.
+    pub given: &'a BTreeMap<usize, String>,
+    /// The reference view, where it is named.
+    pub named: Option<&'a str>,
+    /// Whether the soft shadow around the object's foot goes with it.
+    pub shade: bool,
+    /// Whether the reference's depth is written.
+    pub depth: bool,
+    /// What fills the pixels that nobody saw, in place of pieces of the surroundings.
+    pub inpainting: Option<&'a Inpainting>,
+    /// What tells the reference's depth, in place of the surface, and what it tells.
+    pub depth_network: Option<(&'a network::Depth, PriorKind)>,
+    /// Seed of every random choice.
+    pub seed: u64,
+}
+
+/// Where a view's reference picture is, below the scene's folder.
+pub fn reference_path(view: &str) -> String {
+    format!("reference/{view}.png")
+}
+
+/// Masks enlarged by a part of the longer side.
+fn enlarged(masks: &[GrayImage], part: f64) -> Vec<GrayImage> {
+    let radius = |mask: &GrayImage| (part * f64::from(mask.width().max(mask.height()))).ceil() as u32;
+    masks.par_iter().map(|mask| resample::dilate(mask, radius(mask))).collect()
+}
+
+/// Makes the reference picture, its depth if asked for, the filled holes of all other views, and the map of where the
+/// reference's pixels are from.
+///
+/// # Errors
+/// A view without a hole; when the device has no room, or is lost.
+pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
+    let n = task.scene.train.len() as u64;
+    let cameras: Vec<Camera> = task.fine.train.iter().map(|view| view.camera).collect();
+    let mut masks: Vec<GrayImage> =
+        task.masks.par_iter().zip(&cameras).map(|(mask, camera)| resample::mask(mask, camera.size)).collect();
+    let mut matched = task.scene.clone();
+    for (view, mask) in matched.train.iter_mut().zip(task.masks) {
+        view.mask = Some(resample::mask(mask, view.camera.size));
+    }
+    let grids = multiview::depths(task.gpu, &matched)?;
+    watch.turn(n)?;
+    let mut batch = Batch::default();
+    let grown = surface::complete(&grids, &cameras, &mut masks);
+    if let Some(first) = grown.first() {
+        batch.notes.push(format!(
+            "{} of {n} masks end before the object does, by what the other views show of it; there the hole is larger than \
+             the mask (first: {})",
+            grown.len(),
+            task.scene.train[*first].name
+        ));
+    }
+    let wide = enlarged(&masks, BLEEDING);
+    let masks = enlarged(&masks, MARGIN);
+    let with_holes: Vec<usize> = (0..masks.len()).filter(|i| masks[*i].as_raw().iter().any(|v| *v != 0)).collect();
+    if with_holes.is_empty() {
+        return Err(Error::Request(
+            "no view has the object, so that nothing can be removed; are the masks right?".into(),
+        ));
+    }
+    let mut sights = Sights::new(grids, &cameras, &masks, &wide);
+    let of = reference(task, &sights, &with_holes)?;
+    let photographed = |masks: &[GrayImage]| -> Vec<Photograph<'_>> {
+        let views = task.fine.train.iter().zip(masks);
+        views.map(|(view, hole)| Photograph { camera: view.camera, picture: &view.image, hole: hole.clone() }).collect()
+    };
+    let mut photographs = photographed(&masks);
+    let mut masks = masks;
+    if task.shade {
+        sights.solve(of, task.seed);
+        let found = shade::add(&sights, &photographs, of, &mut masks);
+        if found {
+            batch.notes.push(
+                "the soft shadow around the object's foot is taken away with it (--shadow keep: it stays)".into(),
+            );
+            photographs = photographed(&masks);
+        }
+        let grids = sights.0.into_iter().map(|sight| sight.grid).collect();
+        sights = Sights::new(grids, &cameras, &masks, &wide);
+    }
+    let mut filled: Vec<Option<Vec<[f32; 3]>>> = vec![None; photographs.len()];
+    let unsolved = |sights: &Sights, i: usize| {
+        let known = sights.carried(i).iter().filter(|(z, _)| z.is_finite()).count();
+        sights.0[i].hole.iter().filter(|hole| **hole).count() - known
+    };
+    let expected = 1.0 - unsolved(&sights, of) as f64 / sights.0[of].hole.iter().filter(|h| **h).count().max(1) as f64;
+    sights.solve(of, task.seed);
+    // After the reference those that show most of what is still unknown.
+    let mut rest: Vec<(usize, usize)> =
+        with_holes.iter().filter(|i| **i != of).map(|i| (unsolved(&sights, *i), *i)).collect();
+    rest.sort_by(|a, b| b.0.cmp(&a.0).then(a.1.cmp(&b.1)));
+    watch.turn(n + 1)?;
+    // What the user has painted is known to all others.
+    rest.sort_by_key(|(_, i)| !task.given.contains_key(i));
+    for (k, i) in std::iter::once(of).chain(rest.into_iter().map(|(_, i)| i)).enumerate() {
+        if i != of {
+            sights.solve(i, task.seed + i as u64);
+        }
+        let mut filling = color::gather(&sights, &photographs, &filled, i);
+        if task.given.contains_key(&i) {
+            painted(task, i, &photographs[i].hole, &mut filling)?;
+        } else if let Some(network) = task.inpainting {
+            network.fill(&mut filling.rgb, &filling.guessed, cameras[i].size.map(|n| n as usize))?;
+        } else {
+            guess::fill(&sights, &photographs, i, &mut filling);
+        }
+        if i == of {
+            of_reference(task, of, &filling, &photographs[of], &sights, expected, &mut batch)?;
+        }
+        if !task.given.contains_key(&i) {
+            let name = &task.fine.train[i].name;
+            let picture = cut_out(&as_exposed(task, i, &filling.rgb), &photographs[i].hole);
+            batch.rgba(
+                format!("{HOLE}/{name}.png"),
+                &picture,
+                "the surface behind the object, filled once for all views",
+            );
+        }
+        filled[i] = Some(filling.rgb);
+        watch.turn(n + 2 + k as u64)?;
+    }
+    let name = |i: usize| reference_path(&task.scene.train[i].name);
+    let mut made_with: Vec<String> = task.given.iter().map(|(i, hash)| format!("{hash} {}\n", name(*i))).collect();
+    if !task.given.contains_key(&of) {
+        made_with.extend(batch.hash_of(&name(of)).map(|hash| format!("{hash} {}\n", name(of))));
+    }
+    let from = "the reference pictures that the holes were filled with";
+    batch.bytes(format!("{HOLE}/{MADE_WITH}"), made_with.concat().into_bytes(), from);
+    Ok(batch)
+}
+
+/// Takes the hole from the user's own reference picture.
+fn painted(task: &Task<'_>, i: usize, hole: &GrayImage, filling: &mut Filling) -> Result<(), Error> {
+    let picture = scene::photograph(&task.root.join(reference_path(&task.scene.train[i].name)), 1)?;
+    let picture = resample::photograph(&picture, [hole.width(), hole.height()]);
+    let gain = task.fine.gains.get(i).copied().unwrap_or([1.0; 3]);
+    for (pixel, color) in picture.pixels().enumerate().filter(|(pixel, _)| hole.as_raw()[*pixel] != 0) {
+        filling.rgb[pixel] = std::array::from_fn(|c| f32::from(color.0[c]) / 255.0 / gain[c] as f32);
+        (filling.guessed[pixel], filling.seen[pixel]) = (false, false);
+    }
+    Ok(())
+}
+
+/// Colours in a view's own exposure.
+fn as_exposed(task: &Task<'_>, i: usize, rgb: &[[f32; 3]]) -> Vec<[f32; 3]> {
+    let gain = task.fine.gains.get(i).copied().unwrap_or([1.0; 3]);
+    rgb.iter().map(|color| std::array::from_fn(|c| color[c] * gain[c] as f32)).collect()
+}
+
+/// The view whose hole is seen best by others, or the named one.
+fn reference(task: &Task<'_>, sights: &Sights, with_holes: &[usize]) -> Result<usize, Error> {
+    if let Some(name) = task.named {
+        let of = task.scene.train.iter().position(|view| view.name == name).expect("the name was looked up before");
+        if !with_holes.contains(&of) {
+            return Err(Error::Request(format!(
+                "--reference {name}: the object is not in this view; name one that shows it"
+            )));
+        }
+        return Ok(of);
+    }
+    if let Some(of) = task.given.keys().find(|i| with_holes.contains(i)) {
+        return Ok(*of);
+    }
+    let area = |i: usize| sights.0[i].hole.iter().filter(|hole| **hole).count() as f64;
+    let largest = with_holes.iter().map(|i| area(*i)).fold(0.0, f64::max);
+    let seen = |i: usize| sights.carried(i).iter().filter(|(z, _)| z.is_finite()).count() as f64 / area(i).max(1.0);
+    let large = with_holes.iter().copied().filter(|i| sights.0[*i].grid.trusted && area(*i) >= LEAST_HOLE * largest);
+    let best = large.map(|i| (seen(i), i)).reduce(|best, next| if next.0 > best.0 { next } else { best });
+    Ok(best.map_or(with_holes[0], |(_, i)| i))
+}
+
+/// The filled hole as large as its box and a little around it: whole colours, alpha in the hole alone.
+fn cut_out(rgb: &[[f32; 3]], hole: &GrayImage) -> RgbaImage {
+    /// Pixels around the hole whose colours are kept, so that a reduced picture mixes in none that is not there.
+    const KEPT: u32 = 8;
+    let (w, h) = hole.dimensions();
+    let near = resample::dilate(hole, KEPT);
+    RgbaImage::from_fn(w, h, |x, y| {
+        let i = (y * w + x) as usize;
+        if near.as_raw()[i] == 0 {
+            return Rgba([0; 4]);
+        }
+        let [r, g, b] = rgb[i].map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8);
+        Rgba([r, g, b, hole.as_raw()[i]])
+    })
+}
+
+/// The reference's files, notes and figures.
+fn of_reference(
+    task: &Task<'_>,
+    of: usize,
+    filling: &Filling,
+    photograph: &Photograph<'_>,
+    sights: &Sights,
+    expected: f64,
+    batch: &mut Batch,
+) -> Result<(), Error> {
+    let name = &task.fine.train[of].name;
+    let size = photograph.camera.size;
+    let guesser = if task.inpainting.is_some() { "an inpainting network" } else { "the surroundings" };
+    // At the photograph's own size.
+    let files = scene::pictures(&task.root.join(super::poses::IMAGES))?;
+    let mut picture = scene::photograph(&files[name], 1)?;
+    let full = [picture.width(), picture.height()];
+    let bytes = as_exposed(task, of, &filling.rgb);
+    let bytes = bytes.as_flattened().iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+    let filled = RgbImage::from_raw(size[0], size[1], bytes).expect("a colour per pixel");
+    let large = if full == size {
+        filled
+    } else {
+        image::imageops::resize(&filled, full[0], full[1], image::imageops::FilterType::CatmullRom)
+    };
+    let hole = resample::nearest(&photograph.hole, full);
+    let mut provenance = RgbImage::new(full[0], full[1]);
+    let mut counts = [0u64; 2];
+    for (x, y, inside) in hole.enumerate_pixels() {
+        if inside.0[0] == 0 {
+            continue;
+        }
+        picture.put_pixel(x, y, *large.get_pixel(x, y));
+        let [u, v] = [x * size[0] / full[0], y * size[1] / full[1]];
+        let seen = filling.seen[(v * size[0] + u) as usize];
+        provenance.put_pixel(x, y, Rgb(if seen { [40, 170, 70] } else { [230, 60, 40] }));
+        counts[usize::from(!seen)] += 1;
+    }
+    let part = counts[0] as f64 / (counts[0] + counts[1]).max(1) as f64;
+    batch.rgb(
+        reference_path(name),
+        &picture,
+        format!("the photograph; in the hole what other photographs show behind the object, and from {guesser} where none does"),
+    );
+    batch.rgb(
+        PROVENANCE,
+        &provenance,
+        format!(
+            "black: the reference's own photograph; green: seen by others; red: seen by none, guessed from {guesser}"
+        ),
+    );
+    if let Some((network, kind)) = task.depth_network.filter(|_| task.depth) {
+        let (values, size) = depth::proportioned(network.of(&picture)?, full);
+        let from = format!("{}, of the reference picture", network.path().display());
+        batch.npy(format!("reference/{name}_{}.npy", depth::word(kind)), size, values, from);
+    } else if task.depth {
+        let camera = &task.scene.train[of].camera;
+        batch.npy(
+            format!("reference/{name}_depth.npy"),
+            camera.size,
+            known_depth(&sights.0[of], camera),
+            "depth measured between the photographs; in the hole that of the surface behind the object",
+        );
+    }
+    batch.notes.push(format!(
+        "{name} is the reference view: {:.0} % of its hole were seen by others, {:.0} % are guessed",
+        100.0 * part,
+        100.0 * (1.0 - part)
+    ));
+    if part == 0.0 {
+        batch.notes.push(
+            "no other photograph looks behind the object: the whole hole is guessed, and a better picture in reference/ stays"
+                .into(),
+        );
+    }
+    batch.figures = BTreeMap::from([("seen".into(), part), ("expected".into(), expected)]);
+    Ok(())
+}
+
+/// `[pixel]` depth z of a view without the object at the size of a camera: in the hole that of its surface, elsewhere what
+/// other views confirm; NaN where they do not.
+fn known_depth(sight: &Sight, camera: &Camera) -> Vec<f32> {
+    let w = camera.size[0] as usize;
+    let one = |i: usize| {
+        let place = sight.grid.place(camera.unproject([(i % w) as f64 + 0.5, (i / w) as f64 + 0.5])?);
+        let site = sight.grid.site(place[0].floor() as i64, place[1].floor() as i64)?;
+        (sight.hole[site] || sight.grid.confirmed[site]).then(|| sight.depth_at(place) as f32)
+    };
+    (0..w * camera.size[1] as usize).into_par_iter().map(|i| one(i).unwrap_or(f32::NAN)).collect()
+}

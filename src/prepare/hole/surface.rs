@@ -1,0 +1,451 @@
+//! What stands behind the object, as every view sees it: one surface.
+//!
+//! Each view knows the depth of what it shows beside the object ([`multiview::depths`](crate::multiview::depths)). What
+//! other views show behind the object is carried over: the nearest depth that enough of them claim and that no more of
+//! them look through. What nobody shows continues the surfaces around it ([`planes`]). A view that is solved counts for
+//! all that follow, so that all views end with the same surface.
+
+use glam::DVec3;
+use image::GrayImage;
+use rayon::prelude::*;
+
+use crate::multiview::DepthGrid;
+use crate::prepare::planes;
+use crate::scene::Camera;
+
+/// Relative difference up to which two depths are of one surface.
+pub(super) const SAME: f64 = 0.03;
+/// Relative difference from which on the nearer of two surfaces hides the farther one.
+const APART: f64 = 0.06;
+/// Sum of the weights of the views that must claim a depth behind the object.
+const ENOUGH: f64 = 2.0;
+/// Weight of a depth that no other view has confirmed. A confirmed one weighs 1.
+const UNCONFIRMED: f64 = 0.5;
+/// Share of the views with a point in the picture whose masks must cover it for it to be the object's.
+const HULL: f64 = 0.8;
+/// Fewest views with a point in the picture that can tell whether it is the object's.
+const HULL_VIEWS: usize = 3;
+/// Part of what speaks against a surface that all other views have hidden behind something else; 1 is a proof.
+const BURIED: f64 = 0.1;
+/// Relative difference to a plane up to which a measured inverse depth is taken to lie on it.
+const FLAT: f32 = 0.015;
+/// Least width of a hole's surroundings, sites.
+const LEAST_MARGIN: i64 = 16;
+/// Sites of a hole that are filled from their neighbours where no more than these are unknown.
+const FEW: usize = 12;
+
+/// One view of the scene without the object.
+pub struct Sight {
+    /// Depth of the photograph, the object included.
+    pub grid: DepthGrid,
+    /// `[site]` whether the object, or a margin around it, covers it.
+    pub hole: Vec<bool>,
+    /// `[site]` depth z of what is there without the object, scene units; NaN where it is not known.
+    pub depth: Vec<f64>,
+    /// `[site]` whether another photograph shows it past the object.
+    pub measured: Vec<bool>,
+    /// `[site]` number of the plane in [`Sight::planes`] that it lies on; their count for what lies on none.
+    pub surface: Vec<u8>,
+    /// Planes around the hole: inverse depth by x/z, y/z and 1.
+    pub planes: Vec<planes::Plane>,
+    /// Whether every site has its depth.
+    pub solved: bool,
+}
+
+/// How a view sees a point that some other view claims.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Witness {
+    Agrees,
+    Hidden,
+    Through,
+    Silent,
+}
+
+/// Depth z that another view claims at a site.
+#[derive(Clone, Copy)]
+struct Claim {
+    depth: f64,
+    view: usize,
+    weight: f64,
+    /// Whether the view's photograph shows it.
+    photographed: bool,
+}
+
+impl Sight {
+    /// A view whose photograph has this camera and whose object, with its margin, has this mask (as large as the camera's
+    /// picture); `wide` is the mask with the margin by which depth bleeds over the object's border.
+    fn new(grid: DepthGrid, camera: &Camera, mask: &GrayImage) -> Self {
+        let hole: Vec<bool> = (0..grid.depth.len()).map(|site| covers(mask, camera, &grid, site)).collect();
+        let depth = grid.depth.iter().zip(&hole).map(|(z, hole)| if *hole { f64::NAN } else { *z }).collect();
+        let sites = hole.len();
+        Self { grid, hole, depth, measured: vec![false; sites], surface: vec![0; sites], planes: vec![], solved: false }
+    }
+
+    /// Site and depth z of a world point that is in the picture.
+    pub fn see(&self, point: DVec3) -> Option<(usize, f64)> {
+        let [x, y, z] = self.grid.camera.to_camera(point.to_array());
+        if z <= 0.0 {
+            return None;
+        }
+        let [column, row] = self.grid.place([x / z, y / z]).map(f64::floor);
+        self.grid.site(column as i64, row as i64).map(|site| (site, z))
+    }
+
+    /// Depth z at a place in sites, linear in its inverse between sites of one surface; NaN where nothing is known.
+    pub fn depth_at(&self, place: [f64; 2]) -> f64 {
+        let nearest =
+            self.grid.site(place[0].floor() as i64, place[1].floor() as i64).map_or(f64::NAN, |s| self.depth[s]);
+        if nearest.is_nan() {
+            return f64::NAN;
+        }
+        let [x, y] = place.map(|v| v - 0.5);
+        let (mut sum, mut total) = (0.0, 0.0);
+        for (dx, dy) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
+            let (u, v) = (x.floor() + f64::from(dx), y.floor() + f64::from(dy));
+            let Some(z) = self.grid.site(u as i64, v as i64).map(|site| self.depth[site]) else { continue };
+            if (z / nearest - 1.0).abs() <= 2.0 * SAME {
+                let weight = (1.0 - (x - u).abs()) * (1.0 - (y - v).abs());
+                sum += weight / z;
+                total += weight;
+            }
+        }
+        if total > 0.0 { total / sum } else { nearest }
+    }
+
+    /// The surface at a place in sites: that of most of the four sites around it, the nearer ones counting more.
+    pub fn surface_at(&self, place: [f64; 2]) -> u8 {
+        let [x, y] = place.map(|v| v - 0.5);
+        let mut votes: Vec<(u8, f64)> = vec![];
+        for (dx, dy) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
+            let (u, v) = (x.floor() + f64::from(dx), y.floor() + f64::from(dy));
+            let Some(site) = self.grid.site(u as i64, v as i64) else { continue };
+            let weight = (1.0 - (x - u).abs()) * (1.0 - (y - v).abs());
+            match votes.iter_mut().find(|(surface, _)| *surface == self.surface[site]) {
+                Some((_, sum)) => *sum += weight,
+                None => votes.push((self.surface[site], weight)),
+            }
+        }
+        votes.into_iter().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(0, |(surface, _)| surface)
+    }
+
+    /// Normalised coordinates of a site's centre.
+    pub fn ray(&self, site: usize) -> [f64; 2] {
+        self.grid.ray([site as u32 % self.grid.columns, site as u32 / self.grid.columns])
+    }
+
+    /// `[site]` whether it is in the hole's box, or within as much again on each side: the surfaces there go on in it.
+    fn surroundings(&self) -> Vec<bool> {
+        let place = |site: usize| [site as u32 % self.grid.columns, site as u32 / self.grid.columns].map(i64::from);
+        let holes = (0..self.hole.len()).filter(|site| self.hole[*site]).map(place);
+        let (low, high) = holes.fold(([i64::MAX; 2], [i64::MIN; 2]), |(low, high), at| {
+            (std::array::from_fn(|a| low[a].min(at[a])), std::array::from_fn(|a: usize| high[a].max(at[a])))
+        });
+        let margin: [i64; 2] = std::array::from_fn(|a| high[a].saturating_sub(low[a]).max(LEAST_MARGIN));
+        let inside = |at: [i64; 2]| {
+            (0..2).all(|a| at[a] >= low[a].saturating_sub(margin[a]) && at[a] <= high[a].saturating_add(margin[a]))
+        };
+        (0..self.hole.len()).map(|site| low[0] <= high[0] && inside(place(site))).collect()
+    }
+
+    /// The world point on a site's ray at a depth z.
+    pub fn point(&self, site: usize, depth: f64) -> DVec3 {
+        DVec3::from(self.grid.camera.along(self.ray(site), depth))
+    }
+
+    /// Whether a site is of the hole, or next to it.
+    pub fn near_hole(&self, site: usize) -> bool {
+        self.around(site).any(|near| self.hole[near])
+    }
+
+    /// The sites within one of this one, itself included.
+    fn around(&self, site: usize) -> impl Iterator<Item = usize> + '_ {
+        let (x, y) = ((site as u32 % self.grid.columns) as i64, (site as u32 / self.grid.columns) as i64);
+        (-1..=1).flat_map(move |dy| (-1..=1).filter_map(move |dx| self.grid.site(x + dx, y + dy)))
+    }
+}
+
+/// Whether a mask as large as a camera's picture covers a site.
+fn covers(mask: &GrayImage, camera: &Camera, grid: &DepthGrid, site: usize) -> bool {
+    let at = [site as u32 % grid.columns, site as u32 / grid.columns];
+    let point = camera.along(grid.ray(at), 1.0);
+    let Some([x, y]) = camera.project(point) else { return false };
+    x >= 0.0 && y >= 0.0 && mask.get_pixel_checked(x as u32, y as u32).is_some_and(|p| p.0[0] != 0)
+}
+
+/// Sites from the mask's border from which on what it covers is the object.
+const WITHIN: i64 = 2;
+/// Share of the views with a point of the object in the picture whose masks must cover it.
+const SHARED: f64 = 0.7;
+/// Points of the object that must fall into a site for it to be the object's.
+const FEWEST_POINTS: u32 = 2;
+
+/// Adds to the masks (as large as the pictures of these cameras) where points of the object fall that most other masks cover:
+/// a mask that stops short of the object is completed by what all views know of it. Returns the views whose masks grew.
+pub fn complete(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage]) -> Vec<usize> {
+    let sites = |grid: &DepthGrid| 0..grid.depth.len();
+    let inside: Vec<Vec<bool>> = (grids.par_iter().zip(cameras).zip(&*masks))
+        .map(|((grid, camera), mask)| sites(grid).map(|site| covers(mask, camera, grid, site)).collect())
+        .collect();
+    let see = |grid: &DepthGrid, point: [f64; 3]| {
+        let [x, y, z] = grid.camera.to_camera(point);
+        let [column, row] = grid.place([x / z, y / z]).map(f64::floor);
+        (z > 0.0).then(|| grid.site(column as i64, row as i64)).flatten().map(|site| (site, z))
+    };
+    let on_object = |point: [f64; 3]| {
+        let trusted = grids.iter().zip(&inside).filter(|(grid, _)| grid.trusted);
+        let framing = trusted.filter_map(|(grid, inside)| Some(inside[see(grid, point)?.0]));
+        let (framed, covered) = framing.fold((0, 0), |(n, k), inside| (n + 1, k + usize::from(inside)));
+        framed >= HULL_VIEWS && covered as f64 >= SHARED * framed as f64
+    };
+    let points: Vec<[f64; 3]> = (grids.par_iter().zip(&inside))
+        .flat_map_iter(|(grid, inside)| {
+            let deep = |site: usize| {
+                let (x, y) = ((site as u32 % grid.columns) as i64, (site as u32 / grid.columns) as i64);
+                let mut around = (-WITHIN..=WITHIN).flat_map(|dy| (-WITHIN..=WITHIN).map(move |dx| (x + dx, y + dy)));
+                around.all(|(x, y)| grid.site(x, y).is_some_and(|near| inside[near]))
+            };
+            let known = sites(grid).filter(|site| inside[*site] && grid.confirmed[*site]).filter(|site| deep(*site));
+            known
+                .filter_map(|site| Some(grid.point(site)?.to_array()))
+                .filter(|point| on_object(*point))
+                .collect::<Vec<_>>()
+        })
+        .collect();
+    let added: Vec<Vec<usize>> = (grids.par_iter().zip(&inside))
+        .map(|(grid, inside)| {
+            let mut count = vec![0u32; grid.depth.len()];
+            for (site, z) in points.iter().filter_map(|point| see(grid, *point)) {
+                // What stands before the object hides it.
+                let hidden = grid.confirmed[site] && z > (1.0 + APART) * grid.depth[site];
+                count[site] += u32::from(!inside[site] && !hidden);
+            }
+            sites(grid).filter(|site| count[*site] >= FEWEST_POINTS).collect()
+        })
+        .collect();
+    let mut grown = vec![];
+    for (view, added) in added.into_iter().enumerate().filter(|(_, added)| !added.is_empty()) {
+        let (grid, camera, mask) = (&grids[view], &cameras[view], &mut masks[view]);
+        let mut more = GrayImage::new(mask.width(), mask.height());
+        for site in &added {
+            let at = [*site as u32 % grid.columns, *site as u32 / grid.columns];
+            let Some([x, y]) = camera.project(camera.along(grid.ray(at), 1.0)) else { continue };
+            if let Some(pixel) = more.get_pixel_mut_checked(x.max(0.0) as u32, y.max(0.0) as u32) {
+                pixel.0 = [255];
+            }
+        }
+        // A site's pixels, and a half more on each side.
+        let site = f64::from(grid.stride) * f64::from(camera.size[0]) / f64::from(grid.camera.size[0]);
+        let more = crate::scene::resample::dilate(&more, site.ceil() as u32);
+        mask.iter_mut().zip(more.as_raw()).for_each(|(m, more)| *m = (*m).max(*more));
+        grown.push(view);
+    }
+    grown
+}
+
+/// All views of the scene without the object.
+pub struct Sights(pub Vec<Sight>);
+
+impl Sights {
+    /// Of views with these depths, cameras and masks. `wide` are the masks with as much around them as depth may bleed over the
+    /// object's border: what lies within them in nearly all views is not taken for background.
+    pub fn new(grids: Vec<DepthGrid>, cameras: &[Camera], masks: &[GrayImage], wide: &[GrayImage]) -> Self {
+        let inside: Vec<Vec<bool>> = (grids.par_iter().zip(cameras).zip(wide))
+            .map(|((grid, camera), wide)| (0..grid.depth.len()).map(|site| covers(wide, camera, grid, site)).collect())
+            .collect();
+        let views = grids.into_par_iter().zip(cameras).zip(masks);
+        let mut sights = Self(views.map(|((grid, camera), mask)| Sight::new(grid, camera, mask)).collect());
+        let on_object = |point: DVec3| {
+            let trusted = sights.0.iter().zip(&inside).filter(|(sight, _)| sight.grid.trusted);
+            let framing = trusted.filter_map(|(sight, inside)| Some(inside[sight.see(point)?.0]));
+            let (framed, covered) = framing.fold((0, 0), |(n, k), inside| (n + 1, k + usize::from(inside)));
+            framed >= HULL_VIEWS && covered as f64 >= HULL * framed as f64
+        };
+        let bled: Vec<Vec<usize>> = (sights.0.par_iter().zip(&inside))
+            .map(|(sight, inside)| {
+                let near = (0..sight.depth.len()).filter(|site| inside[*site] && sight.depth[*site].is_finite());
+                near.filter(|site| on_object(sight.point(*site, sight.depth[*site]))).collect()
+            })
+            .collect();
+        for (sight, bled) in sights.0.iter_mut().zip(bled) {
+            bled.into_iter().for_each(|site| sight.depth[site] = f64::NAN);
+        }
+        sights
+    }
+
+    /// How a view, whose object is taken for glass, sees a point.
+    fn witness(&self, view: usize, point: DVec3) -> Witness {
+        let sight = &self.0[view];
+        let Some((site, z)) = sight.see(point).filter(|_| sight.grid.trusted) else { return Witness::Silent };
+        let hole = sight.hole[site];
+        // The object hides what is behind it, and shows that nothing else is before it.
+        let known = if hole && !sight.solved { sight.grid.depth[site] } else { sight.depth[site] };
+        let object = hole && !sight.solved;
+        if !known.is_finite() || object && !sight.grid.confirmed[site] {
+            Witness::Silent
+        } else if z < (1.0 - APART) * known {
+            Witness::Through
+        } else if object {
+            Witness::Silent
+        } else if (z / known - 1.0).abs() <= SAME {
+            Witness::Agrees
+        } else if z > (1.0 + APART) * known {
+            Witness::Hidden
+        } else {
+            Witness::Silent
+        }
+    }
+
+    /// From 0, nothing speaks against a surface at this point, to 1, it cannot be there.
+    fn against(&self, of: usize, point: DVec3) -> f64 {
+        let (mut through, mut agree, mut hidden, mut asked) = (0u32, 0u32, 0u32, 0u32);
+        for view in (0..self.0.len()).filter(|view| *view != of) {
+            let said = self.witness(view, point);
+            asked += u32::from(said != Witness::Silent);
+            through += u32::from(said == Witness::Through);
+            agree += u32::from(said == Witness::Agrees);
+            hidden += u32::from(said == Witness::Hidden);
+        }
+        if through >= 2 && through > 2 * agree {
+            return 1.0;
+        }
+        BURIED * f64::from(hidden) / f64::from(asked.max(1))
+    }
+
+    /// `[site]` of a view's hole what others claim to be there.
+    fn claims(&self, of: usize) -> Vec<Vec<Claim>> {
+        let own = &self.0[of];
+        let found: Vec<Vec<(usize, Claim)>> = (0..self.0.len())
+            .into_par_iter()
+            .filter(|view| *view != of && self.0[*view].grid.trusted)
+            .map(|view| {
+                let sight = &self.0[view];
+                let mut found = vec![];
+                for site in 0..sight.depth.len() {
+                    let depth = sight.depth[site];
+                    if !depth.is_finite() {
+                        continue;
+                    }
+                    let point = sight.point(site, depth);
+                    let Some((there, z)) = own.see(point).filter(|(there, _)| own.hole[*there]) else { continue };
+                    let weight = match (sight.hole[site], sight.grid.confirmed[site]) {
+                        // One solved view is enough.
+                        (true, _) => ENOUGH,
+                        (false, true) => 1.0,
+                        (false, false) => UNCONFIRMED,
+                    };
+                    found.push((there, Claim { depth: z, view, weight, photographed: !sight.hole[site] }));
+                }
+                found
+            })
+            .collect();
+        let mut claims = vec![vec![]; own.hole.len()];
+        found.into_iter().flatten().for_each(|(site, claim)| claims[site].push(claim));
+        claims
+    }
+
+    /// `[site]` of a view's hole the depth that others show or have solved, and whether photographs show it; NaN elsewhere.
+    pub fn carried(&self, of: usize) -> Vec<(f64, bool)> {
+        let own = &self.0[of];
+        let claims = self.claims(of);
+        let one = |site: usize| {
+            if !own.hole[site] {
+                return (f64::NAN, false);
+            }
+            let mut near: Vec<Claim> = own.around(site).flat_map(|site| claims[site].iter().copied()).collect();
+            near.sort_unstable_by(|a, b| a.depth.total_cmp(&b.depth));
+            let object = if own.grid.confirmed[site] { own.grid.depth[site] } else { 0.0 };
+            let mut first = 0;
+            while first < near.len() {
+                let last =
+                    first + near[first..].partition_point(|claim| claim.depth <= (1.0 + SAME) * near[first].depth);
+                let mut views: Vec<(usize, f64)> = near[first..last].iter().map(|c| (c.view, c.weight)).collect();
+                views.sort_unstable_by(|a, b| a.0.cmp(&b.0).then(b.1.total_cmp(&a.1)));
+                views.dedup_by_key(|view| view.0);
+                let weight: f64 = views.iter().map(|view| view.1).sum();
+                // What a view was solved by is smoother than what was measured.
+                let solved: Vec<f64> =
+                    near[first..last].iter().filter(|claim| !claim.photographed).map(|claim| claim.depth).collect();
+                let depth = match solved.len() {
+                    0 => near[(first + last) / 2].depth,
+                    n => solved[n / 2],
+                };
+                let enough = weight >= ENOUGH && depth > (1.0 - SAME) * object;
+                if enough && self.against(of, own.point(site, depth)) < 1.0 {
+                    return (depth, near[first..last].iter().any(|claim| claim.photographed));
+                }
+                // The cluster that begins with the next claim.
+                first += 1;
+            }
+            (f64::NAN, false)
+        };
+        (0..own.hole.len()).into_par_iter().map(one).collect()
+    }
+
+    /// Gives every site of a view's hole its depth. The same seed finds the same.
+    pub fn solve(&mut self, of: usize, seed: u64) {
+        let carried = self.carried(of);
+        let own = &self.0[of];
+        let size = [own.grid.columns as usize, own.grid.rows as usize];
+        let unknown: Vec<bool> = (0..own.hole.len()).map(|site| own.hole[site] && carried[site].0.is_nan()).collect();
+        let near = own.surroundings();
+        let known = |site: usize| match (near[site], own.hole[site]) {
+            (false, _) => f64::NAN,
+            (true, false) => own.depth[site],
+            (true, true) => carried[site].0,
+        };
+        let mut disparity: Vec<f32> = (0..own.hole.len()).map(|site| (1.0 / known(site)) as f32).collect();
+        let (mut surface, mut found_planes) = (vec![0; own.hole.len()], vec![]);
+        let first = !self.0.iter().any(|sight| sight.solved);
+        if first || unknown.iter().filter(|unknown| **unknown).count() > FEW {
+            let rays: Vec<Option<[f64; 2]>> = (0..own.hole.len()).map(|site| Some(own.ray(site))).collect();
+            // Between what is known and the hole lies what the object's depth has bled into.
+            let ring = |site: usize| near[site] && !own.hole[site] && own.depth[site].is_nan();
+            let outline: Vec<bool> = (0..own.hole.len())
+                .map(|site| ring(site) || own.hole[site] && own.around(site).any(|s| !own.hole[s]))
+                .collect();
+            let open: Vec<bool> = (0..own.hole.len()).map(|site| unknown[site] || ring(site)).collect();
+            let against = |site: usize, d: f64| {
+                if d.is_nan() || d <= 0.0 {
+                    return 1.0;
+                }
+                if own.grid.confirmed[site] && own.hole[site] && 1.0 / d < (1.0 - APART) * own.grid.depth[site] {
+                    return 1.0;
+                }
+                self.against(of, own.point(site, 1.0 / d))
+            };
+            let hole =
+                planes::Hole { size, disparity: &disparity, rays: &rays, unknown: &open, outline: &outline, against };
+            let found = planes::surfaces(&hole, seed);
+            let count = |label: usize, of: &[bool]| {
+                found.label.iter().zip(of).filter(|(own, of)| usize::from(**own) == label && **of).count()
+            };
+            for label in 0..=found.planes.len() {
+                log::debug!(
+                    "surface {label}: {} sites of the surroundings, {} of what is unknown",
+                    count(label, &near),
+                    count(label, &unknown)
+                );
+            }
+            for site in (0..unknown.len()).filter(|site| own.hole[*site]) {
+                // What was measured to lie on a plane lies on it: single depths are noisier than all of them.
+                let plane = found.planes.get(usize::from(found.label[site])).filter(|_| !unknown[site]);
+                let on_plane = plane.map(|plane| planes::on(plane, own.ray(site)) as f32);
+                match on_plane {
+                    Some(flat) if (flat / disparity[site] - 1.0).abs() <= FLAT => disparity[site] = flat,
+                    Some(_) => {}
+                    None if unknown[site] => disparity[site] = found.disparity[site],
+                    None => {}
+                }
+            }
+            (surface, found_planes) = (found.label, found.planes);
+        }
+        planes::membrane(&mut disparity, size, |site| own.hole[site]);
+        let own = &mut self.0[of];
+        for site in (0..unknown.len()).filter(|site| own.hole[*site]) {
+            own.depth[site] = 1.0 / f64::from(disparity[site]);
+        }
+        own.measured = carried.into_iter().map(|(_, photographed)| photographed).collect();
+        (own.surface, own.planes) = (surface, found_planes);
+        own.solved = true;
+    }
+}

@@ -1,0 +1,487 @@
+//! Filling a hole in a texture with large pieces of what is around it.
+//!
+//! Textures that people build repeat: tiles, boards, bricks. The shifts by which a texture is like itself are few, and a hole
+//! that is filled by shifted copies of its surroundings goes on as they do, lines included (He and Sun 2012). The shifts are
+//! found by comparing the surroundings with themselves; which one each pixel takes is chosen by alpha expansion, so that
+//! seams run where both copies are alike (Pritch et al. 2009); and the gradients of the copies, not their colours, are put
+//! together (Pérez et al. 2003), so that light that falls off goes on falling off.
+//!
+//! Everything is a function of the picture.
+
+use image::GrayImage;
+use rayon::prelude::*;
+
+use super::gradient::{self, Equation};
+use crate::prepare::planes;
+use crate::scene::resample;
+
+/// A picture with a hole.
+#[derive(Clone, Debug)]
+pub struct Texture {
+    /// Width and height in pixels.
+    pub size: [usize; 2],
+    /// `[pixel]` RGB, 0 to 1; in the hole anything.
+    pub rgb: Vec<[f32; 3]>,
+    /// `[pixel]` whether it is to be filled; no more once it is.
+    pub hole: Vec<bool>,
+    /// `[pixel]` whether it may be copied; never in the hole.
+    pub source: Vec<bool>,
+}
+
+/// Longer side of the picture that shifts are chosen on, pixels.
+const SIDE: usize = 128;
+/// Shifts that are tried in the hole.
+const SHIFTS: usize = 48;
+/// Patches that are compared are 2 `RADIUS` + 1 pixels wide.
+const RADIUS: usize = 3;
+/// Shortest shift, as a part of the longer side: every texture is like itself next to itself.
+const SHORTEST: f64 = 0.06;
+/// Sum of the differences of the channels from which on two pixels are merely different.
+const DIFFERENT: f32 = 0.6;
+/// Sum of the differences of the channels from which on a copy shows something else than what is known there.
+const ANOTHER: f32 = 0.3;
+/// Cost of a copy whose surroundings differ in one channel by the whole range from what goes on into the hole, at its border;
+/// it falls by a factor e every `FADES` of the hole's half width.
+const UNLIKE: f64 = 12.0;
+const FADES: f64 = 0.6;
+/// Half the width of the squares over which surroundings are averaged, pixels.
+const SURROUNDINGS: usize = 3;
+/// Cost of a pixel whose copy is no source.
+const NO_SOURCE: f64 = 1e4;
+/// Cost per channel sum of the difference of two copies along a seam.
+const SEAM: f64 = 10.0;
+/// Cost of a seam where both copies are the same: copies are large.
+const LEAST_SEAM: f64 = 0.05;
+
+type Shift = [isize; 2];
+
+impl Texture {
+    /// The pixel at a shift from another, if it is in the picture.
+    fn shifted(&self, pixel: usize, [dx, dy]: Shift) -> Option<usize> {
+        let [w, h] = self.size.map(|n| n as isize);
+        let (x, y) = (pixel as isize % w + dx, pixel as isize / w + dy);
+        (x >= 0 && y >= 0 && x < w && y < h).then(|| (y * w + x) as usize)
+    }
+
+    /// The pixel at a shift, if it may be copied.
+    fn source(&self, pixel: usize, shift: Shift) -> Option<usize> {
+        self.shifted(pixel, shift).filter(|at| self.source[*at])
+    }
+
+    /// Reduced by a whole factor: means of what is known, hole where any of its pixels is.
+    fn reduced(&self, by: usize) -> Self {
+        let size @ [w, h] = self.size.map(|n| n.div_ceil(by));
+        let mut small = Self { size, rgb: vec![[0.0; 3]; w * h], hole: vec![false; w * h], source: vec![false; w * h] };
+        for (at, rgb) in small.rgb.iter_mut().enumerate() {
+            let (x0, y0) = (at % w * by, at / w * by);
+            let rows = y0..(y0 + by).min(self.size[1]);
+            let pixels: Vec<usize> =
+                rows.flat_map(|y| (x0..(x0 + by).min(self.size[0])).map(move |x| y * self.size[0] + x)).collect();
+            small.hole[at] = pixels.iter().any(|i| self.hole[*i]);
+            small.source[at] = pixels.iter().all(|i| self.source[*i]);
+            let known: Vec<usize> = pixels.iter().copied().filter(|i| !self.hole[*i]).collect();
+            let count = known.len().max(1) as f32;
+            *rgb = std::array::from_fn(|c| known.iter().map(|i| self.rgb[*i][c]).sum::<f32>() / count);
+        }
+        small
+    }
+
+    fn apart(&self, a: usize, b: usize) -> f32 {
+        (0..3).map(|c| (self.rgb[a][c] - self.rgb[b][c]).abs()).sum()
+    }
+
+    /// The shifts under which patches around the hole are most often most like others, most frequent first.
+    fn shifts(&self) -> Vec<Shift> {
+        let [w, h] = self.size;
+        let longest = w.max(h) as f64;
+        let shortest = (SHORTEST * longest).ceil() as isize;
+        // Around the hole, as far as it is wide.
+        let holes: Vec<usize> = (0..w * h).filter(|i| self.hole[*i]).collect();
+        let bounds = |f: &dyn Fn(usize) -> usize| {
+            let (low, high) = holes.iter().fold((usize::MAX, 0), |(a, b), i| (a.min(f(*i)), b.max(f(*i))));
+            (low, high)
+        };
+        let ((x0, x1), (y0, y1)) = (bounds(&|i| i % w), bounds(&|i| i / w));
+        let reach = ((x1 - x0).max(y1 - y0) / 2).max(4 * RADIUS);
+        let (x0, y0) = (x0.saturating_sub(reach), y0.saturating_sub(reach));
+        let (x1, y1) = ((x1 + reach + 1).min(w), (y1 + reach + 1).min(h));
+        let box_w = x1 - x0;
+        let patches: Vec<usize> = (y0..y1).flat_map(|y| (x0..x1).map(move |x| y * w + x)).collect();
+        // Shifts by which some of the hole is filled at all, and of each only one direction: the other compares the same.
+        let [rx, ry] = [w as isize, h as isize].map(|n| n - 1);
+        let all: Vec<Shift> = (-ry..=ry)
+            .flat_map(|dy| (-rx..=rx).map(move |dx| [dx, dy]))
+            .filter(|[dx, dy]| dx * dx + dy * dy >= shortest * shortest && (*dy > 0 || *dy == 0 && *dx > 0))
+            .filter(|shift| {
+                let mut some = holes.iter().step_by(holes.len().div_ceil(64));
+                some.any(|i| self.source(*i, *shift).or(self.source(*i, shift.map(|v| -v))).is_some())
+            })
+            .collect();
+        // Of each patch the best shift: row by row of shifts, so that memory is bounded.
+        let best = |shifts: &[Shift]| -> Vec<(f32, u32)> {
+            let mut best = vec![(f32::INFINITY, u32::MAX); patches.len()];
+            let mut errors = vec![f32::NAN; patches.len()];
+            for (number, shift) in shifts.iter().enumerate() {
+                for (error, &i) in errors.iter_mut().zip(&patches) {
+                    let own = self.source[i].then(|| self.source(i, *shift)).flatten();
+                    *error = own.map_or(f32::NAN, |there| self.apart(i, there).min(DIFFERENT));
+                }
+                let means = box_means(&errors, [box_w, y1 - y0]);
+                for (best, mean) in best.iter_mut().zip(means) {
+                    if mean < best.0 {
+                        *best = (mean, number as u32);
+                    }
+                }
+            }
+            best
+        };
+        let chunk = all.len().div_ceil(4 * rayon::current_num_threads()).max(1);
+        let parts: Vec<(usize, Vec<(f32, u32)>)> =
+            all.par_chunks(chunk).enumerate().map(|(k, part)| (k * chunk, best(part))).collect();
+        let mut votes = std::collections::BTreeMap::<Shift, f64>::new();
+        for at in 0..patches.len() {
+            let found = parts.iter().map(|(first, best)| (best[at].0, *first + best[at].1 as usize));
+            let Some((error, number)) = found.min_by(|a, b| a.0.total_cmp(&b.0)).filter(|f| f.0.is_finite()) else {
+                continue;
+            };
+            // Neighbouring shifts are one: votes are smoothed by a small disc below. Patches with structure say more than blank
+            // ones, whose best shift is a matter of noise.
+            let [dx, dy] = all[number];
+            let contrast = self.contrast(patches[at]);
+            let vote = f64::from((-8.0 * error).exp()) * f64::from(0.05 + contrast);
+            for (ox, oy, weight) in [(0, 0, 1.0), (1, 0, 0.5), (-1, 0, 0.5), (0, 1, 0.5), (0, -1, 0.5)] {
+                *votes.entry([dx + ox, dy + oy]).or_default() += weight * vote;
+                *votes.entry([-dx + ox, -dy + oy]).or_default() += weight * vote;
+            }
+        }
+        let mut ranked: Vec<(f64, Shift)> = votes.into_iter().map(|(shift, votes)| (votes, shift)).collect();
+        ranked.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+        let mut shifts: Vec<Shift> = vec![];
+        let apart = |a: &Shift, b: &Shift| (a[0] - b[0]).abs().max((a[1] - b[1]).abs()) > 1;
+        let useful = |shift: &Shift| holes.iter().any(|i| self.source(*i, *shift).is_some());
+        for (_, shift) in ranked {
+            if shifts.len() == SHIFTS {
+                break;
+            }
+            if shifts.iter().all(|other| apart(other, &shift)) && useful(&shift) {
+                shifts.push(shift);
+            }
+        }
+        self.reach_all(&holes, &all, &mut shifts);
+        shifts
+    }
+
+    /// Adds shifts until every pixel of the hole has a source, as far as there are any.
+    fn reach_all(&self, holes: &[usize], all: &[Shift], shifts: &mut Vec<Shift>) {
+        let mut left: Vec<usize> =
+            holes.iter().copied().filter(|i| shifts.iter().all(|s| self.source(*i, *s).is_none())).collect();
+        while !left.is_empty() {
+            let count = |shift: Shift| left.iter().filter(|i| self.source(**i, shift).is_some()).count();
+            let every = all.len().div_ceil(2000).max(1);
+            let both = all.iter().step_by(every).flat_map(|shift| [*shift, shift.map(|v| -v)]);
+            let best = both.map(|shift| (count(shift), shift)).max_by_key(|(n, s)| (*n, std::cmp::Reverse(*s)));
+            let Some((_, shift)) = best.filter(|(n, _)| *n > 0) else { break };
+            shifts.push(shift);
+            left.retain(|i| self.source(*i, shift).is_none());
+        }
+    }
+
+    /// Largest difference of a pixel to its four neighbours, sum over the channels.
+    fn contrast(&self, pixel: usize) -> f32 {
+        let near = [[1, 0], [-1, 0], [0, 1], [0, -1]].into_iter().filter_map(|shift| self.source(pixel, shift));
+        near.map(|there| self.apart(pixel, there)).fold(0.0, f32::max)
+    }
+
+    /// `[pixel]` number of the shift of each pixel; `shifts.len()` outside the hole, and where nothing can be copied.
+    fn labels(&self, shifts: &[Shift]) -> Vec<usize> {
+        let none = shifts.len();
+        // The hole's box and what touches it.
+        let [w, h] = self.size;
+        let holes = || (0..w * h).filter(|i| self.hole[*i]);
+        let range = |f: &dyn Fn(usize) -> usize, end: usize| {
+            let (low, high) = holes().fold((end, 0), |(low, high), i| (low.min(f(i)), high.max(f(i))));
+            (low.saturating_sub(1), (high + 2).min(end))
+        };
+        let ((x0, x1), (y0, y1)) = (range(&|i| i % w, w), range(&|i| i / w, h));
+        let size = [x1 - x0, y1 - y0];
+        let pixel = |node: usize| (y0 + node / size[0]) * w + x0 + node % size[0];
+        let n = size[0] * size[1];
+        let unlike = self.unlike();
+        let cost = |label: usize, i: usize| match (self.hole[i], label == none) {
+            (false, own) => {
+                if own {
+                    0.0
+                } else {
+                    NO_SOURCE
+                }
+            }
+            (true, true) => 2.0 * NO_SOURCE,
+            (true, false) => self.source(i, shifts[label]).map_or(NO_SOURCE, |from| unlike(i, from)),
+        };
+        let costs: Vec<Vec<f64>> =
+            (0..=none).map(|label| (0..n).map(|node| cost(label, pixel(node))).collect()).collect();
+        let color = |i: usize, label: usize| {
+            if label == none { self.source[i].then_some(i) } else { self.source(i, shifts[label]) }
+        };
+        let border = |[p, q]: [usize; 2], [a, b]: [usize; 2]| {
+            let at = |i: usize| match (color(i, a), color(i, b)) {
+                (Some(one), Some(other)) => f64::from(self.apart(one, other)),
+                // Known pixels have one colour; that a copy would have there is compared on the other side.
+                _ => f64::from(DIFFERENT) / 2.0,
+            };
+            LEAST_SEAM + SEAM * (at(pixel(p)) + at(pixel(q)))
+        };
+        let mut labels = vec![none; w * h];
+        planes::cheapest(&costs, border, size)
+            .into_iter()
+            .enumerate()
+            .for_each(|(node, label)| labels[pixel(node)] = label);
+        labels
+    }
+}
+
+/// Means over squares of 2 `RADIUS` + 1 pixels of what is a number; infinite where less than two thirds are.
+fn box_means(values: &[f32], [w, h]: [usize; 2]) -> Vec<f32> {
+    let line = |values: &[[f32; 2]], length: usize, out: &mut Vec<[f32; 2]>| {
+        out.clear();
+        let mut sum = [0f32; 2];
+        let add = |sum: &mut [f32; 2], v: [f32; 2], sign: f32| (0..2).for_each(|k| sum[k] += sign * v[k]);
+        (0..RADIUS.min(length)).for_each(|i| add(&mut sum, values[i], 1.0));
+        for i in 0..length {
+            if i + RADIUS < length {
+                add(&mut sum, values[i + RADIUS], 1.0);
+            }
+            if i > RADIUS {
+                add(&mut sum, values[i - RADIUS - 1], -1.0);
+            }
+            out.push(sum);
+        }
+    };
+    let mut sums: Vec<[f32; 2]> = values.iter().map(|v| if v.is_nan() { [0.0; 2] } else { [*v, 1.0] }).collect();
+    let mut out = Vec::with_capacity(w.max(h));
+    for y in 0..h {
+        line(&sums[y * w..(y + 1) * w], w, &mut out);
+        sums[y * w..(y + 1) * w].copy_from_slice(&out);
+    }
+    let mut column = vec![[0f32; 2]; h];
+    for x in 0..w {
+        (0..h).for_each(|y| column[y] = sums[y * w + x]);
+        line(&column, h, &mut out);
+        (0..h).for_each(|y| sums[y * w + x] = out[y]);
+    }
+    let enough = (2 * RADIUS + 1).pow(2) as f32 * 2.0 / 3.0;
+    sums.iter().map(|[sum, count]| if *count >= enough { sum / count } else { f32::INFINITY }).collect()
+}
+
+impl Texture {
+    /// What it costs a pixel of the hole to be copied from another: the colours around that one are compared with those that
+    /// go on into the hole from its border.
+    fn unlike(&self) -> impl Fn(usize, usize) -> f64 {
+        let [w, h] = self.size;
+        let around: Vec<[f32; 3]> = (0..w * h)
+            .into_par_iter()
+            .map(|i| {
+                let (x, y) = (i % w, i / w);
+                let rows = y.saturating_sub(SURROUNDINGS)..(y + SURROUNDINGS + 1).min(h);
+                let near = rows.flat_map(|v| {
+                    (x.saturating_sub(SURROUNDINGS)..(x + SURROUNDINGS + 1).min(w)).map(move |u| v * w + u)
+                });
+                let known: Vec<usize> = near.filter(|j| self.source[*j]).collect();
+                let n = known.len() as f32;
+                std::array::from_fn(|c| known.iter().map(|j| self.rgb[*j][c]).sum::<f32>() / n)
+            })
+            .collect();
+        let mut expected = vec![[0f32; 3]; w * h];
+        for c in 0..3 {
+            let mut channel: Vec<f32> =
+                (0..w * h).map(|i| if self.hole[i] { f32::NAN } else { around[i][c] }).collect();
+            planes::membrane(&mut channel, self.size, |i| self.hole[i]);
+            expected.iter_mut().zip(channel).for_each(|(to, v)| to[c] = v);
+        }
+        let raw = self.source.iter().map(|source| if *source { 255 } else { 0 }).collect();
+        let known = GrayImage::from_raw(w as u32, h as u32, raw).expect("a value per pixel");
+        let inwards = resample::distances(&known, w.max(h) as u32);
+        let deepest = (0..w * h).filter(|i| self.hole[*i]).map(|i| inwards[i]).max().unwrap_or(1);
+        let fades = FADES * f64::from(deepest);
+        move |pixel, from| {
+            let apart: f32 = (0..3).map(|c| (around[from][c] - expected[pixel][c]).abs()).sum();
+            let weight = UNLIKE * (-f64::from(inwards[pixel]) / fades).exp();
+            if apart.is_finite() { weight * f64::from(apart) } else { 0.0 }
+        }
+    }
+}
+
+/// Fills the hole, as far as there is anything to copy. Returns whether there was.
+pub fn fill(texture: &mut Texture) -> bool {
+    if !texture.hole.iter().any(|hole| *hole) || !texture.source.iter().any(|source| *source) {
+        return false;
+    }
+    let by = texture.size[0].max(texture.size[1]).div_ceil(SIDE).max(1);
+    let small = texture.reduced(by);
+    let coarse = small.shifts();
+    if coarse.is_empty() {
+        return false;
+    }
+    let labels = small.labels(&coarse);
+    let shifts: Vec<Shift> =
+        (0..coarse.len()).map(|label| refined(texture, &small, &labels, label, coarse[label], by)).collect();
+    // Of each pixel the pixel that it copies.
+    let [w, h] = texture.size;
+    let copied: Vec<Option<usize>> = (0..w * h)
+        .map(|i| {
+            if !texture.hole[i] {
+                return None;
+            }
+            let label = labels[(i / w / by) * small.size[0] + i % w / by];
+            let own = shifts.get(label).and_then(|shift| texture.source(i, *shift));
+            own.or_else(|| shifts.iter().find_map(|shift| texture.source(i, *shift)))
+        })
+        .collect();
+    for (i, from) in copied.iter().enumerate() {
+        if let Some(from) = from {
+            texture.rgb[i] = texture.rgb[*from];
+        }
+    }
+    join(texture, &copied);
+    texture.hole.iter_mut().zip(&copied).filter(|(_, from)| from.is_some()).for_each(|(hole, _)| *hole = false);
+    true
+}
+
+/// A shift of the reduced picture at full size: the nearest at which what is around its pixels is most like what it copies.
+fn refined(texture: &Texture, small: &Texture, labels: &[usize], label: usize, shift: Shift, by: usize) -> Shift {
+    let large = shift.map(|v| v * by as isize);
+    if by == 1 {
+        return large;
+    }
+    let [sw, _] = small.size;
+    // Known pixels beside the label's own: the seam to what is known, and what is not far from it.
+    let mut beside: Vec<usize> = vec![];
+    let reach = 3isize;
+    for at in (0..labels.len()).filter(|at| labels[*at] == label) {
+        for (dx, dy) in (-reach..=reach).flat_map(|dy| (-reach..=reach).map(move |dx| (dx, dy))) {
+            beside.extend(small.shifted(at, [dx, dy]).filter(|near| small.source[*near]));
+        }
+    }
+    beside.sort_unstable();
+    beside.dedup();
+    if beside.is_empty() {
+        // The whole surroundings, where it touches nothing known.
+        beside = (0..small.source.len()).filter(|at| small.source[*at]).collect();
+    }
+    let every = beside.len().div_ceil(1500).max(1);
+    let pixels: Vec<usize> = (beside.into_iter().step_by(every))
+        .map(|at| {
+            (at / sw * by + by / 2).min(texture.size[1] - 1) * texture.size[0]
+                + (at % sw * by + by / 2).min(texture.size[0] - 1)
+        })
+        .collect();
+    let by = by as isize;
+    let near = (-by..=by).flat_map(|dy| (-by..=by).map(move |dx| [large[0] + dx, large[1] + dy]));
+    let error = |shift: Shift| {
+        let both = pixels.iter().filter_map(|i| Some(texture.apart(*i, texture.source(*i, shift)?).min(DIFFERENT)));
+        let (sum, count) = both.fold((0.0, 0usize), |(sum, n), error| (sum + f64::from(error), n + 1));
+        let off = (shift[0] - large[0]).abs() + (shift[1] - large[1]).abs();
+        if 4 * count < pixels.len() { f64::INFINITY } else { sum / count as f64 + 1e-6 * off as f64 }
+    };
+    let found = near.map(|shift| (error(shift), shift)).min_by(|a, b| a.0.total_cmp(&b.0));
+    found.filter(|(error, _)| error.is_finite()).map_or(large, |(_, shift)| shift)
+}
+
+/// Gives the copied pixels the colours whose gradients are those of the copies, and that go on from what is known.
+fn join(texture: &mut Texture, copied: &[Option<usize>]) {
+    let original = &texture.rgb;
+    let less = |a: usize, b: usize| -> [f32; 3] { std::array::from_fn(|c| original[a][c] - original[b][c]) };
+    let equation = |i: usize| {
+        let mut equation = Equation::new(i);
+        for shift in [[1, 0], [-1, 0], [0, 1], [0, -1]] {
+            // Only what is known and what is being filled has a colour.
+            let neighbour = texture.shifted(i, shift).filter(|j| copied[*j].is_some() || texture.source[*j]);
+            let Some(j) = neighbour else { continue };
+            // Beside the hole a copy goes on in another light, or it shows something else and ends.
+            let beside = copied[i].filter(|_| copied[j].is_none()).and_then(|at| texture.source(at, shift));
+            if beside.is_some_and(|there| texture.apart(there, j) > ANOTHER) {
+                continue;
+            }
+            // That of the copy; of two copies the mean of both.
+            let own = copied[i].and_then(|at| Some(less(at, texture.source(at, shift)?)));
+            let back = shift.map(|v| -v);
+            let other = copied[j].and_then(|at| Some(less(texture.source(at, back)?, at)));
+            let gradient = match (own, other) {
+                (Some(own), Some(other)) => std::array::from_fn(|c| 0.5 * (own[c] + other[c])),
+                (Some(one), None) | (None, Some(one)) => one,
+                (None, None) => less(copied[i].unwrap_or(i), copied[j].unwrap_or(j)),
+            };
+            equation.add(j, gradient);
+        }
+        equation
+    };
+    let inside: Vec<usize> = (0..copied.len()).filter(|i| copied[*i].is_some()).collect();
+    let equations: Vec<Equation> = inside.into_par_iter().map(equation).collect();
+    gradient::solve(&mut texture.rgb, &equations);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn texture(
+        size: [usize; 2],
+        hole: impl Fn(usize, usize) -> bool,
+        color: impl Fn(usize, usize) -> [f32; 3],
+    ) -> (Texture, Vec<[f32; 3]>) {
+        let places = || (0..size[1]).flat_map(|y| (0..size[0]).map(move |x| (x, y)));
+        let truth: Vec<[f32; 3]> = places().map(|(x, y)| color(x, y)).collect();
+        let hole: Vec<bool> = places().map(|(x, y)| hole(x, y)).collect();
+        let rgb = truth.iter().zip(&hole).map(|(c, h)| if *h { [0.0; 3] } else { *c }).collect();
+        let source = hole.iter().map(|h| !h).collect();
+        (Texture { size, rgb, hole, source }, truth)
+    }
+
+    /// Tiles of 23 x 17 pixels with joints of two, light falling off to one side: joints cross the hole where they would.
+    #[test]
+    fn tiles_go_on_and_so_does_the_light() {
+        for size in [[150, 120], [300, 240]] {
+            let [w, h] = size;
+            let scale = w / 150;
+            let tile = [23 * scale, 17 * scale];
+            let hole = |x: usize, y: usize| (w / 3..2 * w / 3).contains(&x) && (h / 3..2 * h / 3).contains(&y);
+            let color = |x: usize, y: usize| {
+                let joint = x % tile[0] < 2 * scale || y % tile[1] < 2 * scale;
+                let light = 1.0 - 0.4 * x as f32 / w as f32;
+                [if joint { 0.3 } else { 0.8 } * light, if joint { 0.3 } else { 0.7 } * light, 0.5 * light]
+            };
+            let (mut tiles, truth) = texture(size, hole, color);
+            let before = tiles.hole.clone();
+            assert!(fill(&mut tiles) && !tiles.hole.contains(&true));
+            let inside = || (0..truth.len()).filter(|i| before[*i]);
+            let wrong = inside().filter(|i| (0..3).any(|c| (tiles.rgb[*i][c] - truth[*i][c]).abs() > 0.06)).count();
+            let all = inside().count();
+            assert!(wrong * 50 < all, "{wrong} of {all} at {size:?}");
+        }
+    }
+
+    /// A straight border between two plain colours runs straight through the hole, and no colour is there that is not around.
+    #[test]
+    fn a_straight_border_stays_straight() {
+        let hole = |x: usize, y: usize| (50..80).contains(&x) && (35..70).contains(&y);
+        let upper = |x: usize, y: usize| 2 * y < 40 + x;
+        let color = |x: usize, y: usize| if upper(x, y) { [0.2, 0.3, 0.6] } else { [0.7, 0.6, 0.4] };
+        let (mut two, truth) = texture([130, 100], hole, color);
+        let before = two.hole.clone();
+        assert!(fill(&mut two));
+        for i in (0..truth.len()).filter(|i| before[*i]) {
+            let (x, y) = ((i % 130) as f64, (i / 130) as f64);
+            let off = (2.0 * y - 40.0 - x).abs() / 5f64.sqrt();
+            let apart = (0..3).map(|c| (two.rgb[i][c] - truth[i][c]).abs()).fold(0.0, f32::max);
+            assert!(off < 2.5 || apart < 0.08, "({x}, {y}): {apart}");
+        }
+    }
+
+    #[test]
+    fn without_anything_to_copy_nothing_is_filled() {
+        let (mut none, _) = texture([20, 20], |_, _| true, |_, _| [0.5; 3]);
+        assert!(!fill(&mut none));
+        let (mut whole, _) = texture([20, 20], |_, _| false, |_, _| [0.5; 3]);
+        assert!(!fill(&mut whole));
+    }
+}
