@@ -127,7 +127,7 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
 }
 
 /// Part of a hole that is so little that it is filled smoothly.
-const SLIVER: f64 = 0.01;
+pub const SLIVER: f64 = 0.01;
 
 /// Goes on smoothly with the colours around what nothing tells.
 fn smooth(filling: &mut Filling, size: [usize; 2]) {

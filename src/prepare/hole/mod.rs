@@ -156,6 +156,10 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
             sights.solve(i, task.seed + i as u64);
         }
         let mut filling = color::gather(&sights, &photographs, &filled, i);
+        // What was made for this view the others get from it; what photographs show they look up themselves.
+        let made = filling.guessed.iter().filter(|guessed| **guessed).count();
+        let hole = photographs[i].hole.as_raw().iter().filter(|v| **v != 0).count();
+        let made = task.given.contains_key(&i) || made as f64 > guess::SLIVER * hole as f64;
         if task.given.contains_key(&i) {
             painted(task, i, &photographs[i].hole, &mut filling)?;
         } else if let Some(network) = task.inpainting {
@@ -175,7 +179,7 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
                 "the surface behind the object, filled once for all views",
             );
         }
-        filled[i] = Some(filling.rgb);
+        filled[i] = made.then_some(filling.rgb);
         watch.turn(n + 2 + k as u64)?;
     }
     let name = |i: usize| reference_path(&task.scene.train[i].name);

@@ -449,3 +449,87 @@ impl Sights {
         own.solved = true;
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use image::Luma;
+
+    use super::*;
+
+    const SIZE: [u32; 2] = [48, 32];
+
+    /// Five cameras side by side look at a wall at z = 4 with a square at z = 2 before it: grids, cameras, masks.
+    fn views() -> (Vec<DepthGrid>, Vec<Camera>, Vec<GrayImage>) {
+        let camera = |x: f64| Camera {
+            rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            translation: [-x, 0.0, 0.0],
+            focal: [40.0; 2],
+            principal: [24.0, 16.0],
+            distortion: [0.0; 4],
+            size: SIZE,
+        };
+        let cameras: Vec<Camera> = [-0.6, -0.3, 0.0, 0.3, 0.6].map(camera).to_vec();
+        let on_object = |camera: &Camera, i: usize| {
+            let [x, y, _] = camera.lift(camera.pixel_center(i), 2.0).expect("a ray");
+            x.abs() < 0.2 && y.abs() < 0.2
+        };
+        let pixels = (SIZE[0] * SIZE[1]) as usize;
+        let grid = |camera: &Camera| DepthGrid {
+            camera: *camera,
+            stride: 1,
+            columns: SIZE[0],
+            rows: SIZE[1],
+            depth: (0..pixels).map(|i| if on_object(camera, i) { 2.0 } else { 4.0 }).collect(),
+            confirmed: vec![true; pixels],
+            colors: vec![[0; 3]; pixels],
+            trusted: true,
+        };
+        let mask = |camera: &Camera| {
+            let inside = |x, y| on_object(camera, (y * SIZE[0] + x) as usize);
+            GrayImage::from_fn(SIZE[0], SIZE[1], |x, y| Luma([if inside(x, y) { 255 } else { 0 }]))
+        };
+        (cameras.iter().map(grid).collect(), cameras.clone(), cameras.iter().map(mask).collect())
+    }
+
+    /// What the views on the left and on the right show behind the square is the wall, and the middle view's hole gets it; what
+    /// is solved is known to the next view.
+    #[test]
+    fn the_wall_goes_on_behind_the_object() {
+        let (grids, cameras, masks) = views();
+        let mut sights = Sights::new(grids, &cameras, &masks, &masks);
+        for of in [2, 0] {
+            sights.solve(of, 1);
+            let sight = &sights.0[of];
+            let holes: Vec<usize> = (0..sight.hole.len()).filter(|site| sight.hole[*site]).collect();
+            assert!(holes.len() > 40, "{}", holes.len());
+            assert!(holes.iter().all(|site| (sight.depth[*site] / 4.0 - 1.0).abs() < 0.01));
+            assert!(holes.iter().all(|site| sight.measured[*site]));
+        }
+    }
+
+    /// A view whose camera is wrong claims nothing: what it alone would show stays unknown to the others.
+    #[test]
+    fn views_that_are_not_trusted_claim_nothing() {
+        let (mut grids, cameras, masks) = views();
+        grids.iter_mut().enumerate().filter(|(view, _)| *view != 2).for_each(|(_, grid)| grid.trusted = false);
+        let sights = Sights::new(grids, &cameras, &masks, &masks);
+        assert!(sights.carried(2).iter().all(|(depth, _)| depth.is_nan()));
+    }
+
+    /// A mask that ends in the middle of the object is completed by what the other masks cover; the others stay.
+    #[test]
+    fn a_mask_that_stops_short_is_completed() {
+        let (grids, cameras, whole) = views();
+        let mut masks = whole.clone();
+        for (x, _, pixel) in masks[3].enumerate_pixels_mut() {
+            // The object's middle is at x = 24 - 40 * 0.3 / 2.
+            pixel.0 = if x < 18 { [0] } else { pixel.0 };
+        }
+        assert_eq!(complete(&grids, &cameras, &mut masks), [3]);
+        let left = whole[3].pixels().zip(masks[3].pixels()).filter(|(whole, now)| whole.0[0] != 0 && now.0[0] == 0);
+        let missing = whole[3].pixels().filter(|p| p.0[0] != 0).count() / 2;
+        // Its rim is left, where no point of the object is deep enough in the others' masks.
+        assert!(left.count() * 2 < missing, "of {missing}");
+        assert!(masks.iter().zip(&whole).enumerate().all(|(view, (now, whole))| view == 3 || now == whole));
+    }
+}
