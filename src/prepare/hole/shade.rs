@@ -15,20 +15,23 @@ use crate::scene::{Camera, resample};
 
 /// Logarithm of the luminance by which the shade's middle is darker than the surface, at least, and its border.
 const DARK: f64 = -0.06;
-const DARK_BORDER: f64 = -0.025;
+const DARK_BORDER: f64 = -0.035;
 /// Largest difference of the logarithms of two channels: what is of another colour is no shade.
 const TINTED: f64 = 0.06;
 /// The shade reaches at most so many times the foot's width from it.
-const REACH: f64 = 1.2;
+const REACH: f64 = 0.8;
 /// How far from the foot it may be that no view shows the plane, in the foot's widths.
 const UNSEEN: f64 = 0.3;
 /// Largest deviation (median of absolute values) of the surface from smooth light for a shade to be told on it.
 const ROUGH: f64 = 0.05;
 /// Half the width of the squares that the differences are averaged over, as a part of the foot's width.
 const SMOOTH: f64 = 0.05;
-/// Fewest sites of the foot, and the shade's least share of the foot's area.
+/// Fewest sites of the foot.
 const FEWEST_SITES: usize = 8;
+/// The dark part of a shade covers at least this part of the foot's area, and all of it at most so much: what is larger is a
+/// pattern of the surface, or something else's shadow.
 const LEAST: f64 = 0.05;
+const MOST: f64 = 1.3;
 /// Views that are asked for the colours of the plane.
 const VIEWS: usize = 12;
 
@@ -205,7 +208,8 @@ fn shaded(light: &[[f64; 3]], foot: &[bool], size @ [w, h]: [usize; 2]) -> Optio
     log::debug!("shade: the darkest is {darkest:.2?}");
     log::debug!("shade: {area} texels, {core} of them dark, {at_end} of {all} at the end of what is looked at");
     let ends = 5 * at_end < all || at_end == 0;
-    (core >= LEAST * feet().count() as f64 && core >= 0.2 * area && ends).then_some(shade)
+    let foot = feet().count() as f64;
+    (core >= LEAST * foot && core >= 0.2 * area && area <= MOST * foot && ends).then_some(shade)
 }
 
 /// Coefficients of least squares in which what is far off loses its weight (Cauchy), and the median of the absolute residuals.
@@ -282,6 +286,17 @@ mod tests {
             assert!(*found || shade(x, y) < 0.05, "({x}, {y}) is left");
             assert!(!found || x < 75.0, "({x}, {y}) is no shade");
         }
+    }
+
+    /// Dark joints between tiles run away from the foot, and a shadow of something else touches it: neither is the foot's shade.
+    #[test]
+    fn patterns_and_other_shadows_stay() {
+        let joint = |v: f64| v.rem_euclid(30.0) < 2.0;
+        let tiles = light(|x, y| if joint(x) || joint(y) { [0.4, 0.37, 0.35] } else { [0.8, 0.75, 0.7] });
+        assert!(shaded(&tiles, &foot(), SIZE).is_none());
+        let wide = |x: f64, y: f64| x < 52.0 && (y - 50.0).abs() < 25.0;
+        let shadow = light(|x, y| if wide(x, y) { [0.5, 0.47, 0.44] } else { [0.8, 0.75, 0.7] });
+        assert!(shaded(&shadow, &foot(), SIZE).is_none());
     }
 
     /// Without a shade, on another surface that begins at the foot, and beside something of another colour there is none.
