@@ -46,7 +46,7 @@ pub(super) struct Args {
     /// A scene that has priors of its own in depth/ or disparity/ keeps those alone.
     #[arg(long)]
     no_depth: bool,
-    /// Network that fills what no photograph shows, instead of pieces of what is around it: LaMa as ONNX file
+    /// Network that fills what no photograph shows: LaMa as ONNX file
     ///
     /// It takes the picture [1, 3, H, W], RGB from 0 to 1, and the hole [1, 1, H, W], 1 in it, and gives the picture, from 0
     /// to 1 or to 255. H and W are the file's, or 512.

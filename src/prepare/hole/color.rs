@@ -147,22 +147,59 @@ fn sources(sights: &Sights, of: usize) -> Vec<Option<usize>> {
 /// Cost of a seam between two sources, per site of its length.
 const SEAM: f64 = 0.15;
 
-/// What photographs, and views that were filled before, tell of the colours of a view's hole.
-pub fn gather(sights: &Sights, photographs: &[Photograph<'_>], filled: &[Option<Vec<[f32; 3]>>], of: usize) -> Filling {
+/// A pixel's place in sites, and the world point that it shows without the object.
+fn shown(own: &Photograph<'_>, sight: &Sight, i: usize) -> Option<([f64; 2], DVec3)> {
+    let ray = own.camera.unproject(own.camera.pixel_center(i))?;
+    let place = sight.grid.place(ray);
+    let z = sight.depth_at(place);
+    z.is_finite().then(|| (place, DVec3::from(own.camera.along(ray, z))))
+}
+
+/// What views that were filled before tell of the colours of a view's hole that no photograph shows.
+pub fn repaint(
+    sights: &Sights,
+    photographs: &[Photograph<'_>],
+    filled: &[Option<Vec<[f32; 3]>>],
+    of: usize,
+    filling: &mut Filling,
+) {
+    let (own, sight) = (&photographs[of], &sights.0[of]);
+    let painted: Vec<usize> = (0..filled.len()).filter(|view| *view != of && filled[*view].is_some()).collect();
+    let repainted = |i: usize| -> Option<[f32; 3]> {
+        let (_, point) = shown(own, sight, i)?;
+        painted.iter().find_map(|view| {
+            let (other, there) = (&photographs[*view], &sights.0[*view]);
+            let [a, b, c] = there.grid.camera.to_camera(point.to_array());
+            let place = (c > 0.0).then(|| there.grid.place([a / c, b / c]))?;
+            let agrees = (there.depth_at(place) / c - 1.0).abs() <= SAME;
+            let pixel = other.camera.project(point.to_array()).filter(|_| agrees)?;
+            // Beside its hole it is a photograph, which has been asked.
+            other.hole.get_pixel_checked(pixel[0].max(0.0) as u32, pixel[1].max(0.0) as u32).filter(|p| p.0[0] != 0)?;
+            let rgb = filled[*view].as_ref()?;
+            let width = other.camera.size[0] as usize;
+            sample(|x, y| rgb[y * width + x], other.camera.size, pixel)
+        })
+    };
+    let told: Vec<Option<[f32; 3]>> = (0..filling.guessed.len())
+        .into_par_iter()
+        .map(|i| if filling.guessed[i] { repainted(i) } else { None })
+        .collect();
+    for (i, color) in told.into_iter().enumerate() {
+        if let Some(color) = color {
+            filling.rgb[i] = color;
+            filling.guessed[i] = false;
+        }
+    }
+}
+
+/// What photographs tell of the colours of a view's hole.
+pub fn gather(sights: &Sights, photographs: &[Photograph<'_>], of: usize) -> Filling {
     let (own, sight) = (&photographs[of], &sights.0[of]);
     let [w, h] = own.camera.size.map(|n| n as usize);
     let sources = sources(sights, of);
-    let painted: Vec<usize> = (0..filled.len()).filter(|view| *view != of && filled[*view].is_some()).collect();
-    // A pixel's place in sites, and the world point that it shows without the object.
-    let shown = |i: usize| -> Option<([f64; 2], DVec3)> {
-        let ray = own.camera.unproject([(i % w) as f64 + 0.5, (i / w) as f64 + 0.5])?;
-        let place = sight.grid.place(ray);
-        let z = sight.depth_at(place);
-        z.is_finite().then(|| (place, DVec3::from(own.camera.along(ray, z))))
-    };
     let photographed = |i: usize| -> Vec<Shown> {
         let mut found: Vec<Shown> = vec![];
-        let Some((place, point)) = shown(i) else { return found };
+        let Some((place, point)) = shown(own, sight, i) else { return found };
         let [x, y] = place.map(|v| v - 0.5);
         for (dx, dy) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
             let (u, v) = (x.floor() + f64::from(dx), y.floor() + f64::from(dy));
@@ -177,21 +214,6 @@ pub fn gather(sights: &Sights, photographs: &[Photograph<'_>], filled: &[Option<
             found.clear();
         }
         found
-    };
-    let repainted = |i: usize| -> Option<[f32; 3]> {
-        let (_, point) = shown(i)?;
-        painted.iter().find_map(|view| {
-            let (other, there) = (&photographs[*view], &sights.0[*view]);
-            let [a, b, c] = there.grid.camera.to_camera(point.to_array());
-            let place = (c > 0.0).then(|| there.grid.place([a / c, b / c]))?;
-            let agrees = (there.depth_at(place) / c - 1.0).abs() <= SAME;
-            let pixel = other.camera.project(point.to_array()).filter(|_| agrees)?;
-            // Beside its hole it is a photograph, which has been asked.
-            other.hole.get_pixel_checked(pixel[0].max(0.0) as u32, pixel[1].max(0.0) as u32).filter(|p| p.0[0] != 0)?;
-            let rgb = filled[*view].as_ref()?;
-            let width = other.camera.size[0] as usize;
-            sample(|x, y| rgb[y * width + x], other.camera.size, pixel)
-        })
     };
     let hole = |i: usize| own.hole.as_raw()[i] != 0;
     let ring = resample::dilate(&own.hole, RING);
@@ -222,14 +244,6 @@ pub fn gather(sights: &Sights, photographs: &[Photograph<'_>], filled: &[Option<
         (filling.guessed[i], filling.seen[i]) = (false, true);
     }
     gradient::solve(&mut filling.rgb, &equations);
-    let told: Vec<Option<[f32; 3]>> =
-        (0..w * h).into_par_iter().map(|i| if filling.guessed[i] { repainted(i) } else { None }).collect();
-    for (i, color) in told.into_iter().enumerate() {
-        if let Some(color) = color {
-            filling.rgb[i] = color;
-            filling.guessed[i] = false;
-        }
-    }
     filling
 }
 

@@ -39,6 +39,8 @@ const MARGIN: f64 = 0.008;
 const BLEEDING: f64 = 0.03;
 /// A view is taken for the reference only if its hole is at least this part of the largest one.
 const LEAST_HOLE: f64 = 0.4;
+/// Views whose pictures are filled at once: each is held as float32.
+const AT_ONCE: usize = 16;
 /// Name of the way in which holes are filled: a scene that was filled in another way is filled anew.
 pub const METHOD: &str = "one surface, all views";
 /// Where each pixel of the reference is from, below the scene's folder.
@@ -151,36 +153,42 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
     watch.turn(n + 1)?;
     // What the user has painted is known to all others.
     rest.sort_by_key(|(_, i)| !task.given.contains_key(i));
-    for (k, i) in std::iter::once(of).chain(rest.into_iter().map(|(_, i)| i)).enumerate() {
-        if i != of {
-            sights.solve(i, task.seed + i as u64);
+    let order: Vec<usize> = std::iter::once(of).chain(rest.into_iter().map(|(_, i)| i)).collect();
+    for i in order.iter().filter(|i| **i != of) {
+        sights.solve(*i, task.seed + *i as u64);
+    }
+    let mut done = 0;
+    for some in order.chunks(AT_ONCE) {
+        let gathered: Vec<Filling> = some.par_iter().map(|i| color::gather(&sights, &photographs, *i)).collect();
+        for (&i, mut filling) in some.iter().zip(gathered) {
+            color::repaint(&sights, &photographs, &filled, i, &mut filling);
+            // What was made for this view the others get from it; what photographs show they look up themselves.
+            let made = filling.guessed.iter().filter(|guessed| **guessed).count();
+            let hole = photographs[i].hole.as_raw().iter().filter(|v| **v != 0).count();
+            let made = task.given.contains_key(&i) || made as f64 > guess::SLIVER * hole as f64;
+            if task.given.contains_key(&i) {
+                painted(task, i, &photographs[i].hole, &mut filling)?;
+            } else if let Some(network) = task.inpainting {
+                network.fill(&mut filling.rgb, &filling.guessed, cameras[i].size.map(|n| n as usize))?;
+            } else {
+                guess::fill(&sights, &photographs, i, &mut filling);
+            }
+            if i == of {
+                of_reference(task, of, &filling, &photographs[of], &sights, expected, &mut batch)?;
+            }
+            if !task.given.contains_key(&i) {
+                let name = &task.fine.train[i].name;
+                let picture = cut_out(&as_exposed(task, i, &filling.rgb), &photographs[i].hole);
+                batch.rgba(
+                    format!("{HOLE}/{name}.png"),
+                    &picture,
+                    "the surface behind the object, filled once for all views",
+                );
+            }
+            filled[i] = made.then_some(filling.rgb);
+            done += 1;
+            watch.turn(n + 1 + done)?;
         }
-        let mut filling = color::gather(&sights, &photographs, &filled, i);
-        // What was made for this view the others get from it; what photographs show they look up themselves.
-        let made = filling.guessed.iter().filter(|guessed| **guessed).count();
-        let hole = photographs[i].hole.as_raw().iter().filter(|v| **v != 0).count();
-        let made = task.given.contains_key(&i) || made as f64 > guess::SLIVER * hole as f64;
-        if task.given.contains_key(&i) {
-            painted(task, i, &photographs[i].hole, &mut filling)?;
-        } else if let Some(network) = task.inpainting {
-            network.fill(&mut filling.rgb, &filling.guessed, cameras[i].size.map(|n| n as usize))?;
-        } else {
-            guess::fill(&sights, &photographs, i, &mut filling);
-        }
-        if i == of {
-            of_reference(task, of, &filling, &photographs[of], &sights, expected, &mut batch)?;
-        }
-        if !task.given.contains_key(&i) {
-            let name = &task.fine.train[i].name;
-            let picture = cut_out(&as_exposed(task, i, &filling.rgb), &photographs[i].hole);
-            batch.rgba(
-                format!("{HOLE}/{name}.png"),
-                &picture,
-                "the surface behind the object, filled once for all views",
-            );
-        }
-        filled[i] = made.then_some(filling.rgb);
-        watch.turn(n + 2 + k as u64)?;
     }
     let name = |i: usize| reference_path(&task.scene.train[i].name);
     let mut made_with: Vec<String> = task.given.iter().map(|(i, hash)| format!("{hash} {}\n", name(*i))).collect();

@@ -42,10 +42,10 @@ const DIFFERENT: f32 = 0.6;
 const ANOTHER: f32 = 0.3;
 /// Cost of a copy whose surroundings differ in one channel by the whole range from what goes on into the hole, at its border;
 /// it falls by a factor e every `FADES` of the hole's half width.
-const UNLIKE: f64 = 12.0;
+const UNLIKE: f64 = 6.0;
 const FADES: f64 = 0.6;
 /// Half the width of the squares over which surroundings are averaged, pixels.
-const SURROUNDINGS: usize = 3;
+const SURROUNDINGS: usize = 8;
 /// Cost of a pixel whose copy is no source.
 const NO_SOURCE: f64 = 1e4;
 /// Cost per channel sum of the difference of two copies along a seam.
