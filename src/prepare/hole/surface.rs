@@ -458,8 +458,9 @@ mod tests {
 
     const SIZE: [u32; 2] = [48, 32];
 
-    /// Five cameras side by side look at a wall at z = 4 with a square at z = 2 before it: grids, cameras, masks.
-    fn views() -> (Vec<DepthGrid>, Vec<Camera>, Vec<GrayImage>) {
+    /// Five cameras side by side look at a wall at z = 4 with a square of this half width at z = 2 before it: grids, cameras,
+    /// masks.
+    fn views(half: f64) -> (Vec<DepthGrid>, Vec<Camera>, Vec<GrayImage>) {
         let camera = |x: f64| Camera {
             rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
             translation: [-x, 0.0, 0.0],
@@ -471,7 +472,7 @@ mod tests {
         let cameras: Vec<Camera> = [-0.6, -0.3, 0.0, 0.3, 0.6].map(camera).to_vec();
         let on_object = |camera: &Camera, i: usize| {
             let [x, y, _] = camera.lift(camera.pixel_center(i), 2.0).expect("a ray");
-            x.abs() < 0.2 && y.abs() < 0.2
+            x.abs() < half && y.abs() < half
         };
         let pixels = (SIZE[0] * SIZE[1]) as usize;
         let grid = |camera: &Camera| DepthGrid {
@@ -495,7 +496,7 @@ mod tests {
     /// is solved is known to the next view.
     #[test]
     fn the_wall_goes_on_behind_the_object() {
-        let (grids, cameras, masks) = views();
+        let (grids, cameras, masks) = views(0.2);
         let mut sights = Sights::new(grids, &cameras, &masks, &masks);
         for of in [2, 0] {
             sights.solve(of, 1);
@@ -510,7 +511,7 @@ mod tests {
     /// A view whose camera is wrong claims nothing: what it alone would show stays unknown to the others.
     #[test]
     fn views_that_are_not_trusted_claim_nothing() {
-        let (mut grids, cameras, masks) = views();
+        let (mut grids, cameras, masks) = views(0.2);
         grids.iter_mut().enumerate().filter(|(view, _)| *view != 2).for_each(|(_, grid)| grid.trusted = false);
         let sights = Sights::new(grids, &cameras, &masks, &masks);
         assert!(sights.carried(2).iter().all(|(depth, _)| depth.is_nan()));
@@ -519,7 +520,7 @@ mod tests {
     /// A mask that ends in the middle of the object is completed by what the other masks cover; the others stay.
     #[test]
     fn a_mask_that_stops_short_is_completed() {
-        let (grids, cameras, whole) = views();
+        let (grids, cameras, whole) = views(0.4);
         let mut masks = whole.clone();
         for (x, _, pixel) in masks[3].enumerate_pixels_mut() {
             // The object's middle is at x = 24 - 40 * 0.3 / 2.
