@@ -64,5 +64,6 @@ pub mod signal;
 mod skip;
 pub mod splat;
 pub mod stage;
+pub mod statistics;
 pub mod train;
 pub mod view;

@@ -28,6 +28,7 @@ use crate::export::up;
 use crate::gpu::{self, Gpu};
 use crate::multiview::{self, DepthGrid};
 use crate::scene::{self, Camera, Scene, colmap, stem};
+use crate::statistics::{median, quantile};
 
 /// Longer side of the pictures that depth is measured in, pixels.
 const SIDE: u32 = 512;
@@ -316,9 +317,7 @@ fn gains(grids: &[DepthGrid], at: usize, stand: &Stand) -> Vec<f64> {
         0.299 * r + 0.587 * g + 0.114 * b
     };
     let own = &grids[at];
-    let mut all: Vec<f64> = own.colors.iter().map(|color| luminance(*color)).collect();
-    all.sort_unstable_by(f64::total_cmp);
-    let bright = all.get(all.len() * 3 / 4).copied().unwrap_or(0.6);
+    let bright = quantile(own.colors.iter().map(|color| luminance(*color)), 0.75).unwrap_or(0.6);
     let gain = (bright / 0.6).clamp(0.5, 1.2);
     let near = |site: &usize| {
         own.confirmed[*site] && own.point(*site).is_some_and(|p| (p - stand.foot).length() < 2.0 * stand.height)
@@ -334,9 +333,8 @@ fn gains(grids: &[DepthGrid], at: usize, stand: &Stand) -> Vec<f64> {
             let site = grid.site(column, row).filter(|site| z > 0.0 && grid.confirmed[*site])?;
             ((grid.depth[site] / z - 1.0).abs() < 0.02 && *before > 0.02).then(|| luminance(grid.colors[site]) / before)
         };
-        let mut ratios: Vec<f64> = around.iter().filter_map(one).collect();
-        ratios.sort_unstable_by(f64::total_cmp);
-        if ratios.len() < 20 { 1.0 } else { ratios[ratios.len() / 2].clamp(0.6, 1.6) }
+        let ratios: Vec<f64> = around.iter().filter_map(one).collect();
+        median(ratios.iter().copied()).filter(|_| ratios.len() >= 20).map_or(1.0, |ratio| ratio.clamp(0.6, 1.6))
     };
     grids.iter().map(|grid| gain * ratio(grid)).collect()
 }

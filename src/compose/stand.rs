@@ -6,6 +6,7 @@ use rand_pcg::Pcg64;
 
 use crate::multiview::DepthGrid;
 use crate::scene::Camera;
+use crate::statistics::median;
 
 /// The surface at a pixel is looked for within these shares of the picture's longer side, the nearest first.
 const AROUND: [f64; 3] = [0.015, 0.03, 0.05];
@@ -66,9 +67,7 @@ pub fn find(
         return None;
     }
     near.sort_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)));
-    let mut nearest: Vec<f64> = near.iter().take(9).map(|(_, z)| *z).collect();
-    nearest.sort_unstable_by(f64::total_cmp);
-    let z = nearest[nearest.len() / 2];
+    let z = median(near.iter().take(9).map(|(_, z)| *z))?;
     let seen = DVec3::from(camera.along(ray, z));
     let height = share * f64::from(camera.size[1]) * z / f64::from(camera.focal[1]);
     let eye = DVec3::from(camera.center());
@@ -84,10 +83,8 @@ pub fn find(
     let toward = |normal: DVec3| if normal.dot(eye - seen) < 0.0 { -normal } else { normal };
     let (through, normal) = fitted.map_or((seen, toward(common_up)), |(p, n)| (p, toward(n)));
     let steep = normal.dot(common_up) < STEEP;
-    let mut apart: Vec<f64> =
-        around.iter().map(|p| (*p - through).dot(normal).abs()).filter(|d| *d <= 3.0 * on).collect();
-    apart.sort_unstable_by(f64::total_cmp);
-    let roughness = apart.get(apart.len() / 2).copied().unwrap_or(0.0);
+    let apart = around.iter().map(|p| (*p - through).dot(normal).abs()).filter(|d| *d <= 3.0 * on);
+    let roughness = median(apart).unwrap_or(0.0);
     // The pixel's ray meets the plane more exactly than the depth at the pixel has it.
     let along = (seen - eye).normalize();
     let slope = along.dot(normal);

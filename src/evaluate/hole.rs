@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::seen::{Shown, Surface};
 use crate::scene::resample;
+use crate::statistics::median;
 
 /// A depth counts as right within this share of the true one.
 const RIGHT: f64 = 0.05;
@@ -57,11 +58,7 @@ pub fn unit<'a>(views: impl IntoIterator<Item = (&'a Surface, &'a [f32], Option<
         let usable = pairs.filter(|(i, (z, t))| outside(*i) && !z.is_nan() && is_known(**t));
         ratios.extend(usable.map(|(_, (z, t))| f64::from(*z) / f64::from(*t)));
     }
-    if ratios.is_empty() {
-        return None;
-    }
-    let middle = ratios.len() / 2;
-    Some(*ratios.select_nth_unstable_by(middle, f64::total_cmp).1)
+    median(ratios)
 }
 
 /// Fewest pixels from which a residue is computed.

@@ -10,6 +10,7 @@ use rand_pcg::Pcg64;
 
 use crate::math::harmonics::{ZEROTH, coefficients};
 use crate::scene::Point;
+use crate::statistics::median;
 
 use super::files::{ATTENTION_WIDTH, Anchors, FEATURES, Tensor, Weights, weight_shapes};
 use super::gaussians::{Cloud, logit};
@@ -230,20 +231,14 @@ pub fn mean_distance_to_nearest(positions: &[[f32; 3]], floor: f64) -> Vec<f64> 
         .collect()
 }
 
-/// Median over the distinct points of the distance to the nearest other one (the lower of two middle values); `None`
-/// if all points coincide.
+/// Median over the distinct points of the distance to the nearest other one; `None` if all points coincide.
 pub fn median_nearest_distance(points: &[[f32; 3]]) -> Option<f64> {
     let mut distinct = points.to_vec();
     // -0 and 0 are the same place.
     distinct.iter_mut().flatten().for_each(|v| *v += 0.0);
     distinct.sort_unstable_by(|a, b| a.iter().map(|v| v.to_bits()).cmp(b.iter().map(|v| v.to_bits())));
     distinct.dedup();
-    let mut distances: Vec<f64> = nearest_distances(&distinct, 1).into_iter().flatten().collect();
-    if distances.is_empty() {
-        return None;
-    }
-    let middle = (distances.len() - 1) / 2;
-    Some(*distances.select_nth_unstable_by(middle, f64::total_cmp).1)
+    median(nearest_distances(&distinct, 1).into_iter().flatten())
 }
 
 /// Distances of each position to its `count` nearest others, ascending; fewer if there are fewer others.
@@ -426,9 +421,9 @@ mod tests {
 
     #[test]
     fn the_median_spacing_counts_distinct_points_once() {
-        // Nearest distances of 0, 1, 3, 7: 1, 1, 2, 4.
+        // Nearest distances of 0, 1, 3, 7: 1, 1, 2, 4, and the mean of the two in the middle.
         let line = |xs: &[f32]| xs.iter().map(|&x| [x, 0.0, 0.0]).collect::<Vec<_>>();
-        assert_eq!(median_nearest_distance(&line(&[0.0, 1.0, 3.0, 7.0])), Some(1.0));
+        assert_eq!(median_nearest_distance(&line(&[0.0, 1.0, 3.0, 7.0])), Some(1.5));
         assert_eq!(median_nearest_distance(&line(&[0.0, 3.0, 7.0])), Some(3.0));
         assert_eq!(median_nearest_distance(&line(&[0.0, 3.0, 7.0, 7.0, 7.0, 7.0, -0.0])), Some(3.0));
         assert_eq!(median_nearest_distance(&line(&[2.0, 2.0, 2.0])), None);

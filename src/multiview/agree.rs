@@ -7,6 +7,7 @@
 use super::fuse::Surface;
 use super::neighbors::Neighbors;
 use super::picture::Picture;
+use crate::statistics::quantile;
 
 /// Grey levels between the darkest and the lightest pixel around a site that has texture.
 const CONTRAST: u8 = 16;
@@ -54,13 +55,12 @@ fn has_texture(picture: &Picture, site: usize) -> bool {
 
 /// The views whose shares are those of wrong cameras.
 pub(super) fn wrong(shares: &[Option<f64>]) -> Vec<bool> {
-    let mut judged: Vec<f64> = shares.iter().flatten().copied().collect();
-    judged.sort_unstable_by(f64::total_cmp);
-    let usual = judged.get(judged.len() * 3 / 4).copied().unwrap_or(0.0);
+    let judged = shares.iter().flatten().copied();
+    let usual = quantile(judged.clone(), 0.75).unwrap_or(0.0);
     let found: Vec<bool> = shares.iter().map(|share| share.is_some_and(|share| share < PART * usual)).collect();
     let count = found.iter().filter(|wrong| **wrong).count();
     // What most views contradict is not the rule.
-    let sound = judged.len() >= FEWEST_VIEWS && usual >= WORKS && 2 * count <= shares.len();
+    let sound = judged.count() >= FEWEST_VIEWS && usual >= WORKS && 2 * count <= shares.len();
     if sound { found } else { vec![false; shares.len()] }
 }
 

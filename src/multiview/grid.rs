@@ -6,6 +6,7 @@ use super::picture::Picture;
 use super::{STRIDE, Sites, agree, depth, fill, fuse, neighbors};
 use crate::gpu::{Error, Gpu};
 use crate::scene::{Camera, Point, Scene};
+use crate::statistics::quantile;
 
 /// Depths within this share of one another are of one surface.
 const SAME: f64 = 0.02;
@@ -81,8 +82,8 @@ impl DepthGrid {
             if around.len() < LEAST || like >= LEAST {
                 return z;
             }
-            around.sort_unstable_by(f64::total_cmp);
-            around[around.len() / 2]
+            // One of the depths: between two surfaces there is nothing.
+            quantile(around, 0.5).unwrap_or(z)
         };
         self.depth = (0..self.depth.len()).map(one).collect();
     }

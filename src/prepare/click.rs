@@ -20,6 +20,7 @@ use super::depth::DepthMap;
 use super::graph_cut::{self, COMPONENTS, Grid, Mixture, SHIFTS, SMOOTHNESS, UNIT};
 use super::masks;
 use crate::scene::resample;
+use crate::statistics::median;
 
 /// A user's mark in a photograph. Positions are parts of its width and height, 0 to 1.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -306,10 +307,7 @@ impl Pixels {
     fn scale_places(&mut self) {
         let on = |i: usize| self.touched[i] == Some(true);
         let near = |of: &dyn Fn(usize) -> bool| {
-            let mut depths: Vec<f64> =
-                (0..self.places.len()).filter(|i| of(*i)).filter_map(|i| Some(self.places[i]?.0[2])).collect();
-            depths.sort_unstable_by(f64::total_cmp);
-            depths.get(depths.len() / 2).copied()
+            median((0..self.places.len()).filter(|i| of(*i)).filter_map(|i| Some(self.places[i]?.0[2])))
         };
         let Some(depth) = near(&on).or_else(|| near(&|i| !self.outside[i])) else { return };
         let unit = depth * ROUGH;

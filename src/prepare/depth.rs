@@ -11,6 +11,7 @@ use super::splats::Splats;
 use super::{Error, Watch, network};
 use crate::scene::doctor;
 use crate::scene::{self, Camera, Prior, PriorKind, Scene, resample};
+use crate::statistics::median;
 
 /// A pixel less covered than this has no depth.
 const COVERED: f32 = 0.9;
@@ -181,8 +182,7 @@ pub fn by_network(
         maps.push((values, size));
         watch.turn(2 * i as u64 + 2)?;
     }
-    correlations.sort_by(f64::total_cmp);
-    let median = correlations.get(correlations.len() / 2).copied();
+    let median = median(correlations);
     let kind = match median {
         Some(r) if r.abs() < FOLLOWS => {
             let what = format!(

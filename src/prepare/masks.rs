@@ -10,6 +10,7 @@ use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use super::splats::Splats;
 use crate::gpu::Error;
 use crate::scene::{Camera, View, resample};
+use crate::statistics::median;
 
 /// Anchors seen less than this (pixels) in the masked views count as unseen: what shines through the object.
 const SEEN: f32 = 1.0;
@@ -122,10 +123,8 @@ fn spacing(positions: &[[f32; 3]]) -> f32 {
     let Some(two) = std::num::NonZero::new(2).filter(|_| positions.len() > 1) else { return 1.0 };
     let tree: ImmutableKdTree<f32, 3> = ImmutableKdTree::new_from_slice(positions);
     let some = positions.iter().step_by(positions.len().div_ceil(1000));
-    let mut distances: Vec<f32> =
-        some.filter_map(|p| tree.nearest_n::<SquaredEuclidean>(p, two).last().map(|n| n.distance.sqrt())).collect();
-    distances.sort_unstable_by(f32::total_cmp);
-    distances[distances.len() / 2].max(f32::MIN_POSITIVE)
+    let distances = some.filter_map(|p| tree.nearest_n::<SquaredEuclidean>(p, two).last().map(|n| n.distance.sqrt()));
+    median(distances).map_or(1.0, |median| median as f32).max(f32::MIN_POSITIVE)
 }
 
 /// The anchors' mean colours, from some views; grey where none has an anchor.

@@ -20,6 +20,7 @@ use super::program::{self, Halt};
 use super::record::{self, Batch, Inputs};
 use super::{Error, Watch};
 use crate::scene::{self, Camera, colmap, undistort};
+use crate::statistics::median;
 
 /// Where a scene keeps its photographs and its model.
 pub const IMAGES: &str = "images";
@@ -760,9 +761,7 @@ fn random_points(shots: &[Shot]) -> String {
     let mean = shots.iter().map(center).sum::<DVec3>() / shots.len() as f64;
     let spread = shots.iter().map(|shot| (center(shot) - mean).length()).fold(0.0, f64::max);
     let focus = normal.inverse() * right;
-    let mut depths: Vec<f64> = shots.iter().map(|shot| (focus - center(shot)).dot(axis(shot))).collect();
-    depths.sort_unstable_by(f64::total_cmp);
-    let depth = depths[depths.len() / 2];
+    let depth = median(shots.iter().map(|shot| (focus - center(shot)).dot(axis(shot)))).unwrap_or(0.0);
     // Cameras that look past each other have no such point: what they see is then a few times as far as they stand apart.
     let depth = if depth.is_finite() && depth > 0.1 * spread { depth } else { 4.0 * spread.max(1e-3) };
     let mut rng = Pcg64::new(0, 11);

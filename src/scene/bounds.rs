@@ -1,12 +1,13 @@
 //! What lies beyond a capture: cameras that structure from motion has placed nowhere near the others, points without a
 //! distance, and the radius of the rest.
 //!
-//! Every scale here is a median of distances, or a high quantile of them, so that a few strays change nothing, and all
-//! limits are ratios, so that the unit of the capture changes nothing. They are wide: what a person could have
-//! photographed stays. Structure from motion fails by orders of magnitude, since a triangulation without parallax has no
-//! scale at all.
+//! Every scale here is a median of distances, or a high quantile of them, so that a few strays change nothing (one of
+//! the distances each time: a mean of two would have the stray in it where there are three cameras), and all limits are
+//! ratios, so that the unit of the capture changes nothing. They are wide: what a person could have photographed stays.
+//! Structure from motion fails by orders of magnitude, since a triangulation without parallax has no scale at all.
 
 use super::Point;
+use crate::statistics::quantile;
 
 /// A camera is a stray from so many times as far from the others as these are from one another, or from the points,
 /// whichever is more. A close-up of a detail amid photographs of the whole building is 10 to 50 times nearer.
@@ -32,19 +33,12 @@ fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
     (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f64>().sqrt()
 }
 
-/// The value that a share of `quantile` lies at or below; `None` for no values.
-fn quantile(values: &mut [f64], quantile: f64) -> Option<f64> {
-    let at = (values.len().checked_sub(1)? as f64 * quantile).floor() as usize;
-    Some(*values.select_nth_unstable_by(at, f64::total_cmp).1)
-}
-
 /// The median distance of every camera from the others.
 fn apart(centers: &[[f64; 3]]) -> Vec<f64> {
     let every = centers.len().div_ceil(COMPARED).max(1);
     let from = |(at, center): (usize, &[f64; 3])| {
         let others = centers.iter().enumerate().step_by(every).filter(|(other, _)| *other != at);
-        let mut distances: Vec<f64> = others.map(|(_, other)| distance(*center, *other)).collect();
-        quantile(&mut distances, 0.5).unwrap_or(0.0)
+        quantile(others.map(|(_, other)| distance(*center, *other)), 0.5).unwrap_or(0.0)
     };
     centers.iter().enumerate().map(from).collect()
 }
@@ -55,9 +49,9 @@ impl Bounds {
         let apart = apart(centers);
         let middle =
             apart.iter().zip(centers).min_by(|a, b| a.0.total_cmp(b.0)).map_or([0.0; 3], |(_, center)| *center);
-        let spread = quantile(&mut apart.clone(), 0.5).unwrap_or(0.0);
-        let mut away: Vec<f64> = points.iter().map(|p| distance(p.position.map(f64::from), middle)).collect();
-        let depth = quantile(&mut away, 0.5).unwrap_or(0.0);
+        let spread = quantile(apart.iter().copied(), 0.5).unwrap_or(0.0);
+        let away = points.iter().map(|p| distance(p.position.map(f64::from), middle));
+        let depth = quantile(away, 0.5).unwrap_or(0.0);
         let limit = CAMERA_REACH * spread.max(depth);
         let stray: Vec<bool> = apart.iter().map(|apart| limit > 0.0 && *apart > limit).collect();
         let kept = centers.iter().zip(&stray).filter(|(_, stray)| !**stray);
@@ -78,8 +72,7 @@ pub(super) fn radius(centers: &[[f64; 3]]) -> f64 {
     let apart = apart(centers);
     let Some((_, middle)) = apart.iter().zip(centers).min_by(|a, b| a.0.total_cmp(b.0)) else { return 0.0 };
     let from_middle = |center: &[f64; 3]| distance(*center, *middle);
-    let mut distances: Vec<f64> = centers.iter().map(from_middle).collect();
-    let usual = quantile(&mut distances, 0.9).unwrap_or(0.0);
+    let usual = quantile(centers.iter().map(from_middle), 0.9).unwrap_or(0.0);
     let counts = |center: &&[f64; 3]| usual <= 0.0 || from_middle(center) <= OUTLIER * usual;
     let kept: Vec<[f64; 3]> = centers.iter().filter(counts).copied().collect();
     let mean: [f64; 3] = std::array::from_fn(|i| kept.iter().map(|c| c[i]).sum::<f64>() / kept.len() as f64);

@@ -10,6 +10,7 @@ use serde::Serialize;
 
 use super::{Camera, Error, Note, Prior, PriorKind, Reference, Scene, View, rank_correlation, resample};
 use crate::scene;
+use crate::statistics::median;
 
 /// How bad a finding is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -213,11 +214,6 @@ fn seen(scene: &Scene, camera: &Camera) -> Vec<Seen> {
     nearest.into_iter().flatten().collect()
 }
 
-pub(super) fn median(values: &mut [f64]) -> Option<f64> {
-    values.sort_unstable_by(f64::total_cmp);
-    values.get(values.len() / 2).copied()
-}
-
 fn luminance(color: [u8; 3]) -> f64 {
     let [r, g, b] = color.map(f64::from);
     0.299 * r + 0.587 * g + 0.114 * b
@@ -266,10 +262,8 @@ fn against_points(prior: &Prior, points: &[Seen]) -> (Option<f64>, Option<f64>) 
         own += (f64::from(*v) - mv).powi(2);
     }
     let scale = if own > 0.0 { cross / own } else { 0.0 };
-    let mut off: Vec<f64> =
-        values.iter().zip(&truth).map(|(v, t)| (scale * (f64::from(*v) - mv) + mt - f64::from(*t)).abs()).collect();
-    let mut sizes: Vec<f64> = truth.iter().map(|t| f64::from(*t)).collect();
-    let residual = median(&mut off).zip(median(&mut sizes)).map(|(off, size)| off / size);
+    let off = values.iter().zip(&truth).map(|(v, t)| (scale * (f64::from(*v) - mv) + mt - f64::from(*t)).abs());
+    let residual = median(off).zip(median(truth.iter().copied())).map(|(off, size)| off / size);
     (correlation, residual)
 }
 
@@ -315,8 +309,7 @@ fn mask_findings(scene: &Scene, report: &mut Report) {
             format!("the object is in {} views only: what is behind it is hardly seen from elsewhere", shown.len());
         report.add(Severity::Problem, "masks", None, message);
     }
-    let mut sizes: Vec<f64> = shown.iter().map(|c| c.1).collect();
-    let typical = median(&mut sizes).unwrap_or(0.0);
+    let typical = median(shown.iter().map(|c| c.1)).unwrap_or(0.0);
     for (name, size) in &shown {
         if *size > 6.0 * typical || *size < typical / 12.0 {
             let message = format!(
@@ -444,8 +437,7 @@ fn depth_findings(scene: &Scene, report: &mut Report) {
             format!("its prior hardly follows the sparse points (rank correlation {r:.2}): is it this view's?");
         report.add(Severity::Problem, "depth", Some(name), message);
     }
-    let mut residuals: Vec<f64> = all.iter().filter_map(|a| a.2).collect();
-    if let Some(typical) = median(&mut residuals) {
+    if let Some(typical) = median(all.iter().filter_map(|a| a.2)) {
         let message = format!(
             "priors agree with the sparse points within {:.1} % (median over views, after scale and shift)",
             100.0 * typical

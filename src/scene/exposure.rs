@@ -12,6 +12,7 @@
 use rayon::prelude::*;
 
 use super::{Camera, Scene, View};
+use crate::statistics::median;
 
 /// Points that are looked at, at most.
 const POINTS: usize = 20_000;
@@ -103,10 +104,8 @@ fn ratios(one: &[Sample], other: &[Sample]) -> Option<Sample> {
     let [from, to] = if all.len() < LEAST_SHARED { None } else { most_common(&mut all) }?;
     let of = |channel: usize| {
         let agreeing = both().filter(|(a, b)| (from..=to).contains(&(a[0] - b[0])));
-        let mut values: Vec<f64> = agreeing.map(|(a, b)| a[channel] - b[channel]).filter(|v| v.is_finite()).collect();
-        let enough = 2 * values.len() >= LEAST_SHARED;
-        values.sort_unstable_by(f64::total_cmp);
-        enough.then(|| values[values.len() / 2])
+        let values: Vec<f64> = agreeing.map(|(a, b)| a[channel] - b[channel]).filter(|v| v.is_finite()).collect();
+        median(values.iter().copied()).filter(|_| 2 * values.len() >= LEAST_SHARED)
     };
     let luminance = of(0)?;
     Some([luminance, of(1).unwrap_or(luminance), of(2).unwrap_or(luminance), of(3).unwrap_or(luminance)])
@@ -136,10 +135,8 @@ pub(super) fn exposures(scene: &Scene) -> Vec<Option<Exposure>> {
         }
     }
     let known = |i: &usize| witnesses[*i][1] >= LEAST_WITNESSES && 2 * witnesses[*i][1] > witnesses[*i][0];
-    let usual: [f64; 4] = std::array::from_fn(|c| {
-        let mut all: Vec<f64> = (0..cameras.len()).filter(known).map(|i| solved[c][i]).collect();
-        super::doctor::median(&mut all).unwrap_or(0.0)
-    });
+    let usual: [f64; 4] =
+        std::array::from_fn(|c| median((0..cameras.len()).filter(known).map(|i| solved[c][i])).unwrap_or(0.0));
     let of = |i: usize| {
         let [luminance, r, g, b] = std::array::from_fn(|c| (solved[c][i] - usual[c]).exp());
         known(&i).then_some(Exposure { luminance, channels: [r, g, b] })

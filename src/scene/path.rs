@@ -3,6 +3,7 @@
 use glam::{DMat3, DVec3};
 
 use super::{Camera, Point};
+use crate::statistics::median;
 
 /// A smooth closed path of `frames` pinhole cameras, all looking at the point that the train cameras look at
 /// ([`focus`]).
@@ -111,13 +112,11 @@ impl Average {
             }
         }
         let ahead = self.direction.normalize_or(DVec3::Z);
-        let mut depths: Vec<f64> = points
+        let depths = points
             .iter()
             .map(|p| (DVec3::from_array(p.position.map(f64::from)) - self.center).dot(ahead))
-            .filter(|depth| *depth > 0.0)
-            .collect();
-        depths.sort_by(f64::total_cmp);
-        let depth = depths.get(depths.len() / 2).copied().unwrap_or(1.0);
+            .filter(|depth| *depth > 0.0);
+        let depth = median(depths).unwrap_or(1.0);
         self.center + ahead * depth
     }
 }

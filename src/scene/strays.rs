@@ -10,6 +10,7 @@ use super::bounds::Bounds;
 use super::colmap::{Image, Model, Tracks};
 use super::note::{Note, Notes};
 use super::{Point, Poses, layout};
+use crate::statistics::median;
 
 /// Two photographs hang together by this many points at least, the least that COLMAP takes for a match ...
 const LINK: f64 = 15.0;
@@ -40,12 +41,6 @@ fn root(parents: &mut [usize], mut at: usize) -> usize {
     at
 }
 
-/// The value in the middle; 0 of none.
-fn median(mut values: Vec<u32>) -> f64 {
-    let middle = values.len() / 2;
-    if values.is_empty() { 0.0 } else { f64::from(*values.select_nth_unstable(middle).1) }
-}
-
 /// Which photographs hang together. Nothing is said of models without tracks.
 fn linked(images: &[Image], points: &[Point], tracks: &Tracks) -> Linked {
     let mut found = Linked { loose: vec![false; images.len()], parts: vec![] };
@@ -74,7 +69,7 @@ fn linked(images: &[Image], points: &[Point], tracks: &Tracks) -> Linked {
             }
         }
     }
-    let usual = median(seen.iter().copied().filter(|seen| *seen > 0).collect());
+    let usual = median(seen.iter().copied().filter(|seen| *seen > 0)).unwrap_or(0.0);
     let least = LINK.min(LINK_SHARE * usual).max(1.0);
     let mut parents: Vec<usize> = (0..images.len()).collect();
     for ((one, other), count) in shared {
@@ -90,7 +85,7 @@ fn linked(images: &[Image], points: &[Point], tracks: &Tracks) -> Linked {
     if 2 * main.len() <= images.len() {
         return found;
     }
-    let support = |part: &[usize]| median(part.iter().map(|at| seen[*at]).collect());
+    let support = |part: &[usize]| median(part.iter().map(|at| seen[*at])).unwrap_or(0.0);
     let needed = SUPPORTED * support(main);
     for part in parts.values() {
         if support(part) < needed {

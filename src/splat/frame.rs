@@ -5,6 +5,7 @@
 //! frame they lie where the splat has matter. A frame that is nearly right, as where only some of the model's cameras were
 //! used, is refined by iterated closest points (Besl and McKay 1992) without rotation, with a scale as in Umeyama (1991).
 
+use crate::statistics::median;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 
 /// Points that are looked at, at most.
@@ -34,12 +35,6 @@ impl Frame {
     }
 }
 
-fn median(values: impl IntoIterator<Item = f64>) -> f64 {
-    let mut values: Vec<f64> = values.into_iter().collect();
-    let middle = values.len() / 2;
-    if values.is_empty() { f64::NAN } else { *values.select_nth_unstable_by(middle, f64::total_cmp).1 }
-}
-
 fn mean(points: &[[f64; 3]]) -> [f64; 3] {
     std::array::from_fn(|c| points.iter().map(|p| p[c]).sum::<f64>() / points.len() as f64)
 }
@@ -60,9 +55,9 @@ impl Matter<'_> {
     /// Median distance of the points from matter, over the median distance of the points from their middle.
     fn misses(&self, points: &[[f64; 3]], frame: &Frame) -> f64 {
         let moved: Vec<[f64; 3]> = points.iter().map(|p| frame.apply(*p)).collect();
-        let middle: [f64; 3] = std::array::from_fn(|c| median(moved.iter().map(|p| p[c])));
-        let spread = median(moved.iter().map(|p| distance(*p, middle)));
-        median(moved.iter().map(|p| self.nearest(*p).0)) / spread
+        let median = |values: &dyn Fn(&[f64; 3]) -> f64| median(moved.iter().map(values)).unwrap_or(f64::NAN);
+        let middle: [f64; 3] = std::array::from_fn(|c| median(&|p| p[c]));
+        median(&|p| self.nearest(*p).0) / median(&|p| distance(*p, middle))
     }
 
     /// The frame moved and scaled so that the nearest of the points come to lie on matter.

@@ -18,6 +18,7 @@ use crate::prepare::poses;
 use crate::render::Config;
 use crate::render::view::{Rendered, Renderer};
 use crate::scene::{self, Camera, colmap};
+use crate::statistics::median;
 
 /// Below this a Gaussian touches no pixel.
 const FAINT: f64 = 1.0 / 255.0;
@@ -98,11 +99,7 @@ pub fn depth(splat: &Splat, cameras: &[Camera]) -> Result<f64, Error> {
         };
         depths.extend(some().filter(inside).map(|p| camera.to_camera(*p)[2]));
     }
-    if depths.is_empty() {
-        return Err(apart());
-    }
-    let middle = depths.len() / 2;
-    Ok(*depths.select_nth_unstable_by(middle, f64::total_cmp).1)
+    median(depths).ok_or_else(apart)
 }
 
 /// Takes the cameras of a COLMAP model to the frame of a splat that was moved and scaled against it. Returns whether it was.

@@ -7,6 +7,7 @@
 use super::Ground;
 use super::mixture::{Color, Mixture, brightened};
 use crate::scene::resample::squared_distances;
+use crate::statistics::median;
 
 /// Distance of each cell from the border of a mask, in cells: positive inside, negative outside, no farther than `reach`.
 fn depths(mask: &[bool], side: usize, reach: u32) -> Vec<f64> {
@@ -54,11 +55,6 @@ struct Crossing {
 struct Profile {
     along: f64,
     amounts: Vec<f64>,
-}
-
-fn median(values: &mut [f64]) -> f64 {
-    values.sort_unstable_by(f64::total_cmp);
-    0.5 * (values[(values.len() - 1) / 2] + values[values.len() / 2])
 }
 
 /// A shadow's border: places, how far along the light each lies, and which way is in.
@@ -131,7 +127,7 @@ fn across(borders: &Borders<'_>) -> Option<(Color, Vec<Profile>)> {
     if deeps.len() < TELLING {
         return None;
     }
-    let drop: Color = std::array::from_fn(|c| median(&mut deeps.iter().map(|d| d[c]).collect::<Vec<f64>>()));
+    let drop: Color = std::array::from_fn(|c| median(deeps.iter().map(|d| d[c])).expect("there are crossings"));
     crossings.sort_by(|a, b| a.along.total_cmp(&b.along));
     let parts = (crossings.len() / TELLING).clamp(1, PARTS);
     let profiles = crossings.chunks(crossings.len().div_ceil(parts)).map(|part| {
@@ -139,8 +135,9 @@ fn across(borders: &Borders<'_>) -> Option<(Color, Vec<Profile>)> {
         let length = 2 * borders.across + 1;
         let mut amounts: Vec<f64> = (0..length)
             .map(|k| {
-                let mut values: Vec<f64> = part.iter().filter_map(|c| c.drops[k]).map(|d| d[0]).collect();
-                if values.len() < 8 { f64::NAN } else { median(&mut values) / drop[0] }
+                let values = || part.iter().filter_map(|c| c.drops[k]).map(|d| d[0]);
+                let known = values().count() >= 8;
+                median(values()).filter(|_| known).map_or(f64::NAN, |median| median / drop[0])
             })
             .collect();
         // It sets in and does not let up again.

@@ -1,5 +1,6 @@
 //! The surface that the object stands on: a plane through what is seen around the object, which the object rests on.
 
+use crate::statistics::{median, quantile};
 use glam::{DMat3, DVec3};
 use rand::RngExt as _;
 use rand_pcg::Pcg64;
@@ -52,19 +53,7 @@ impl Support {
 }
 
 fn middle(points: &[DVec3]) -> DVec3 {
-    let median = |axis: usize| {
-        let mut values: Vec<f64> = points.iter().map(|p| p[axis]).collect();
-        values.sort_unstable_by(f64::total_cmp);
-        values[values.len() / 2]
-    };
-    DVec3::new(median(0), median(1), median(2))
-}
-
-/// The value below which a share of all lie.
-fn quantile(mut values: Vec<f64>, share: f64) -> f64 {
-    values.sort_unstable_by(f64::total_cmp);
-    let last = values.len().saturating_sub(1);
-    values[((values.len() as f64 * share) as usize).min(last)]
+    DVec3::from(std::array::from_fn(|axis| median(points.iter().map(|p| p[axis])).expect("there are points")))
 }
 
 /// The object's middle and the radius around it that nine in ten of its places lie in; nothing where there are too few.
@@ -73,7 +62,7 @@ pub fn extent(object: &[DVec3]) -> Option<(DVec3, f64)> {
         return None;
     }
     let middle = middle(object);
-    let radius = quantile(object.iter().map(|p| (*p - middle).length()).collect(), 0.9);
+    let radius = quantile(object.iter().map(|p| (*p - middle).length()), 0.9)?;
     (radius > 0.0).then_some((middle, radius))
 }
 
@@ -89,7 +78,7 @@ pub fn find(around: &[DVec3], object: &[DVec3], up: DVec3, seed: u64) -> Option<
     let rests = |through: DVec3, normal: DVec3| {
         let heights: Vec<f64> = object.iter().map(|p| (*p - through).dot(normal)).collect();
         let above = heights.iter().filter(|h| **h > -ON * size).count() as f64 / heights.len() as f64;
-        above >= ABOVE && quantile(heights, LOWEST).abs() <= GAP * size
+        above >= ABOVE && quantile(heights, LOWEST).is_some_and(|lowest| lowest.abs() <= GAP * size)
     };
     let mut rng = Pcg64::new(seed.into(), 61);
     let mut best: Option<(f64, DVec3, DVec3)> = None;
@@ -122,8 +111,8 @@ pub fn find(around: &[DVec3], object: &[DVec3], up: DVec3, seed: u64) -> Option<
     let (x, y) = normal.any_orthonormal_pair();
     let support = Support { foot, up: normal, along: [x, y], height: 0.0, radius: 0.0 };
     let local: Vec<DVec3> = object.iter().map(|p| support.local(*p)).collect();
-    let height = quantile(local.iter().map(|p| p.z).collect(), 0.97);
-    let radius = quantile(local.iter().map(|p| p.truncate().length()).collect(), 0.95);
+    let height = quantile(local.iter().map(|p| p.z), 0.97)?;
+    let radius = quantile(local.iter().map(|p| p.truncate().length()), 0.95)?;
     (height > 0.0).then_some(Support { height, radius, ..support })
 }
 

@@ -7,6 +7,7 @@ use rayon::prelude::*;
 use super::plane::Support;
 use crate::prepare::depth::{DepthMap, Witness};
 use crate::scene::{Camera, resample};
+use crate::statistics::median;
 
 /// Cells on each side of the texture, at most.
 const MOST: usize = 320;
@@ -74,12 +75,11 @@ fn disagreement(support: &Support, photographs: &[Photograph<'_>]) -> f64 {
             Some(log[0] + log[1] + log[2])
         };
         let every = photographs.len().div_ceil(ASKED).max(1);
-        let mut values: Vec<f32> = photographs.iter().step_by(every).filter_map(of).collect();
+        let values: Vec<f32> = photographs.iter().step_by(every).filter_map(of).collect();
         if values.len() < 4 {
             return None;
         }
-        values.sort_unstable_by(f32::total_cmp);
-        let median = values[values.len() / 2];
+        let median = median(values.iter().copied())? as f32;
         let mut apart: Vec<f32> = values.iter().map(|v| (v - median).abs()).collect();
         apart.sort_unstable_by(f32::total_cmp);
         // The farthest quarter sees something else.
@@ -135,18 +135,14 @@ impl Texture {
     /// The texture around an object, its cells somewhat smaller than a pixel of the median photograph.
     pub fn of(support: &Support, photographs: &[Photograph<'_>]) -> Self {
         let half = reach(support);
-        let mut pixels: Vec<f64> = photographs
-            .iter()
-            .filter_map(|photograph| {
-                let z = photograph.camera.to_camera(support.foot.to_array())[2];
-                (z > 0.0).then(|| z / f64::from(photograph.camera.focal[0].min(photograph.camera.focal[1])))
-            })
-            .collect();
-        pixels.sort_unstable_by(f64::total_cmp);
-        let pixel = pixels.get(pixels.len() / 2).copied().unwrap_or(half / 50.0);
+        let pixels = photographs.iter().filter_map(|photograph| {
+            let z = photograph.camera.to_camera(support.foot.to_array())[2];
+            (z > 0.0).then(|| z / f64::from(photograph.camera.focal[0].min(photograph.camera.focal[1])))
+        });
+        let pixel = median(pixels).unwrap_or(half / 50.0);
         let side = ((FINER * 2.0 * half / pixel).ceil() as usize).clamp(64, MOST);
         let mut texture = Self { side, cell: 2.0 * half / side as f64, log: vec![] };
-        let log = |cell: usize| median(texture.place(support, cell), photographs);
+        let log = |cell: usize| shown(texture.place(support, cell), photographs);
         texture.log = (0..side * side).into_par_iter().map(log).collect();
         texture
     }
@@ -164,20 +160,13 @@ impl Texture {
 }
 
 /// The median of what photographs show of a place.
-fn median(place: [f64; 3], photographs: &[Photograph<'_>]) -> [f32; 3] {
+fn shown(place: [f64; 3], photographs: &[Photograph<'_>]) -> [f32; 3] {
     let mut channels: [Vec<f32>; 3] = Default::default();
     for pixel in photographs.iter().filter_map(|photograph| Some(photograph.log(photograph.shows(place)?))) {
         pixel.into_iter().zip(&mut channels).for_each(|(v, c)| c.push(v));
     }
-    let count = channels[0].len();
-    if count < FEWEST {
-        return [f32::NAN; 3];
-    }
-    let median = |mut values: Vec<f32>| {
-        values.sort_unstable_by(f32::total_cmp);
-        0.5 * (values[(count - 1) / 2] + values[count / 2])
-    };
-    channels.map(median)
+    let known = channels[0].len() >= FEWEST;
+    channels.map(|values| median(values).filter(|_| known).map_or(f32::NAN, |median| median as f32))
 }
 
 /// How much darker a photograph shows some cells than others, beyond what the texture's own colours there differ by: the
@@ -189,14 +178,13 @@ pub fn left(
     [inside, outside]: [&[usize]; 2],
     lit: &[f32],
 ) -> Option<f64> {
-    let median = |cells: &[usize]| {
+    let usual = |cells: &[usize]| {
         let one = |cell: &usize| {
             let log = photograph.log(photograph.shows(texture.place(support, *cell))?);
             Some((log[0] + log[1] + log[2]) / 3.0 - lit[*cell])
         };
-        let mut values: Vec<f32> = cells.iter().filter_map(one).filter(|v| v.is_finite()).collect();
-        values.sort_unstable_by(f32::total_cmp);
-        (values.len() >= 12.max(cells.len() / 8)).then(|| f64::from(values[values.len() / 2]))
+        let values: Vec<f32> = cells.iter().filter_map(one).filter(|v| v.is_finite()).collect();
+        median(values.iter().copied()).filter(|_| values.len() >= 12.max(cells.len() / 8))
     };
-    Some((median(inside)? - median(outside)?).exp())
+    Some((usual(inside)? - usual(outside)?).exp())
 }

@@ -13,9 +13,9 @@ use rayon::prelude::*;
 
 use super::points::pixel_of;
 use super::reference::Surroundings;
-use super::sparse::deviation;
 use super::stereo::bilinear;
 use crate::scene::{Camera, Scene, View, resample};
+use crate::statistics::{deviation, median};
 
 /// How far beyond a mask is looked, as a share of the picture's longer side.
 const REACH: f64 = 0.025;
@@ -164,8 +164,7 @@ fn judge(scene: &Scene, at: usize, mask: &GrayImage, wide: &[Option<GrayImage>])
     if usual.len() < FEWEST {
         return None;
     }
-    let usual: [[f64; 2]; 3] =
-        std::array::from_fn(|c| median_and_deviation(&mut usual.iter().map(|off| off[c][0]).collect::<Vec<f64>>()));
+    let usual: [[f64; 2]; 3] = std::array::from_fn(|c| median_and_deviation(usual.iter().map(|off| off[c][0])));
     let score = |(pixel, distance, off): (usize, i32, [[f64; 2]; 3])| {
         let squares = off
             .iter()
@@ -240,18 +239,15 @@ fn consensus(others: &[(&Camera, &RgbImage, Option<&GrayImage>)], place: [f64; 3
         clear.then(|| bilinear(image, camera.project(place)?)).flatten()
     };
     let colors: Vec<[f32; 3]> = others.iter().filter_map(color).take(MOST).collect();
-    (colors.len() >= FEWEST).then(|| {
-        std::array::from_fn(|c| {
-            median_and_deviation(&mut colors.iter().map(|color| f64::from(color[c])).collect::<Vec<f64>>())
-        })
-    })
+    (colors.len() >= FEWEST)
+        .then(|| std::array::from_fn(|c| median_and_deviation(colors.iter().map(|color| f64::from(color[c])))))
 }
 
-/// The median of values, and the standard deviation that their median absolute deviation tells.
-fn median_and_deviation(values: &mut [f64]) -> [f64; 2] {
-    let median = *values.select_nth_unstable_by(values.len() / 2, f64::total_cmp).1;
-    values.iter_mut().for_each(|v| *v = (*v - median).abs());
-    [median, deviation(values)]
+/// The median of at least one value, and the standard deviation that their median absolute deviation tells.
+fn median_and_deviation(values: impl Iterator<Item = f64> + Clone) -> [f64; 2] {
+    let median = median(values.clone()).expect("there are values");
+    let deviation = deviation(values.map(|v| (v - median).abs())).expect("as many");
+    [median, deviation]
 }
 
 /// What of the values above 0 hangs together with the mask, by sides or corners; the rest is another texture's.

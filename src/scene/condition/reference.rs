@@ -4,8 +4,9 @@ use image::{GrayImage, Luma};
 use rayon::prelude::*;
 
 use super::points::pixel_of;
-use super::sparse::{Sample, deviation, fit, samples};
+use super::sparse::{Sample, fit, samples};
 use crate::scene::{Camera, Point, Prior, PriorKind, Reference, Scene};
+use crate::statistics::deviation;
 
 /// Of each reference, the depth z of its hole \[pixel\], NaN outside it: its prior brought to the scene's depth by the points
 /// outside the mask. `None` without a prior, or without enough points.
@@ -160,7 +161,7 @@ fn robust_plane(weighted: &mut [Weighted], reach: f64) -> f64 {
     for _ in 0..ROUNDS {
         let [value, x, y] = plane(weighted, reach);
         let residual = |s: &Weighted| (s.2 - value - x * s.1[0] - y * s.1[1]).abs();
-        let deviation = deviation(&mut weighted.iter().map(residual).collect::<Vec<f64>>());
+        let deviation = deviation(weighted.iter().map(residual)).unwrap_or(0.0);
         if deviation == 0.0 {
             break;
         }

@@ -7,6 +7,7 @@ use rayon::prelude::*;
 
 use crate::scene::priors::rank_correlation;
 use crate::scene::{Camera, Notes, Point, Prior, PriorKind, RELATED, Reference, Scene, View};
+use crate::statistics::{deviation, quantile};
 
 /// Fewest points that tell whether a prior fits.
 const FEWEST: usize = 24;
@@ -52,12 +53,6 @@ pub(crate) fn samples(camera: &Camera, points: &[Point], outside: Option<&image:
     blocks.iter_mut().filter_map(median).collect()
 }
 
-/// The standard deviation that the median of absolute residuals tells, as of a normal distribution. Reorders them; there is
-/// at least one.
-pub(super) fn deviation(residuals: &mut [f64]) -> f64 {
-    1.4826 * *residuals.select_nth_unstable_by(residuals.len() / 2, f64::total_cmp).1
-}
-
 /// `y ~ slope x + shift` with small influence of outliers: least absolute deviations by reweighting, then Tukey's biweight
 /// at 4.7 standard deviations, as the median absolute residual tells them (Huber and Ronchetti 2009, chapter 7). `None`
 /// where all x are one.
@@ -78,7 +73,7 @@ pub(super) fn robust_line(x: &[f64], y: &[f64]) -> Option<[f64; 2]> {
     let mut fit = line(&weight)?;
     for round in 0..40 {
         let residuals: Vec<f64> = x.iter().zip(y).map(|(x, y)| (y - fit[0] * x - fit[1]).abs()).collect();
-        let scale = deviation(&mut residuals.clone());
+        let scale = deviation(residuals.iter().copied())?;
         if scale == 0.0 {
             break;
         }
@@ -119,9 +114,7 @@ fn follows(prior: &Prior, samples: &[Sample]) -> Option<f64> {
 
 /// A disparity as the depth it means, far values brought to [`FARTHEST`]; where the prior is not a number it stays so.
 fn to_depth(prior: &Prior, [slope, shift]: [f64; 2], samples: &[Sample]) -> Prior {
-    let mut depths: Vec<f64> = samples.iter().map(|s| s.depth).collect();
-    let at = depths.len() * 98 / 100;
-    let farthest = FARTHEST * *depths.select_nth_unstable_by(at, f64::total_cmp).1;
+    let farthest = FARTHEST * quantile(samples.iter().map(|s| s.depth), 0.98).expect("a prior is fitted to samples");
     let depth = |p: f32| {
         let inverse = slope * f64::from(p) + shift;
         if p.is_finite() { (1.0 / inverse.max(1.0 / farthest)) as f32 } else { f32::NAN }

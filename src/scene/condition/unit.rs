@@ -6,6 +6,7 @@
 //! scenes that the published values were chosen on.
 
 use crate::scene::{Camera, Scene};
+use crate::statistics::median;
 
 /// Depths are counted in thirds of their median.
 const MEDIAN_DEPTH: f64 = 3.0;
@@ -30,14 +31,8 @@ pub(super) fn normalize(scene: &mut Scene, unit: f64) {
 /// `None` where no view sees a point.
 pub fn footprint(scene: &Scene) -> Option<f64> {
     let depth = MEDIAN_DEPTH * find(scene)?;
-    let mut pixels: Vec<f64> =
-        scene.train.iter().map(|v| 1.0 / f64::from(v.camera.focal[0].max(v.camera.focal[1]))).collect();
-    Some(depth * median(&mut pixels)?)
-}
-
-fn median(values: &mut [f64]) -> Option<f64> {
-    let middle = values.len().checked_sub(1)? / 2;
-    Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
+    let pixels = scene.train.iter().map(|v| 1.0 / f64::from(v.camera.focal[0].max(v.camera.focal[1])));
+    Some(depth * median(pixels)?)
 }
 
 fn find(scene: &Scene) -> Option<f64> {
@@ -54,7 +49,7 @@ fn find(scene: &Scene) -> Option<f64> {
         };
         depths.extend(points.clone().filter_map(|p| depth(p.position)));
     }
-    let depth = median(&mut depths)? / MEDIAN_DEPTH;
+    let depth = median(depths)? / MEDIAN_DEPTH;
     let spread = spread(&cameras);
     let octaves = |ratio: f64| (ratio.log2() * GRID).round() / GRID;
     let found = if spread > 0.0 { spread * octaves(depth / spread).exp2() } else { depth };

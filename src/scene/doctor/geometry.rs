@@ -5,6 +5,7 @@ use rayon::prelude::*;
 
 use super::{Report, Severity};
 use crate::scene::{Camera, Scene};
+use crate::statistics::{median, quantile};
 
 /// Points that are looked at, at most.
 const POINTS: usize = 20_000;
@@ -47,12 +48,11 @@ fn shown(camera: &Camera, points: &[[f64; 3]]) -> Shown {
         inside
     };
     let inside = points.iter().map(&mut look).collect();
-    let extent = |values: &mut Vec<f64>| {
-        values.sort_unstable_by(f64::total_cmp);
-        let of = |share: f64| values[((values.len() - 1) as f64 * share) as usize];
-        if values.is_empty() { 0.0 } else { of(0.95) - of(0.05) }
+    let extent = |values: &Vec<f64>| {
+        let of = |share: f64| quantile(values.iter().copied(), share);
+        of(0.95).zip(of(0.05)).map_or(0.0, |(high, low)| high - low)
     };
-    let extent = at.iter_mut().map(extent).fold(0.0, f64::max);
+    let extent = at.iter().map(extent).fold(0.0, f64::max);
     Shown { inside, in_front, extent }
 }
 
@@ -60,7 +60,7 @@ fn shown(camera: &Camera, points: &[[f64; 3]]) -> Shown {
 fn spread(places: &[[f64; 3]]) -> f64 {
     let places: Vec<&[f64; 3]> = places.iter().step_by(places.len().div_ceil(100).max(1)).collect();
     let pairs = places.iter().enumerate().flat_map(|(i, a)| places[..i].iter().map(move |b| distance(a, b)));
-    super::median(&mut pairs.collect::<Vec<f64>>()).unwrap_or(0.0)
+    median(pairs).unwrap_or(0.0)
 }
 
 fn distance(a: &[f64; 3], b: &[f64; 3]) -> f64 {
@@ -106,7 +106,7 @@ pub(super) fn look(scene: &Scene, report: &mut Report) {
     }
     let centers: Vec<[f64; 3]> = scene.train.iter().map(|view| view.camera.center()).collect();
     let between = centers.iter().take(100).flat_map(|c| points.iter().step_by(97).map(move |p| distance(c, p)));
-    let depth = super::median(&mut between.collect::<Vec<f64>>()).unwrap_or(0.0);
+    let depth = median(between).unwrap_or(0.0);
     if points.len() > 1 && spread(&points) <= LEAST_SPREAD * depth {
         let message = "all points stand at one place: the model is not of these photographs, or was exported wrongly";
         report.add(Severity::Problem, check, None, message);
@@ -131,8 +131,8 @@ pub(super) fn look(scene: &Scene, report: &mut Report) {
         report.add(Severity::Problem, check, None, message);
         return;
     }
-    let mut extents: Vec<f64> = shown.iter().filter(|shown| inside(shown) > 0).map(|shown| shown.extent).collect();
-    if let Some(extent) = super::median(&mut extents).filter(|extent| points.len() > 1 && *extent < LEAST_EXTENT) {
+    let extents = shown.iter().filter(|shown| inside(shown) > 0).map(|shown| shown.extent);
+    if let Some(extent) = median(extents).filter(|extent| points.len() > 1 && *extent < LEAST_EXTENT) {
         let message = format!(
             "the points fill {:.2} % of a picture's side: cameras and points are not in the same unit, or not of one place",
             100.0 * extent
