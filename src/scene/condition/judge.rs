@@ -13,7 +13,6 @@ use rayon::prelude::*;
 
 use super::points::pixel_of;
 use super::reference::Surroundings;
-use super::stereo::bilinear;
 use crate::scene::{Camera, Scene, View, resample};
 use crate::statistics::{deviation, median};
 
@@ -236,11 +235,10 @@ fn consensus(others: &[(&Camera, &RgbImage, Option<&GrayImage>)], place: [f64; 3
     let color = |(camera, image, mask): &(&Camera, &RgbImage, Option<&GrayImage>)| {
         let pixel = pixel_of(camera, place)?;
         let clear = mask.is_none_or(|mask| mask.as_raw()[pixel] == 0);
-        clear.then(|| bilinear(image, camera.project(place)?)).flatten()
+        clear.then(|| Some(resample::color_at(image, camera.project(place)?))).flatten()
     };
-    let colors: Vec<[f32; 3]> = others.iter().filter_map(color).take(MOST).collect();
-    (colors.len() >= FEWEST)
-        .then(|| std::array::from_fn(|c| median_and_deviation(colors.iter().map(|color| f64::from(color[c])))))
+    let colors: Vec<[f64; 3]> = others.iter().filter_map(color).take(MOST).collect();
+    (colors.len() >= FEWEST).then(|| std::array::from_fn(|c| median_and_deviation(colors.iter().map(|color| color[c]))))
 }
 
 /// The median of at least one value, and the standard deviation that their median absolute deviation tells.

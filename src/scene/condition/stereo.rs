@@ -133,7 +133,7 @@ fn supported(volume: &[Vec<f32>], picture: &RgbImage, pixel: usize) -> Vec<f32> 
 }
 
 /// The picture at a place in pixels, between the four pixels around it; `None` outside their centres.
-pub(super) fn bilinear(image: &RgbImage, [u, v]: [f64; 2]) -> Option<[f32; 3]> {
+fn bilinear(image: &RgbImage, [u, v]: [f64; 2]) -> Option<[f32; 3]> {
     let (x, y) = (u - 0.5, v - 0.5);
     let (w, h) = (image.width() as usize, image.height() as usize);
     if !(x >= 0.0 && y >= 0.0 && x < (w - 1) as f64 && y < (h - 1) as f64) {
