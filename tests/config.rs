@@ -5,7 +5,6 @@ use std::path::Path;
 
 use clap::Parser;
 use gscream_vk::config::{Error, PRESETS, Settings, SettingsArgs, Source};
-use gscream_vk::losses::config::Region;
 use gscream_vk::train::config::ViewOrder;
 
 #[derive(Parser)]
@@ -103,7 +102,7 @@ fn set_takes_toml_values_and_bare_words() {
         "--set",
         "train.view_order=sequential",
         "--set",
-        "losses.depth.reference_inside_region=\"random-rectangle\"",
+        "scene.truth_reference=\"test_001\"",
         "--set",
         "losses.depth.enabled=false",
         "--set",
@@ -115,7 +114,7 @@ fn set_takes_toml_values_and_bare_words() {
     ])
     .unwrap();
     assert_eq!(settings.train.view_order, ViewOrder::Sequential);
-    assert_eq!(settings.losses.depth.reference_inside_region, Region::RandomRectangle);
+    assert_eq!(settings.scene.truth_reference, "test_001");
     assert!(!settings.losses.depth.enabled);
     assert_eq!(settings.train.background, [1.0, 0.5, 0.0]);
     assert_eq!(settings.model.voxel, 1.0);

@@ -8,7 +8,6 @@ use crate::common::skip::{Lack, skip};
 use gscream_vk::config::Settings;
 use gscream_vk::gpu::form::without_form;
 use gscream_vk::gpu::{Descriptors, Form, Gpu, Options, testing};
-use gscream_vk::losses::config::Region;
 use gscream_vk::model::files;
 use gscream_vk::render::forward::Capacity;
 use gscream_vk::render::view::Renderer;
@@ -335,7 +334,6 @@ fn depth_weighs_on_each_view_what_its_settings_say() {
         // Powers of two make doubling exact.
         let depth = &mut settings.losses.depth;
         (depth.reference_weight, depth.reference_inside_weight, depth.other_weight) = (1.0, 7.0, 0.125);
-        depth.reference_inside_region = Region::Mask;
         let gradient = &mut depth.gradient;
         (gradient.weight, gradient.reference_weight, gradient.other_weight) = (0.5, 1.0, 0.125);
         change(depth);

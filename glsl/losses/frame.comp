@@ -27,10 +27,6 @@ layout(push_constant, scalar) uniform Push {
 #ifdef DEPTH
   float depth_outside; // depth weight outside the mask
   float depth_inside;  // depth weight inside
-  float depth_added;   // added in the rectangle
-  uint width;          // pixels in a line
-  uvec2 low;           // the rectangle's first column and line
-  uvec2 high;          // the column and line behind its last
 #endif
 } push;
 void main() {
@@ -47,9 +43,6 @@ void main() {
   bool has = prior[pixel] > NO_PRIOR;
   given[pixel] = has ? 1.0 : 0.0;
   valid[pixel] = has && word >> 24 == 0u ? 1.0 : 0.0;
-  uvec2 at = uvec2(pixel % push.width, pixel / push.width);
-  bool added = all(greaterThanEqual(at, push.low)) && all(lessThan(at, push.high));
-  float at_pixel = mix(push.depth_outside, push.depth_inside, share) + (added ? push.depth_added : 0.0);
-  depth_weight[pixel] = has ? at_pixel : 0.0;
+  depth_weight[pixel] = has ? mix(push.depth_outside, push.depth_inside, share) : 0.0;
 #endif
 }

@@ -81,6 +81,16 @@ pub enum Error {
         /// The nearest known key, or the keys of the section.
         hint: String,
     },
+    /// A key that older versions had, with a value that this one has not.
+    #[error("{origin}: `{key}` is gone: {instead}")]
+    Removed {
+        /// Where.
+        origin: Origin,
+        /// The key, dotted from the root.
+        key: String,
+        /// What to do instead.
+        instead: &'static str,
+    },
     /// A value of a wrong type.
     #[error("{origin}: `{key}`: {message}")]
     Type {

@@ -5,7 +5,7 @@ use serde::Deserialize;
 use toml::de::{DeTable, DeValue};
 use toml::{Spanned, Table, Value};
 
-use super::removed::without_removed;
+use super::removed::{instead, without_removed};
 use super::{Error, Invalid, Origin, PRESETS, Settings, Source};
 
 /// The layers laid over each other so far, and who set each key.
@@ -151,6 +151,7 @@ fn key_at(table: &DeTable<'_>, prefix: &str, offset: usize) -> Option<String> {
 fn explain(error: &toml::de::Error, tree: &DeTable<'_>, origin: Origin) -> Error {
     let key = error.span().and_then(|span| key_at(tree, "", span.start)).unwrap_or_default();
     match error.message().strip_prefix("unknown field `") {
+        Some(_) if let Some(instead) = instead(&key) => Error::Removed { origin, key, instead },
         Some(rest) => {
             // Serde's wording: "unknown field `a`, expected one of `b`, `c`".
             let mut quoted = rest.split('`');

@@ -26,10 +26,8 @@ pub struct Depth {
     pub enabled: bool,
     /// L1 weight on every pixel of the reference view.
     pub reference_weight: f64,
-    /// L1 weight added to `reference_weight` inside `reference_inside_region`.
+    /// L1 weight added to `reference_weight` inside the mask.
     pub reference_inside_weight: f64,
-    /// Where the added weight applies on the reference view.
-    pub reference_inside_region: Region,
     /// The reference's prior is brought to the scene's depth by the points of the model, once; `false` fits the rendered
     /// depth to it in every step (GScream, equation 4). Rendered depth is nearer than the surface where something thin hangs
     /// in front of it, and a fit hands that error on to the hole.
@@ -38,17 +36,6 @@ pub struct Depth {
     pub other_weight: f64,
     /// The multi-scale gradient of the depth difference.
     pub gradient: DepthGradient,
-}
-
-/// Where the reference view's depth weighs more.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Region {
-    /// Inside the mask, as the paper has it.
-    Mask,
-    /// Inside a rectangle of 80 % of the mask's bounding box, placed at random each step in that box enlarged
-    /// 1.5 times, as the release has it.
-    RandomRectangle,
 }
 
 /// Total variation of the depth difference over pixels 1, 2, 4, ... apart.
@@ -77,7 +64,6 @@ impl Default for Depth {
             enabled: true,
             reference_weight: 1.0,
             reference_inside_weight: 99.0,
-            reference_inside_region: Region::Mask,
             align_to_points: true,
             other_weight: 0.1,
             gradient: DepthGradient::default(),

@@ -37,17 +37,6 @@ fn mix(outside: f32, inside: f32, share: f64) -> f32 {
     (f64::from(outside) * (1.0 - share) + f64::from(inside) * share) as f32
 }
 
-/// A rectangle of pixels in which a weight is added.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Rectangle {
-    /// First column and line.
-    pub low: [u32; 2],
-    /// The column and line behind the last.
-    pub high: [u32; 2],
-    /// The weight added.
-    pub added: f32,
-}
-
 impl Reference for frame::Kernel {
     fn reference(host: frame::Host<'_>, push: frame::Push, (): ()) {
         let pixels = push.pixels as usize;
@@ -65,10 +54,7 @@ impl Reference for frame::Kernel {
         choose(host.given, &|pixel, _| if has(pixel) { 1.0 } else { 0.0 });
         choose(host.valid, &|pixel, share| if has(pixel) && share == 0.0 { 1.0 } else { 0.0 });
         choose(host.depth_weight, &|pixel, share| {
-            let at = [pixel as u32 % push.width, pixel as u32 / push.width];
-            let added = (0..2).all(|i| (push.low[i]..push.high[i]).contains(&at[i]));
-            let weight = mix(push.depth_outside, push.depth_inside, share) + if added { push.depth_added } else { 0.0 };
-            if has(pixel) { weight } else { 0.0 }
+            if has(pixel) { mix(push.depth_outside, push.depth_inside, share) } else { 0.0 }
         });
     }
     /// A division, two products and two sums of positive terms.
@@ -122,13 +108,13 @@ impl Frame {
     }
 
     /// Records the expansion of `picture` \[pixel\], see [`pack`]. The depth's arrays are written with `depth` only: the
-    /// weights of its L1 loss, where they are larger, and the prior \[pixel\].
+    /// weights of its L1 loss and the prior \[pixel\].
     pub fn forward(
         &self,
         rec: &mut Recorder<'_>,
         picture: &Buffer<u32>,
         weights: Weights,
-        depth: Option<(Weights, Option<Rectangle>, &Buffer<f32>)>,
+        depth: Option<(Weights, &Buffer<f32>)>,
     ) {
         let Self { size: [width, height], target, masked } = self;
         let pixels = width * height;
@@ -138,11 +124,9 @@ impl Frame {
         let mut buffers =
             frame::Buffers { picture, target, weight, valid: None, depth_weight: None, prior: None, given: None };
         let arrays = masked.as_ref().and_then(|masked| masked.depth.as_ref());
-        if let (Some(arrays), Some((depth, rectangle, prior))) = (arrays, depth) {
-            let none = Rectangle { low: [0; 2], high: [0; 2], added: 0.0 };
-            let Rectangle { low, high, added } = rectangle.unwrap_or(none);
+        if let (Some(arrays), Some((depth, prior))) = (arrays, depth) {
             let (depth_outside, depth_inside) = (depth.outside, depth.inside);
-            push = frame::Push { depth_outside, depth_inside, depth_added: added, width: *width, low, high, ..push };
+            push = frame::Push { depth_outside, depth_inside, ..push };
             let MaskedDepth { valid, given, weight } = arrays;
             let (valid, given, depth_weight, prior) = (Some(valid), Some(given), Some(weight), Some(prior));
             buffers = frame::Buffers { valid, given, depth_weight, prior, ..buffers };
@@ -186,7 +170,7 @@ mod tests {
     fn kernels_match_their_twins() {
         let gpu = testing::gpu();
         let mut rng = rand_pcg::Pcg32::seed_from_u64(5);
-        for (width, pixels) in [(1, 0), (1, 1), (17, 17), (9, 63), (8, 64), (5, 65), (53, 53 * 37), (252, 252 * 142)] {
+        for pixels in [0, 1, 17, 63, 64, 65, 53 * 37, 252 * 142] {
             // One pixel more than the picture has: left alone.
             let n = pixels as usize + 1;
             let picture: Vec<u32> = (0..n)
@@ -194,17 +178,7 @@ mod tests {
                 .collect();
             let target = vec![[UNWRITTEN; 3]; n];
             let unwritten = vec![UNWRITTEN; n];
-            let push = frame::Push {
-                pixels,
-                outside: 1.0,
-                inside: 20.0,
-                depth_outside: 0.1,
-                depth_inside: 0.0,
-                depth_added: 99.0,
-                width,
-                low: [2, 1],
-                high: [width.saturating_sub(3), 30],
-            };
+            let push = frame::Push { pixels, outside: 1.0, inside: 20.0, depth_outside: 0.1, depth_inside: 99.0 };
             let mut case = frame::Arrays { picture, target, ..frame::Arrays::default() };
             testing::assert_twin(frame::Kernel, &gpu, case.clone(), push, pixels);
             case.weight = Some(unwritten.clone());

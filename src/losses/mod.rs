@@ -17,7 +17,7 @@ use crate::cost::Formula;
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
 
 pub use align::Quantity;
-pub use frame::{NO_PRIOR, Rectangle, Weights, pack};
+pub use frame::{NO_PRIOR, Weights, pack};
 
 /// A term of the loss, as its own file declares it. Their sum is what a step minimises: each carries its weight.
 #[derive(Clone, Copy, Debug)]
@@ -92,8 +92,6 @@ pub struct DepthView<'a> {
     pub quantity: Quantity,
     /// Weights of the L1 loss; without masks every pixel weighs `outside`.
     pub weights: Weights,
-    /// Where the L1 loss weighs more; with masks only.
-    pub rectangle: Option<Rectangle>,
     /// Factor of the depth gradient; 0 leaves it out.
     pub gradient: f32,
     /// Whether the depth gradient looks inside the mask too.
@@ -173,7 +171,7 @@ impl Losses {
     /// Records the expansion of a view into the frame's arrays, which [`Losses::compare`] reads.
     pub fn expand(&self, rec: &mut Recorder<'_>, view: &View<'_>) {
         rec.stage(photometric::TERM.stage);
-        self.frame.forward(rec, view.picture, view.weights, view.depth.map(|d| (d.weights, d.rectangle, d.prior)));
+        self.frame.forward(rec, view.picture, view.weights, view.depth.map(|d| (d.weights, d.prior)));
     }
 
     /// The arrays of the current view, which [`Losses::compare`] reads.
@@ -525,13 +523,11 @@ mod tests {
                 }
                 let depth = gpu.upload("depth", &maps.rendered).expect("upload");
                 let prior = gpu.upload("prior", &maps.prior).expect("upload");
-                let rectangle = Some(Rectangle { low: [1, 1], high: [20, 20], added: 99.0 });
                 let of_depth = DepthView {
                     fit: None,
                     prior: &prior,
                     quantity: DISPARITY,
-                    weights: Weights { outside: 1.0, inside: 1.0 },
-                    rectangle,
+                    weights: Weights { outside: 1.0, inside: 100.0 },
                     gradient: 0.5,
                     gradient_inside: true,
                     gaps,
@@ -541,7 +537,6 @@ mod tests {
                 let other_depth = DepthView {
                     fit: None,
                     weights: Weights { outside: 0.1, inside: 0.0 },
-                    rectangle: None,
                     gradient: 0.05,
                     gradient_inside: false,
                     ..of_depth
@@ -589,7 +584,6 @@ mod tests {
                     prior: &prior,
                     quantity: Quantity::Depth,
                     weights: Weights { outside: 1.0, inside: 100.0 },
-                    rectangle: None,
                     gradient: 0.5,
                     gradient_inside: true,
                     gaps: true,

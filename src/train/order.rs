@@ -86,8 +86,6 @@ pub enum Stream {
     Views = 1,
     /// Patches of the attention, by step.
     Patch = 2,
-    /// Rectangles of the depth weight, by step.
-    Rectangle = 3,
     /// Where a favourite view's steps lie.
     Favorite = 4,
 }

@@ -204,7 +204,6 @@ fn step_in_one_form(gpu: &Gpu) {
                 prior: &priors[view],
                 quantity: Quantity::Depth,
                 weights: Weights { outside: 0.0, inside: 0.0 },
-                rectangle: None,
                 gradient: if reference { 0.5 } else { 0.05 },
                 gradient_inside: reference,
                 gaps: false,

@@ -330,7 +330,7 @@ impl Step {
 
     /// Records step `step` (counted from 1) on a photograph.
     pub fn record(&self, rec: &mut Recorder<'_>, photograph: &Photograph, step: u32, rates: Rates) {
-        let view = self.view(photograph, step);
+        let view = self.view(photograph);
         let compared = (&photograph.camera, view.depth);
         rec.overlapped(|rec| self.line(rec, compared, Some((photograph, &view)), step, rates));
     }
