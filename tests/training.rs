@@ -166,7 +166,7 @@ fn smaller_pictures_come_first() {
     settings.model.attention.patch = 12;
     let small = train(&gpu, &half, &settings, None);
     settings.model.attention.patch = 24;
-    settings.train.coarse = Coarse { until: 13, factor: 2 };
+    settings.train.coarse = Coarse { until: 13 };
     train(&gpu, &full, &settings, None).assert_same(&small, "a scene at half its size");
 
     // The change comes between two steps that would otherwise be in flight together.
@@ -181,7 +181,7 @@ fn smaller_pictures_come_first() {
 
     let after_two_steps = |until| {
         let settings = Settings {
-            train: gscream_vk::train::Config { coarse: Coarse { until, factor: 2 }, ..settings.train.clone() },
+            train: gscream_vk::train::Config { coarse: Coarse { until }, ..settings.train.clone() },
             ..settings.clone()
         };
         let mut run = Run::new(&gpu, &full, &settings).expect("the device has room");
@@ -512,7 +512,7 @@ impl Observer for Corrects {
 fn corrections_are_repeated_to_the_byte() {
     let (gpu, scene) = (testing::gpu(), scene_without_tests());
     let mut settings = common::settings(14);
-    settings.train.coarse = Coarse { until: 6, factor: 2 };
+    settings.train.coarse = Coarse { until: 6 };
     settings.train.checkpoint_interval = 7;
     let files = |folder: &std::path::Path| {
         [files::POINT_CLOUD, files::WEIGHTS]

@@ -46,8 +46,6 @@ pub struct Config {
     /// Most plain Gaussians: the model has memory for so many from the first step on, and more points than that are
     /// thinned. In every round those that fade below `min_opacity` move onto others (3DGS-MCMC).
     pub max_gaussians: u32,
-    /// Share by which a round enlarges the number of plain Gaussians (3DGS-MCMC: 0.05).
-    pub growth: f64,
 }
 
 impl Default for Config {
@@ -70,7 +68,6 @@ impl Default for Config {
             max_pixels: 0.0,
             max_anchors: 0,
             max_gaussians: 500_000,
-            growth: 0.05,
         }
     }
 }
@@ -106,7 +103,6 @@ impl Config {
             ensure((0.0..=1e6).contains(&pixels), key, pixels, "must be a number of pixels, or 0 for none")?;
         }
         ensure(self.max_gaussians > 0, "max_gaussians", self.max_gaussians, "must be at least 1")?;
-        ensure((0.0..=1.0).contains(&self.growth), "growth", self.growth, "must be between 0 and 1")?;
         ensure((0.0..=1.0).contains(&self.min_opacity), "min_opacity", self.min_opacity, "must be between 0 and 1")?;
         ensure(
             self.max_log_scaling > f64::NEG_INFINITY,

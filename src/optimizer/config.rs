@@ -3,12 +3,13 @@ use serde::{Deserialize, Serialize};
 use crate::config::{Invalid, ensure};
 use crate::model::config::Form;
 
+/// Adam's decay of the first and of the second moment.
+pub const BETAS: [f64; 2] = [0.9, 0.999];
+
 /// Adam (Kingma & Ba 2015) and the learning rate of every parameter group.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default, expecting = "a table")]
 pub struct Config {
-    /// Decay of the first and of the second moment.
-    pub betas: [f64; 2],
     /// Added to the root of the second moment.
     pub epsilon: f64,
     /// Steps from a group's initial to its final learning rate; 0 means `train.iterations`.
@@ -108,25 +109,13 @@ impl Group {
 
 impl Default for Config {
     fn default() -> Self {
-        Self {
-            betas: [0.9, 0.999],
-            epsilon: 1e-15,
-            schedule_length: 0,
-            higher_harmonics: 0.05,
-            learning_rate: LearningRates::default(),
-        }
+        Self { epsilon: 1e-15, schedule_length: 0, higher_harmonics: 0.05, learning_rate: LearningRates::default() }
     }
 }
 
 impl Config {
     /// Refuses values that no run could use.
     pub fn validate(&self) -> Result<(), Invalid> {
-        ensure(
-            self.betas.iter().all(|beta| (0.0..1.0).contains(beta)),
-            "betas",
-            format_args!("{:?}", self.betas),
-            "must be two numbers, at least 0 and below 1",
-        )?;
         // In float32 as the device has it: below, epsilon is zero there, and 0 / 0 what a gradient of zero makes.
         ensure(
             (1e-37..=1e30).contains(&self.epsilon),

@@ -4,4 +4,4 @@ pub mod adam;
 pub mod config;
 pub mod schedule;
 
-pub use config::{Config, Group};
+pub use config::{BETAS, Config, Group};

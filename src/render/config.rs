@@ -23,9 +23,6 @@ pub struct Config {
     /// A pixel is finished before the Gaussian that would bring its transmittance below this (3DGS: 1e-4); 0 never
     /// finishes early.
     pub transmittance_threshold: f64,
-    /// Bits of the depth in the sort key, 28 to 32. From 31 every float has its own key, with 28 every float up to 2^32
-    /// times `near`, and a sorting pass less.
-    pub depth_bits: u32,
     /// Shape of the rasteriser's tiles. Changes the time only.
     pub tiles: Tiles,
 }
@@ -49,7 +46,6 @@ impl Default for Config {
             cull: true,
             alpha_threshold: ALPHA_MIN,
             transmittance_threshold: TRANSMITTANCE_MIN,
-            depth_bits: 28,
             tiles: Tiles::Auto,
         }
     }
@@ -70,7 +66,6 @@ impl Config {
             "transmittance_threshold",
             self.transmittance_threshold,
             "must be between 0 and 0.5",
-        )?;
-        ensure((28..=32).contains(&self.depth_bits), "depth_bits", self.depth_bits, "must be between 28 and 32")
+        )
     }
 }

@@ -43,7 +43,7 @@ impl Method {
             tiling,
             alpha_min: config.alpha_threshold as f32,
             transmittance_min: config.transmittance_threshold as f32,
-            depth_key: DepthKey::new(config.near as f32, config.depth_bits),
+            depth_key: DepthKey::new(config.near as f32, DEPTH_BITS),
         }
     }
 }
@@ -65,6 +65,9 @@ pub struct DepthKey {
     /// Bits of the key.
     pub bits: u32,
 }
+
+/// Bits of a depth in the sort key: with 31 every float would have a key of its own, at the cost of a sorting pass.
+const DEPTH_BITS: u32 = 28;
 
 impl DepthKey {
     /// Keys of `bits` bits, 28 or more, for depths beyond `near` > 0.

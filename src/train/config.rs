@@ -37,27 +37,19 @@ pub struct Config {
     pub coarse: Coarse,
 }
 
-/// Smaller pictures first: the first steps train on the training pictures reduced once more, as `scene.downscale`
+/// Smaller pictures first: the first steps train on the training pictures at half their size, reduced as `scene.downscale`
 /// reduces them. Which steps those are depends on the step alone, so that a resumed run goes on as it would have.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default, expecting = "a table")]
 pub struct Coarse {
     /// Last step on reduced pictures; 0 trains on pictures of the full training size from the beginning.
     pub until: u32,
-    /// Both sides are divided by this.
-    pub factor: u32,
-}
-
-impl Default for Coarse {
-    fn default() -> Self {
-        Self { until: 0, factor: 2 }
-    }
 }
 
 impl Coarse {
     /// By how much the pictures of `step` (counted from 1) are reduced: 1 is the full training size.
     pub fn reduction(&self, step: u32) -> u32 {
-        if step <= self.until { self.factor } else { 1 }
+        if step <= self.until { 2 } else { 1 }
     }
 }
 
@@ -115,8 +107,6 @@ impl Config {
             format_args!("{:?}", self.corrections),
             "must be pairs of a step and a later last step, in the order of the steps",
         )?;
-        ensure(self.log_interval > 0, "log_interval", self.log_interval, "must be at least 1")?;
-        let factor = self.coarse.factor;
-        ensure((2..=16).contains(&factor), "coarse.factor", factor, "must be between 2 and 16")
+        ensure(self.log_interval > 0, "log_interval", self.log_interval, "must be at least 1")
     }
 }

@@ -228,7 +228,7 @@ fn settings(_: &Gpu) {
     assert!(all.len() > 30, "{} floats", all.len());
     for path in all {
         for poison in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, -1.0, 1e300, 1e-40] {
-            let rate = path[0] == "optimizer" && path[1] != "betas";
+            let rate = path[0] == "optimizer";
             if poison == 1e-40 && !rate {
                 continue;
             }

@@ -52,7 +52,7 @@ pub const CASES: &[Case] = &[
     Case {
         stage: "cull to decode_backward",
         case: "log-scales of +-40, 88, 100 and 1e30, of offsets and of Gaussians",
-        guarantee: "Gaussians beyond 2^60 px absent; picture within the bounds of blending (with `render.depth_bits` 31: the default 28 order depths up to 2^32 times the near plane); gradients finite, but for an offset's beyond float32's range, which is infinite and never not-a-number",
+        guarantee: "Gaussians beyond 2^60 px absent; picture within the bounds of blending (with depth keys of 31 bits: the usual 28 order depths up to 2^32 times the near plane); gradients finite, but for an offset's beyond float32's range, which is infinite and never not-a-number",
         run: log_scales,
     },
 ];

@@ -49,8 +49,6 @@ pub fn condition(scene: &mut Scene, config: &Config) {
     let depths = reference::hole_depths(scene);
     if config.seed_hole {
         points::seed_holes(scene, &depths);
-    }
-    if config.seed_behind_edges {
         points::seed_behind_edges(scene, &depths);
     }
     let rims = config.judge_rim.then(|| judge::rims(scene));

@@ -133,7 +133,7 @@ pub(super) fn seed_behind_edges(scene: &mut Scene, depths: &[Option<Vec<f32>>]) 
     let added = scene.points.len() - before;
     if added > 0 {
         scene.notes.push(format!(
-            "{added} points are added behind depth edges in the hole, where nothing is seen (scene.seed_behind_edges)"
+            "{added} points are added behind depth edges in the hole, where nothing is seen (scene.seed_hole)"
         ));
     }
 }

@@ -19,7 +19,7 @@ use crate::model::files;
 use crate::model::gaussians::{Cloud, Static};
 use crate::model::learnt::Learnt;
 use crate::model::parameter::{DECODERS, Parameter, Part, WEIGHTS};
-use crate::optimizer::{Group, adam};
+use crate::optimizer::{BETAS, Group, adam};
 use crate::primitives::limit::{Counter, Limits};
 use crate::render::activate::{self, Activate, DrawnGradients};
 use crate::render::decode::{self, Decode, DecodeBackward, GaussianGradients, WantedGradients};
@@ -209,11 +209,7 @@ impl Step {
             voxel,
             attend: None,
             attention_weights,
-            adam: adam::Config {
-                beta1: settings.optimizer.betas[0],
-                beta2: settings.optimizer.betas[1],
-                epsilon: settings.optimizer.epsilon,
-            },
+            adam: adam::Config { beta1: BETAS[0], beta2: BETAS[1], epsilon: settings.optimizer.epsilon },
             near: settings.render.near as f32,
             background: settings.train.background.map(|c| c as f32),
             config: settings.clone(),
