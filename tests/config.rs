@@ -228,7 +228,6 @@ fn values_that_make_no_sense_are_refused_with_the_layer_that_set_them() {
         "densify.gradient_threshold=0",
         "densify.levels=0",
         "densify.coarsest_cell=0",
-        "densify.coarsest_pixels=-1",
         "scene.object_point_share=1.5",
         "scene.unit=-2",
         "train.reference_share=0.95",

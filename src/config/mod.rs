@@ -106,18 +106,15 @@ impl Settings {
         .map_err(|invalid| invalid.against("densify.enabled"))
     }
 
-    /// These settings with what is given in pixels turned into world units of this scene: the initial grid, the growth cells
-    /// and the cap of the scales. What is said in world units stays.
+    /// These settings with what is given in pixels turned into world units of this scene: the initial grid and the
+    /// cap of the scales. What is said in world units stays.
     pub fn fitted(&self, scene: &crate::scene::Scene) -> Self {
         let mut fitted = self.clone();
         let (model, densify) = (&mut fitted.model, &mut fitted.densify);
-        let asked = model.voxel_pixels > 0.0 || densify.coarsest_pixels > 0.0 || densify.max_pixels > 0.0;
+        let asked = model.voxel_pixels > 0.0 || densify.max_pixels > 0.0;
         let Some(pixel) = asked.then(|| crate::scene::footprint(scene)).flatten() else { return fitted };
         if model.voxel <= 0.0 && model.voxel_pixels > 0.0 {
             model.voxel = model.voxel_pixels * model.voxel_factor * pixel;
-        }
-        if model.voxel > 0.0 && densify.coarsest_pixels > 0.0 {
-            densify.coarsest_cell = densify.coarsest_pixels * pixel / model.voxel;
         }
         if densify.max_pixels > 0.0 {
             densify.max_log_scaling = (densify.max_pixels * pixel).ln();

@@ -11,7 +11,7 @@ struct Removed {
     instead: &'static str,
 }
 
-const REMOVED: [Removed; 8] = [
+const REMOVED: [Removed; 9] = [
     Removed {
         section: "optimizer",
         line: "lazy = false",
@@ -36,6 +36,12 @@ const REMOVED: [Removed; 8] = [
         line: "growth = 0.05",
         with: None,
         instead: "a round adds 5 % of the plain Gaussians, up to densify.max_gaussians",
+    },
+    Removed {
+        section: "densify",
+        line: "coarsest_pixels = 0.0",
+        with: None,
+        instead: "densify.coarsest_cell says it in voxels: so many pixels over model.voxel_pixels",
     },
     Removed { section: "scene", line: "seed_behind_edges = true", with: Some("seed_hole = true"), instead: SEEDED },
     Removed { section: "scene", line: "seed_behind_edges = false", with: Some("seed_hole = false"), instead: SEEDED },

@@ -23,9 +23,6 @@ pub struct Config {
     pub levels: u32,
     /// Cell of the coarsest level, in voxels; each finer level divides it by 4 (16, 4, 1).
     pub coarsest_cell: f64,
-    /// The same in pixels of the training pictures, at the median depth of the points; above 0 it takes the place of
-    /// `coarsest_cell`.
-    pub coarsest_pixels: f64,
     /// Count a step for a Gaussian only where it has a gradient: what only few views train is judged by these views
     /// (GScream: false).
     pub count_touched: bool,
@@ -59,7 +56,6 @@ impl Default for Config {
             gradient_threshold: 0.0002,
             levels: 3,
             coarsest_cell: 16.0,
-            coarsest_pixels: 0.0,
             count_touched: true,
             min_slot_visits: 40,
             min_anchor_visits: 80,
@@ -99,9 +95,8 @@ impl Config {
         ensure((1..=8).contains(&self.levels), "levels", self.levels, "must be between 1 and 8")?;
         let cell = self.coarsest_cell;
         ensure(cell > 0.0 && cell <= 1e9, "coarsest_cell", cell, "must be positive, at most 1e9")?;
-        for (key, pixels) in [("coarsest_pixels", self.coarsest_pixels), ("max_pixels", self.max_pixels)] {
-            ensure((0.0..=1e6).contains(&pixels), key, pixels, "must be a number of pixels, or 0 for none")?;
-        }
+        let pixels = self.max_pixels;
+        ensure((0.0..=1e6).contains(&pixels), "max_pixels", pixels, "must be a number of pixels, or 0 for none")?;
         ensure(self.max_gaussians > 0, "max_gaussians", self.max_gaussians, "must be at least 1")?;
         ensure((0.0..=1.0).contains(&self.min_opacity), "min_opacity", self.min_opacity, "must be between 0 and 1")?;
         ensure(
