@@ -230,11 +230,10 @@ fn depth_is_for_views_that_have_losses_of_it() {
     settings.losses.depth = Default::default();
     settings.losses.depth.reference_weight = 0.0;
     settings.losses.depth.reference_inside_weight = 0.0;
-    settings.losses.depth.gradient.reference_weight = 0.0;
+    settings.losses.depth.gradient.weight = 0.0;
     let plan = Plan::new(&scene, &settings);
     assert!(plan.depth && !plan.reference_depth.any() && plan.other_depth.any());
     settings.losses.depth.other_weight = 0.0;
-    settings.losses.depth.gradient.weight = 0.0;
     assert!(!Plan::new(&scene, &settings).depth);
 }
 

@@ -132,7 +132,6 @@ impl Settings {
         new.train.iterations = iterations;
         new.train.coarse.until = at(self.train.coarse.until);
         (new.train.eval_interval, new.train.save_interval) = (0, 0);
-        new.optimizer.schedule_length = at(self.optimizer.schedule_length);
         for group in Group::ALL {
             for rate in new.optimizer.learning_rate.of_mut(group) {
                 *rate *= share.powf(-RATE_EXPONENT);
@@ -163,11 +162,9 @@ impl Settings {
         };
         new.train.iterations = iterations;
         new.train.coarse.until = at(self.train.coarse.until);
-        let length = if self.optimizer.schedule_length == 0 { old } else { self.optimizer.schedule_length };
-        if length > done {
-            new.optimizer.schedule_length = at(length).max(done + 1);
+        if old > done {
             // The rate is log-linear in the step: the line through today's rate and the last one, continued to step 0.
-            let [before, after] = [length, new.optimizer.schedule_length].map(|n| f64::from(done) / f64::from(n));
+            let [before, after] = [old, iterations.max(done + 1)].map(|n| f64::from(done) / f64::from(n));
             for group in Group::ALL {
                 let rate = new.optimizer.learning_rate.of_mut(group);
                 let [initial, last] = *rate;

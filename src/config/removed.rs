@@ -11,7 +11,7 @@ struct Removed {
     instead: &'static str,
 }
 
-const REMOVED: [Removed; 9] = [
+const REMOVED: [Removed; 11] = [
     Removed {
         section: "optimizer",
         line: "lazy = false",
@@ -23,6 +23,12 @@ const REMOVED: [Removed; 9] = [
         line: "betas = [0.9, 0.999]",
         with: None,
         instead: "Adam's decay rates are 0.9 and 0.999",
+    },
+    Removed {
+        section: "optimizer",
+        line: "schedule_length = 0",
+        with: None,
+        instead: "learning rates reach their end in the last step, train.iterations",
     },
     Removed { section: "render", line: "depth_bits = 28", with: None, instead: "sort keys have 28 bits of the depth" },
     Removed {
@@ -45,6 +51,12 @@ const REMOVED: [Removed; 9] = [
     },
     Removed { section: "scene", line: "seed_behind_edges = true", with: Some("seed_hole = true"), instead: SEEDED },
     Removed { section: "scene", line: "seed_behind_edges = false", with: Some("seed_hole = false"), instead: SEEDED },
+    Removed {
+        section: "losses.depth.gradient",
+        line: "reference_weight = 1.0",
+        with: None,
+        instead: "losses.depth.gradient.weight is the reference's, other_weight the share of it on other views",
+    },
     Removed {
         section: "losses.depth",
         line: "reference_inside_region = \"mask\"",

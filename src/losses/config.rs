@@ -42,11 +42,9 @@ pub struct Depth {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default, expecting = "a table")]
 pub struct DepthGradient {
-    /// Weight of the whole term.
+    /// Its weight on the reference view, all pixels.
     pub weight: f64,
-    /// Its factor on the reference view, all pixels.
-    pub reference_weight: f64,
-    /// Its factor on the other views, outside the mask.
+    /// The share of it on the other views, outside the mask.
     pub other_weight: f64,
     /// Number of scales: scale s takes every 2^s-th pixel.
     pub scales: u32,
@@ -73,7 +71,7 @@ impl Default for Depth {
 
 impl Default for DepthGradient {
     fn default() -> Self {
-        Self { weight: 0.5, reference_weight: 1.0, other_weight: 0.1, scales: 4 }
+        Self { weight: 0.5, other_weight: 0.1, scales: 4 }
     }
 }
 
@@ -87,7 +85,6 @@ impl Config {
             ("depth.reference_inside_weight", self.depth.reference_inside_weight),
             ("depth.other_weight", self.depth.other_weight),
             ("depth.gradient.weight", self.depth.gradient.weight),
-            ("depth.gradient.reference_weight", self.depth.gradient.reference_weight),
             ("depth.gradient.other_weight", self.depth.gradient.other_weight),
         ];
         for (key, weight) in weights {

@@ -12,8 +12,6 @@ pub const BETAS: [f64; 2] = [0.9, 0.999];
 pub struct Config {
     /// Added to the root of the second moment.
     pub epsilon: f64,
-    /// Steps from a group's initial to its final learning rate; 0 means `train.iterations`.
-    pub schedule_length: u32,
     /// Share of the harmonics' rate that the coefficients beyond the first have (3DGS: 0.05).
     pub higher_harmonics: f64,
     /// Learning rates by group.
@@ -109,7 +107,7 @@ impl Group {
 
 impl Default for Config {
     fn default() -> Self {
-        Self { epsilon: 1e-15, schedule_length: 0, higher_harmonics: 0.05, learning_rate: LearningRates::default() }
+        Self { epsilon: 1e-15, higher_harmonics: 0.05, learning_rate: LearningRates::default() }
     }
 }
 

@@ -118,7 +118,7 @@ fn depth_losses(config: &losses::config::Depth, reference: bool, masks: bool) ->
     let gradient = &config.gradient;
     let (l1, factor) = if reference {
         let inside = if masks { config.reference_inside_weight } else { 0.0 };
-        (config.reference_weight + inside, gradient.reference_weight)
+        (config.reference_weight + inside, 1.0)
     } else {
         (config.other_weight, gradient.other_weight)
     };

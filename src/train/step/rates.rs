@@ -13,7 +13,7 @@ impl Rates {
     /// The rates of `step` (counted from 1) for a scene of this radius.
     pub fn at(settings: &Settings, radius: f64, step: u32) -> Self {
         let config = &settings.optimizer;
-        let length = if config.schedule_length == 0 { settings.train.iterations } else { config.schedule_length };
+        let length = settings.train.iterations;
         Self(Group::ALL.map(|group| {
             let factor = if group.goes_with_radius() { radius } else { 1.0 };
             let [initial, last] = config.learning_rate.of(group).map(|rate| rate * factor);

@@ -17,7 +17,7 @@ impl Step {
                 let depth = &config.depth;
                 let gradient = &depth.gradient;
                 let outside = if reference { depth.reference_weight } else { depth.other_weight };
-                let factor = if reference { gradient.reference_weight } else { gradient.other_weight };
+                let factor = if reference { 1.0 } else { gradient.other_weight };
                 DepthView {
                     prior,
                     quantity: match kind {
