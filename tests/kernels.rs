@@ -82,6 +82,16 @@ fn registers_and_spills_are_those_of_the_table() {
     }
 }
 
+/// As the command's help has it. The built-in scene's settings ask for stereo, which no null device could run.
+#[test]
+fn kernels_are_compiled_without_memory() {
+    if !installed() {
+        return;
+    }
+    let output = on_null_device("gfx1100", &["kernels", "--subgroup", "32"]).output().expect("it runs");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
 /// A device without memory is refused in a sentence by what would run on it.
 #[test]
 fn nothing_runs_on_a_device_without_memory() {

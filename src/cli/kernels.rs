@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 
 use super::preset;
-use super::shared::{DeviceArgs, SYNTHETIC, SceneArgs, add_dense, with_gpu};
+use super::shared::{DeviceArgs, SYNTHETIC, SceneArgs, with_gpu};
 use crate::config::SettingsArgs;
 use crate::gpu::{Compiled, Options};
 use crate::train::forecast::{self, Question};
@@ -49,12 +49,12 @@ struct Kernels<'a> {
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let given = SceneArgs { scene: args.scene.clone(), settings: args.settings.clone() };
-    let (mut scene, mut settings) = preset::load(&given, &args.device)?;
+    let (scene, settings) = preset::load(&given, &args.device)?;
     // From the cache a kernel would have no compile time, and some drivers no figures.
     let options = Options { statistics: true, subgroup_size: args.subgroup, cache: None, ..args.device.options() };
     with_gpu(&options, |gpu| {
-        add_dense(gpu, &given.scene, &mut scene, &mut settings)?;
-        // What does not fit into the device's memory is rehearsed all the same.
+        // No stereo: it would run on the device, and its points change no kernel. What does not fit into the device's memory
+        // is rehearsed all the same.
         let question = Question { available: Some(u64::MAX), ..Question::default() };
         forecast::forecast(gpu, &scene, &settings, question)?;
         let info = gpu.info();
