@@ -1,7 +1,7 @@
 //! Medians and quantiles, defined once for every count of values.
 
-/// The middle of the values; of an even count the mean of the two in the middle. `None` of no values. A NaN counts as the
-/// largest.
+/// The middle of the values; of an even count the mean of the two in the middle. `None` of no values. A NaN counts as
+/// the largest.
 pub fn median(values: impl IntoIterator<Item = impl Into<f64>>) -> Option<f64> {
     let mut values: Vec<f64> = values.into_iter().map(Into::into).collect();
     let middle = values.len() / 2;
@@ -12,8 +12,8 @@ pub fn median(values: impl IntoIterator<Item = impl Into<f64>>) -> Option<f64> {
     Some(lower.map_or(*upper, |lower| 0.5 * (lower + *upper)))
 }
 
-/// The value at place `floor(share (n - 1))` of the n values in ascending order: always one of the values, so that a single
-/// outlier beyond that place has no part in it. `None` of no values. A NaN counts as the largest.
+/// The value at place `floor(share (n - 1))` of the n values in ascending order: always one of the values, so that a
+/// single outlier beyond that place has no part in it. `None` of no values. A NaN counts as the largest.
 ///
 /// # Panics
 /// Unless `share` is from 0 to 1.

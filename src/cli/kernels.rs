@@ -53,8 +53,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     // From the cache a kernel would have no compile time, and some drivers no figures.
     let options = Options { statistics: true, subgroup_size: args.subgroup, cache: None, ..args.device.options() };
     with_gpu(&options, |gpu| {
-        // No stereo: it would run on the device, and its points change no kernel. What does not fit into the device's memory
-        // is rehearsed all the same.
+        // No stereo: it would run on the device, and its points change no kernel. What does not fit into the device's
+        // memory is rehearsed all the same.
         let question = Question { available: Some(u64::MAX), ..Question::default() };
         forecast::forecast(gpu, &scene, &settings, question)?;
         let info = gpu.info();

@@ -3,7 +3,8 @@
 /// A setting that is gone.
 struct Removed {
     section: &'static str,
-    /// The line that older versions wrote into settings files and checkpoints: the value under which a run goes on as it began.
+    /// The line that older versions wrote into settings files and checkpoints: the value under which a run goes on as
+    /// it began.
     line: &'static str,
     /// A line without which the run would not go on as it began.
     with: Option<&'static str>,

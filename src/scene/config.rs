@@ -43,8 +43,8 @@ pub struct Config {
     pub check_priors: bool,
     /// Guess the depth of a reference picture without prior from the points around its hole.
     pub guess_reference_prior: bool,
-    /// Add points in the hole, at the depth of the reference's prior, and behind its depth edges, where other train cameras
-    /// see what neither the reference nor any photograph shows.
+    /// Add points in the hole, at the depth of the reference's prior, and behind its depth edges, where other train
+    /// cameras see what neither the reference nor any photograph shows.
     pub seed_hole: bool,
     /// Add points where the photographs agree on a depth and the model has none, and on planes around what stays unknown:
     /// floors, walls and what is far off get anchors, too. A view in which hardly anything agrees with the others is left

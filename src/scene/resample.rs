@@ -74,8 +74,8 @@ fn separable<const C: usize>(row: impl Fn(usize, &mut [f64]), from: [usize; 2], 
     out
 }
 
-/// What a picture has at a position in pixels, linear between the centres of the four pixels around it; beyond the outermost
-/// centres what the border has there. `at` tells the values of a row-major pixel.
+/// What a picture has at a position in pixels, linear between the centres of the four pixels around it; beyond the
+/// outermost centres what the border has there. `at` tells the values of a row-major pixel.
 pub fn bilinear<const C: usize>(size: [u32; 2], position: [f64; 2], at: impl Fn(usize) -> [f64; C]) -> [f64; C] {
     let [w, h] = size.map(|n| n as usize);
     let place = |axis: usize, length: usize| (position[axis] - 0.5).clamp(0.0, length.saturating_sub(1) as f64);
