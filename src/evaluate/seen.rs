@@ -107,11 +107,7 @@ pub struct Shown<'a> {
 impl Shown<'_> {
     /// Where a world point appears in this view, pixels: in the picture and not behind what the model shows there.
     pub(super) fn sees(&self, point: [f64; 3]) -> Option<[f64; 2]> {
-        let [px, py] = self.camera.project(point)?;
-        let [w, h] = self.camera.size.map(f64::from);
-        if !(0.0..w).contains(&px) || !(0.0..h).contains(&py) {
-            return None;
-        }
+        let [px, py] = self.camera.within(point)?;
         let [x, y, z] = self.camera.to_camera(point);
         if self.camera.distortion != [0.0; 4] {
             // Beyond a lens's fold, rays from outside the picture come back into it.

@@ -145,11 +145,8 @@ impl Baker {
         let rotation = gpu.read_range(&forward.decode().rotation, slots)?;
         let tiles = gpu.read_range(forward.bin.tiles(), slots)?;
         let shares = gpu.read_range(&backward.grad_color, slots)?;
-        let (near, size) = (self.near, camera.size.map(f64::from));
-        let within = |position: [f64; 3]| {
-            let ahead = camera.to_camera(position)[2] > near;
-            ahead && camera.project(position).is_some_and(|at| (0..2).all(|i| (0.0..size[i]).contains(&at[i])))
-        };
+        let near = self.near;
+        let within = |position: [f64; 3]| camera.to_camera(position)[2] > near && camera.within(position).is_some();
         for slot in 0..slots {
             let (k, v) = (slot / visible_count, slot % visible_count);
             let gaussian = visible[v] as usize * offsets + k;

@@ -191,13 +191,10 @@ mod tests {
         let mut errors = vec![];
         for (grid, view) in grids.iter().zip(&scene.train) {
             let Some(truth) = &view.depth else { continue };
-            let [w, h] = view.camera.size;
             for site in 0..grid.depth.len() {
                 let point = grid.point(site).expect("every site has a depth");
-                let [x, y] = view.camera.project(point.to_array()).expect("ahead");
-                if x >= 0.0 && y >= 0.0 && x < f64::from(w) && y < f64::from(h) {
-                    let truth = f64::from(truth[y as usize * w as usize + x as usize]);
-                    errors.push((grid.depth[site] / truth - 1.0).abs());
+                if let Some(pixel) = view.camera.pixel_of(point.to_array()) {
+                    errors.push((grid.depth[site] / f64::from(truth[pixel]) - 1.0).abs());
                 }
             }
         }

@@ -197,15 +197,12 @@ mod tests {
         for (at, view) in scene.train.iter().enumerate() {
             let Some(truth) = &view.depth else { continue };
             let picture = &pictures[at];
-            let [w, h] = view.camera.size;
             for site in 0..picture.sites.len() {
                 // The photograph's pixel, through its lens.
-                let [x, y] = view.camera.project(picture.lift(picture.pixel(site), 1.0)).expect("ahead");
-                if !(x >= 0.0 && y >= 0.0 && x < f64::from(w) && y < f64::from(h)) {
-                    continue;
-                }
+                let point = picture.lift(picture.pixel(site), 1.0);
+                let Some(pixel) = view.camera.pixel_of(point) else { continue };
                 all += 1;
-                let truth = f64::from(truth[y as usize * w as usize + x as usize]);
+                let truth = f64::from(truth[pixel]);
                 let error = |z: f64| (z / truth - 1.0).abs();
                 if surfaces[at][site].is_finite() {
                     confirmed.push(error(surfaces[at][site]));

@@ -72,6 +72,17 @@ impl Camera {
         undistort(target, self.distortion.map(f64::from))
     }
 
+    /// Where a world point falls within the picture, in pixels. `None` outside, and at or behind the camera plane.
+    pub fn within(&self, point: [f64; 3]) -> Option<[f64; 2]> {
+        let [w, h] = self.size.map(f64::from);
+        self.project(point).filter(|[x, y]| (0.0..w).contains(x) && (0.0..h).contains(y))
+    }
+
+    /// The row-major pixel that a world point falls into, if it is within the picture.
+    pub fn pixel_of(&self, point: [f64; 3]) -> Option<usize> {
+        self.within(point).map(|[x, y]| y as usize * self.size[0] as usize + x as usize)
+    }
+
     /// The pixel position of the centre of a row-major pixel.
     pub fn pixel_center(&self, pixel: usize) -> [f64; 2] {
         let width = self.size[0] as usize;
@@ -162,6 +173,10 @@ mod tests {
             // Rows that are off by 1e-7 move the point by as much of its distance, at 60 pixels a unit.
             assert!((0..2).all(|k| (back[k] - position[k]).abs() < 3e-5), "{position:?} {back:?}");
             assert!((camera.to_camera(point)[2] - 2.5).abs() < 1e-6);
+            assert_eq!(camera.pixel_of(point), Some(pixel));
+        }
+        for outside in [[-0.1, 5.0], [64.1, 5.0], [5.0, -0.1], [5.0, 48.1]] {
+            assert_eq!(camera.within(camera.lift(outside, 2.5).expect("the lens has an inverse")), None);
         }
         let folded = Camera { distortion: [-1.0, 0.0, 0.0, 0.0], ..camera };
         assert_eq!(folded.lift([64.0, 24.0], 2.5), None);

@@ -200,14 +200,10 @@ fn seen(scene: &Scene, camera: &Camera) -> Vec<Seen> {
     let mut nearest: Vec<Option<Seen>> = (0..cells[0] * cells[1]).map(|_| None).collect();
     for point in &scene.points {
         let position = point.position.map(f64::from);
-        let Some([x, y]) = camera.project(position) else { continue };
-        if !(x >= 0.0 && y >= 0.0 && x < f64::from(w) && y < f64::from(h)) {
-            continue;
-        }
+        let Some(pixel) = camera.pixel_of(position) else { continue };
         let depth = camera.to_camera(position)[2];
-        let cell = &mut nearest[(y / 4.0) as usize * cells[0] + (x / 4.0) as usize];
+        let cell = &mut nearest[pixel / w as usize / 4 * cells[0] + pixel % w as usize / 4];
         if cell.as_ref().is_none_or(|other| depth < other.depth) {
-            let pixel = y as usize * w as usize + x as usize;
             *cell = Some(Seen { pixel, depth });
         }
     }

@@ -93,11 +93,7 @@ pub fn depth(splat: &Splat, cameras: &[Camera]) -> Result<f64, Error> {
     let some = || opaque.iter().step_by(opaque.len().div_ceil(POINTS).max(1));
     let mut depths = vec![];
     for camera in cameras.iter().step_by(cameras.len().div_ceil(64).max(1)) {
-        let inside = |p: &&[f64; 3]| {
-            let [w, h] = camera.size.map(f64::from);
-            camera.project(**p).is_some_and(|[x, y]| x >= 0.0 && y >= 0.0 && x < w && y < h)
-        };
-        depths.extend(some().filter(inside).map(|p| camera.to_camera(*p)[2]));
+        depths.extend(some().filter(|p| camera.within(**p).is_some()).map(|p| camera.to_camera(*p)[2]));
     }
     median(depths).ok_or_else(apart)
 }

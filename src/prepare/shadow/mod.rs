@@ -223,12 +223,9 @@ fn object(maps: &[DepthMap], masks: &[GrayImage]) -> Vec<DVec3> {
     let is_object = |point: &DVec3| {
         let (mut shown, mut masked) = (0u32, 0u32);
         for (map, mask) in maps.iter().zip(&small) {
-            let Some([x, y]) = map.camera.project(point.to_array()) else { continue };
-            let [w, h] = map.camera.size;
-            if x >= 0.0 && y >= 0.0 && x < f64::from(w) && y < f64::from(h) {
-                shown += 1;
-                masked += u32::from(mask.get_pixel(x as u32, y as u32).0[0] != 0);
-            }
+            let Some(pixel) = map.camera.pixel_of(point.to_array()) else { continue };
+            shown += 1;
+            masked += u32::from(mask.as_raw()[pixel] != 0);
         }
         f64::from(masked) >= OBJECT * f64::from(shown)
     };
@@ -246,11 +243,7 @@ fn around(scene: &Scene, maps: &[DepthMap], photographs: &[Photograph<'_>], obje
     let off = |p: &DVec3| {
         // Within no mask that could show it: a point of the model on the object is in all of them.
         let on = photographs.iter().filter(|photograph| {
-            let [w, h] = photograph.camera.size;
-            photograph.camera.project(p.to_array()).is_some_and(|[x, y]| {
-                let inside = x >= 0.0 && y >= 0.0 && x < f64::from(w) && y < f64::from(h);
-                inside && photograph.mask.get_pixel(x as u32, y as u32).0[0] != 0
-            })
+            photograph.camera.pixel_of(p.to_array()).is_some_and(|pixel| photograph.mask.as_raw()[pixel] != 0)
         });
         2 * on.count() < photographs.len()
     };

@@ -11,7 +11,6 @@
 use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 
-use super::points::pixel_of;
 use super::reference::Surroundings;
 use crate::scene::{Camera, Scene, View, resample};
 use crate::statistics::{deviation, median};
@@ -233,9 +232,8 @@ fn nearest_views<'a>(
 /// Per channel the median colour of a place in the views that see it past their masks, and the deviation.
 fn consensus(others: &[(&Camera, &RgbImage, Option<&GrayImage>)], place: [f64; 3]) -> Option<[[f64; 2]; 3]> {
     let color = |(camera, image, mask): &(&Camera, &RgbImage, Option<&GrayImage>)| {
-        let pixel = pixel_of(camera, place)?;
-        let clear = mask.is_none_or(|mask| mask.as_raw()[pixel] == 0);
-        clear.then(|| Some(resample::color_at(image, camera.project(place)?))).flatten()
+        let clear = mask.is_none_or(|mask| camera.pixel_of(place).is_some_and(|pixel| mask.as_raw()[pixel] == 0));
+        camera.within(place).filter(|_| clear).map(|position| resample::color_at(image, position))
     };
     let colors: Vec<[f64; 3]> = others.iter().filter_map(color).take(MOST).collect();
     (colors.len() >= FEWEST).then(|| std::array::from_fn(|c| median_and_deviation(colors.iter().map(|color| color[c]))))

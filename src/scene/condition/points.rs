@@ -7,14 +7,6 @@ use crate::scene::{Camera, Point, Scene, View};
 /// Fewest views that must have a point in the picture for it to be judged.
 const FEWEST_VIEWS: usize = 2;
 
-/// The pixel that a world point falls into, row-major.
-pub(super) fn pixel_of(camera: &Camera, position: [f64; 3]) -> Option<usize> {
-    let [u, v] = camera.project(position)?;
-    let [w, h] = camera.size;
-    let inside = u >= 0.0 && v >= 0.0 && u < f64::from(w) && v < f64::from(h);
-    inside.then(|| v as usize * w as usize + u as usize)
-}
-
 /// Whether a point falls into the mask in more than this share of the views that have it in the picture.
 pub(crate) fn on_object(views: &[View], share: f64) -> impl Fn(&Point) -> bool + Sync {
     let views: Vec<_> = views.iter().filter_map(|v| Some((&v.camera, v.mask.as_ref()?))).collect();
@@ -22,7 +14,7 @@ pub(crate) fn on_object(views: &[View], share: f64) -> impl Fn(&Point) -> bool +
         let position = point.position.map(f64::from);
         let (mut seen, mut inside) = (0, 0);
         for (camera, mask) in &views {
-            if let Some(pixel) = pixel_of(camera, position) {
+            if let Some(pixel) = camera.pixel_of(position) {
                 seen += 1;
                 inside += usize::from(mask.as_raw()[pixel] != 0);
             }
@@ -67,7 +59,7 @@ pub(super) fn seed_holes(scene: &mut Scene, depths: &[Option<Vec<f32>>]) {
         let camera = &scene.train[reference.view].camera;
         for (pixel, z) in depth.iter().enumerate().filter(|(_, z)| z.is_finite()) {
             let Some(position) = camera.lift(camera.pixel_center(pixel), f64::from(*z)) else { continue };
-            if seeded.iter().any(|(other, depth)| pixel_of(other, position).is_some_and(|p| depth[p].is_finite())) {
+            if seeded.iter().any(|(other, depth)| other.pixel_of(position).is_some_and(|p| depth[p].is_finite())) {
                 continue;
             }
             let [w, _] = camera.size;
@@ -221,7 +213,7 @@ mod tests {
         assert_eq!(added.len(), 8 * 10);
         for point in added {
             let position = point.position.map(f64::from);
-            let pixel = pixel_of(&camera, position).expect("in the picture");
+            let pixel = camera.pixel_of(position).expect("in the picture");
             assert!((72..80).contains(&(pixel % w as usize)) && (camera.to_camera(position)[2] - 3.0).abs() < 1e-4);
             assert_eq!(point.color, [0, 0, (pixel / w as usize % 200) as u8], "of the far side, in the same row");
         }

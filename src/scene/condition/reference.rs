@@ -3,7 +3,6 @@
 use image::{GrayImage, Luma};
 use rayon::prelude::*;
 
-use super::points::pixel_of;
 use super::sparse::{Sample, fit, samples};
 use crate::scene::{Camera, Point, Prior, PriorKind, Reference, Scene};
 use crate::statistics::deviation;
@@ -240,7 +239,7 @@ fn outranked(scene: &Scene, reference: &Reference, depth: &[f32], enough: u32) -
         let place = || camera.lift(camera.pixel_center(pixel), f64::from(z));
         let Some(position) = z.is_finite().then(place).flatten() else { return 0 };
         let sees = |other: &&&crate::scene::View| {
-            pixel_of(&other.camera, position).is_some_and(|p| other.blend().is_none_or(|w| w.as_raw()[p] == 0))
+            other.camera.pixel_of(position).is_some_and(|p| other.blend().is_none_or(|w| w.as_raw()[p] == 0))
         };
         others.iter().filter(sees).count()
     };

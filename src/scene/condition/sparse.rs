@@ -34,15 +34,10 @@ pub(crate) fn samples(camera: &Camera, points: &[Point], outside: Option<&image:
     let mut blocks: Vec<Vec<Sample>> = vec![vec![]; columns * h.div_ceil(block)];
     for point in points {
         let position = point.position.map(f64::from);
-        let Some([u, v]) = camera.project(position) else { continue };
-        if !(u >= 0.0 && v >= 0.0 && u < w as f64 && v < h as f64) {
-            continue;
-        }
-        let (x, y) = (u as usize, v as usize);
-        let pixel = y * w + x;
+        let Some(pixel) = camera.pixel_of(position) else { continue };
         if outside.is_none_or(|mask| mask.as_raw()[pixel] == 0) {
             let found = Sample { pixel, depth: camera.to_camera(position)[2] };
-            blocks[y / block * columns + x / block].push(found);
+            blocks[pixel / w / block * columns + pixel % w / block].push(found);
         }
     }
     let median = |block: &mut Vec<Sample>| {

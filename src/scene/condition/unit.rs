@@ -43,9 +43,7 @@ fn find(scene: &Scene) -> Option<f64> {
     for camera in cameras.iter().step_by(every(cameras.len(), VIEWS)) {
         let depth = |position: [f32; 3]| {
             let position = position.map(f64::from);
-            let [u, v] = camera.project(position)?;
-            let inside = u >= 0.0 && v >= 0.0 && u < f64::from(camera.size[0]) && v < f64::from(camera.size[1]);
-            inside.then(|| camera.to_camera(position)[2])
+            camera.within(position).map(|_| camera.to_camera(position)[2])
         };
         depths.extend(points.clone().filter_map(|p| depth(p.position)));
     }
