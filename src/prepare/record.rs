@@ -16,6 +16,7 @@ use tempfile::TempDir;
 
 use super::{Error, Step};
 use crate::folder;
+use crate::scene::npy;
 
 /// The record's file within a prepared scene.
 pub const RECORD: &str = "prepare.json";
@@ -187,11 +188,7 @@ impl Batch {
 
     /// A float32 map (row-major, width and height in `size`) as NumPy file.
     pub fn npy(&mut self, path: impl Into<String>, size: [u32; 2], values: Vec<f32>, from: impl Into<String>) {
-        let shape = (size[1] as usize, size[0] as usize);
-        let array = ndarray::Array2::from_shape_vec(shape, values).expect("a value per pixel");
-        let mut bytes = vec![];
-        ndarray_npy::WriteNpyExt::write_npy(&array, &mut bytes).expect("an array is encoded into memory");
-        self.bytes(path, bytes, from);
+        self.bytes(path, npy::encode(&values, size), from);
     }
 }
 

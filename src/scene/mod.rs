@@ -31,7 +31,7 @@ mod exposure;
 mod hole;
 mod layout;
 mod note;
-mod npy;
+pub(crate) mod npy;
 pub mod path;
 mod picture;
 mod priors;

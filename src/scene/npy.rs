@@ -10,6 +10,7 @@ use std::path::Path;
 use super::Error;
 use super::picture::MAX_PIXELS;
 
+const MAGIC: &[u8; 6] = b"\x93NUMPY";
 /// NumPy itself writes 128 bytes and refuses more than 10,000.
 const LONGEST_HEADER: u64 = 10_000;
 
@@ -20,6 +21,27 @@ pub struct Map {
     pub values: Vec<f32>,
     /// Width, height.
     pub size: [u32; 2],
+}
+
+/// Bytes in front of the values of a written file are a multiple of this, as NumPy aligns them.
+const ALIGNMENT: usize = 64;
+
+/// The bytes of a float32 map (row-major, `size` = width, height) as a file of format version 1.0.
+///
+/// # Panics
+/// Unless there is a value per pixel.
+pub fn encode(values: &[f32], [width, height]: [u32; 2]) -> Vec<u8> {
+    assert_eq!(values.len(), width as usize * height as usize, "a value per pixel");
+    let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({height}, {width}), }}");
+    let start = MAGIC.len() + 4;
+    // The header ends with a line break, and at least one space stands before the next multiple.
+    let length = (start + header.len() + 1) / ALIGNMENT * ALIGNMENT + ALIGNMENT - start;
+    let mut bytes = MAGIC.to_vec();
+    bytes.extend([1, 0]);
+    bytes.extend((length as u16).to_le_bytes());
+    bytes.extend(format!("{header:<0$}\n", length - 1).bytes());
+    bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+    bytes
 }
 
 /// Reads an array of rows x columns; axes of length 1 around it count for nothing.
@@ -38,7 +60,7 @@ pub fn read(path: &Path) -> Result<Map, Error> {
     let mut start = [0; 8];
     input.read_exact(&mut start).map_err(io)?;
     let [magic @ .., version, _] = start;
-    if magic != *b"\x93NUMPY" || !(1..=3).contains(&version) {
+    if magic != *MAGIC || !(1..=3).contains(&version) {
         return Err(invalid(
             "not a readable NumPy array: it does not begin as one does; save it with numpy.save".into(),
         ));
@@ -199,11 +221,19 @@ mod tests {
                 assert_eq!((map.values, map.size), (rows.to_vec(), [3, 2]), "{descr} {fortran}");
             }
         }
-        // What the library writes that others of our files are written with.
-        let mut bytes = vec![];
-        let array = ndarray::Array2::from_shape_vec((2, 3), rows.to_vec()).unwrap();
-        ndarray_npy::WriteNpyExt::write_npy(&array, &mut bytes).unwrap();
-        assert_eq!(of(&bytes).unwrap().values, rows);
+    }
+
+    /// As another program writes it, for shapes of every number of digits.
+    #[test]
+    fn written_files_are_those_of_the_library() {
+        for (w, h) in [(1, 1), (3, 2), (1000, 7), (12, 100_000), (100_000, 12)] {
+            let values: Vec<f32> = (0..w * h).map(|i| i as f32 / 7.0).collect();
+            let bytes = encode(&values, [w as u32, h as u32]);
+            let mut expected = vec![];
+            let array = ndarray::Array2::from_shape_vec((h, w), values).unwrap();
+            ndarray_npy::WriteNpyExt::write_npy(&array, &mut expected).unwrap();
+            assert!(bytes == expected, "{w} x {h}");
+        }
     }
 
     /// 128 bytes that claim terabytes, and headers that are no dictionaries, are refused without being believed.

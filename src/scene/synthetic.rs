@@ -9,13 +9,12 @@ use std::path::Path;
 
 use glam::{DMat3, DQuat, DVec3, dvec3};
 use image::{GrayImage, Luma, Rgb, RgbImage};
-use ndarray::Array2;
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64;
 use rayon::prelude::*;
 
-use super::{Error, undistort};
+use super::{Error, npy, undistort};
 
 /// What to make. The same options give the same files.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -140,10 +139,8 @@ pub(super) fn write_tests(dir: &Path, room: &Room, shots: &[Shot], exposures: &[
         let picture = exposed(room.photograph(shot, false), exposures.get(i));
         save(dir.join("test_images").join(&name), |path| picture.save(path))?;
         save(dir.join("test_masks").join(&name), |path| room.mask(shot).save(path))?;
-        let [w, h] = shot.size.map(|n| n as usize);
-        let depth = room.depth(shot, false);
-        let depth = Array2::from_shape_fn((h, w), |(y, x)| depth[y * w + x] as f32);
-        write_npy(&dir.join("test_depth").join(format!("{}.npy", shot.name)), &depth)
+        let depth: Vec<f32> = room.depth(shot, false).into_iter().map(|z| z as f32).collect();
+        write_npy(&dir.join("test_depth").join(format!("{}.npy", shot.name)), &depth, shot)
     })
 }
 
@@ -179,18 +176,20 @@ fn save_prior(path: &Path, depth: &[f64], shot: &Shot, rng: &mut Pcg64) -> Resul
     let noise = PRIOR_NOISE * depth.iter().sum::<f64>() / depth.len() as f64;
     let waves: [[f64; 3]; 3] =
         std::array::from_fn(|_| [rng.random_range(-1.5..1.5), rng.random_range(-1.5..1.5), rng.random_range(0.0..TAU)]);
-    let values = Array2::from_shape_fn((h, w), |(y, x)| {
+    let value = |pixel: usize| {
+        let (x, y) = (pixel % w, pixel / w);
         let white: f64 = StandardNormal.sample(rng);
         let (u, v) = (x as f64 / w as f64, y as f64 / h as f64);
         let slow: f64 = waves.iter().map(|[a, b, phase]| (TAU * (a * u + b * v) + phase).sin()).sum();
-        (scale * (depth[y * w + x] + noise * (white + slow)) + shift) as f32
-    });
-    write_npy(path, &values)
+        (scale * (depth[pixel] + noise * (white + slow)) + shift) as f32
+    };
+    let values: Vec<f32> = (0..w * h).map(value).collect();
+    write_npy(path, &values, shot)
 }
 
-fn write_npy(path: &Path, values: &Array2<f32>) -> Result<(), Error> {
-    ndarray_npy::write_npy(path, values)
-        .map_err(|e| Error::Io { path: path.to_path_buf(), source: std::io::Error::other(e) })
+fn write_npy(path: &Path, values: &[f32], shot: &Shot) -> Result<(), Error> {
+    let bytes = npy::encode(values, shot.size);
+    std::fs::write(path, bytes).map_err(|source| Error::Io { path: path.to_path_buf(), source })
 }
 
 // ---------------------------------------------------------------- cameras
