@@ -9,7 +9,7 @@
 //! at an object in, and [`lab`] holds the instruments: speed, error against run time.
 //! Kernels live in `glsl/`, mirrored by path and stem in `src/`; each has a CPU twin in float64 beside the code that
 //! dispatches it. [`gpu`] is the only place that knows Vulkan; [`primitives`] are sorts, scans and sums that know nothing of
-//! splats. [`cli`] has one file per command.
+//! splats. [`cli`] has one file per command, [`work`] the parts of a job that several commands begin with.
 //!
 //! # Words
 //!
@@ -67,3 +67,4 @@ pub mod stage;
 pub mod statistics;
 pub mod train;
 pub mod view;
+pub mod work;

@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use super::eval::JudgeArgs;
 use super::folders::{RECORD, Record, last_part};
-use super::shared::{DeviceArgs, SYNTHETIC, SceneArgs, add_dense, load_scene, with_gpu};
+use super::shared::{DeviceArgs, SceneArgs, with_gpu};
 use super::train::{Manner, default_folder, is_begun, train};
 use super::{index, next, signals};
 use crate::config::{Settings, SettingsArgs};
@@ -17,7 +17,7 @@ use crate::folder::{self, Lock};
 use crate::gpu::Gpu;
 use crate::lab::ablation::{Row, compare, differences, published, table};
 use crate::lab::pace::Pace;
-use crate::scene::Scene;
+use crate::work::{Loaded, Ready, SYNTHETIC};
 
 /// Train scenes with and without each part of the method, and compare (the ablation of the paper)
 ///
@@ -314,7 +314,7 @@ fn of_scene(
 ) -> anyhow::Result<Vec<Row>> {
     let mut rows = vec![];
     // Read once for all variants that read it alike.
-    let mut read: Option<(Settings, Vec<String>, Scene)> = None;
+    let mut read: Option<(Settings, Ready)> = None;
     for variant in variants {
         let mut settings = variant.settings(base, path, seed);
         let folder = folder(args, out, label, &variant.name, seed);
@@ -328,14 +328,11 @@ fn of_scene(
         }
         // The seed is that of the built-in scene, too.
         let alike = |other: &Settings| other.scene == settings.scene && other.train.seed == settings.train.seed;
-        if !read.as_ref().is_some_and(|(other, _, _)| alike(other)) {
-            let mut scene = load_scene(path, &settings)?;
-            let mut without = settings.clone();
-            add_dense(gpu, path, &mut scene, &mut without)?;
-            read = Some((settings.clone(), without.scene.leave_out, scene));
+        if !read.as_ref().is_some_and(|(other, _)| alike(other)) {
+            read = Some((settings.clone(), Loaded::read(path, settings.clone())?.ready(gpu)?));
         }
-        let Some((_, leave_out, scene)) = &read else { unreachable!("it was just read") };
-        settings.scene.leave_out.clone_from(leave_out);
+        let Some((_, Ready { scene, settings: without })) = &read else { unreachable!("it was just read") };
+        settings.scene.leave_out.clone_from(&without.scene.leave_out);
         if scene.test.is_empty() {
             bail!(
                 "{}: the scene has no test views to compare on: set scene.test_every to hold some out",

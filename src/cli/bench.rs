@@ -8,7 +8,7 @@ use super::folders::last_part;
 use super::hole::{self, HoleArgs};
 use super::next;
 use super::next::command_line;
-use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, add_dense, load_scene, only_anchors, with_gpu};
+use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, only_anchors, with_gpu};
 use crate::config::SettingsArgs;
 use crate::gpu::Options;
 use crate::lab::bench::ceilings::Prober;
@@ -18,6 +18,7 @@ use crate::lab::plots;
 use crate::lab::report::SceneFacts;
 use crate::lab::report::tables::write;
 use crate::train::plan::Plan;
+use crate::work::{Loaded, Ready};
 
 /// Measure every pass of a step against the time it would take at the device's own ceilings
 ///
@@ -103,17 +104,19 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         .clone()
         .map(|scene| {
             let args = SceneArgs { scene, settings: args.settings.clone() };
-            let scene = load_scene(&args.scene, &settings)?;
-            let facts = SceneFacts::new(last_part(&args.name()), &scene);
-            Ok::<_, anyhow::Error>((scene, facts))
+            let loaded = Loaded::read(&args.scene, settings.clone())?;
+            let facts = SceneFacts::new(last_part(&args.name()), &loaded.scene);
+            Ok::<_, anyhow::Error>((loaded, facts))
         })
         .transpose()?;
-    let (mut scene, facts) = loaded.map_or((None, None), |(scene, facts)| (Some(scene), Some(facts)));
+    let (loaded, facts) = loaded.map_or((None, None), |(loaded, facts)| (Some(loaded), Some(facts)));
     let json = serde_json::to_value(&settings).context("the settings as JSON")?;
     let MeasureArgs { warm_up, step, views, repetitions } = args.measure;
     let (views, repetitions) = (views as usize, repetitions as usize);
-    let number = |scene| step.unwrap_or_else(|| bench::usual_step(&Plan::new(scene, &settings), &settings, warm_up));
-    let step = scene.as_ref().map(number);
+    let number = |Loaded { scene, .. }: &Loaded| {
+        step.unwrap_or_else(|| bench::usual_step(&Plan::new(scene, &settings), &settings, warm_up))
+    };
+    let step = loaded.as_ref().map(number);
     let mut say = |line: &str| eprintln!("{line}");
     let options = Options { timestamps: true, ..args.device.options() };
     let (record, notes) = with_gpu(&options, |gpu| {
@@ -125,10 +128,10 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             .map(|(path, old)| compare::ensure_comparable(path, old, subject))
             .transpose()?
             .unwrap_or_default();
-        let mut settings = settings.clone();
-        if let (Some(scene), Some(path)) = (&mut scene, &args.scene) {
-            add_dense(gpu, path, scene, &mut settings)?;
-        }
+        let (scene, settings) = match loaded {
+            Some(loaded) => loaded.ready(gpu).map(|Ready { scene, settings }| (Some(scene), settings))?,
+            None => (None, settings),
+        };
         say("bench: ceilings of the device");
         let mut prober = Prober::new(gpu)?;
         if scene.is_none() {

@@ -5,12 +5,13 @@ use anyhow::{Context as _, anyhow, bail};
 use image::{GrayImage, RgbImage};
 
 use super::folders::{self, Origin};
-use super::shared::{self, DeviceArgs};
+use super::shared::DeviceArgs;
 use super::{instruments, next};
 use crate::evaluate::fid::Inception;
 use crate::evaluate::lpips::Lpips;
 use crate::evaluate::{Judge, Judging, Metrics, Protocol, Report};
 use crate::scene::{self, Scene};
+use crate::work;
 
 /// Measure rendered views against photographs: PSNR, SSIM and FLIP, and LPIPS and FID with your weights
 ///
@@ -126,7 +127,7 @@ fn of_run(args: &Args, judge: &Judge) -> anyhow::Result<Report> {
     let origin = Origin::find(run)?;
     let settings = origin.settings(vec![])?;
     let scene = origin.scene().context("a run folder names its scene")?;
-    let mut scene = shared::load_scene(Path::new(scene), &settings)?;
+    let mut scene = work::load_scene(Path::new(scene), &settings)?;
     if scene.test.is_empty() {
         bail!("{}: its scene has no test views to compare with", run.display());
     }

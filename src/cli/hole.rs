@@ -8,7 +8,7 @@ use anyhow::{Context as _, ensure};
 
 use super::folders::{MODEL, Record, last_part};
 use super::prepare::Bars;
-use super::shared::{DeviceArgs, SceneArgs, add_dense, load_scene};
+use super::shared::{DeviceArgs, SceneArgs};
 use super::train::{self, Manner, go_on_without, is_begun};
 use super::{next, pictures, preset, signals};
 use crate::atomic;
@@ -22,8 +22,8 @@ use crate::lab::hole::record::{Known, RUNS, Row, TABLE};
 use crate::lab::hole::truth::{self, Truth};
 use crate::lab::hole::{self, SCENE};
 use crate::lab::pace::Pace;
-use crate::scene::Scene;
 use crate::train::checkpoint;
+use crate::work::{Loaded, Ready};
 
 /// How holes are judged.
 #[derive(Debug, Clone, Default, clap::Args)]
@@ -169,7 +169,7 @@ impl Work<'_> {
     fn run(&self, truth: &Truth, prepared: &hole::Prepared, hash: String) -> anyhow::Result<Row> {
         let run = self.folder.join(format!("seed-{}", self.seed));
         let began = Instant::now();
-        let (scene, settings) = self.train(&run)?;
+        let Ready { scene, settings } = self.train(&run)?;
         let train_seconds = began.elapsed().as_secs_f64();
         let model = run.join(MODEL);
         let evened = !scene.gains.is_empty();
@@ -195,24 +195,23 @@ impl Work<'_> {
 
     /// Trains what the preparation left into a run folder, or goes on with what is there; the scene and the settings as they
     /// were trained with.
-    fn train(&self, run: &Path) -> anyhow::Result<(Scene, Settings)> {
+    fn train(&self, run: &Path) -> anyhow::Result<Ready> {
         let given = preset::chosen(&self.given(self.folder.join(SCENE)), self.device)?;
-        let (path, scene_name) = (&given.scene, given.name());
-        let mut settings = self.fitted(&given.settings.resolve()?);
+        let scene_name = given.name();
+        let settings = self.fitted(&given.settings.resolve()?);
         let _lock = Lock::take(run)?;
         let begun = is_begun(run, &scene_name, &settings)?;
-        let mut scene = load_scene(path, &settings)?;
+        let mut loaded = Loaded::read(&given.scene, settings)?;
         if begun {
-            go_on_without(run, path, &mut scene, &mut settings)?;
+            go_on_without(run, &mut loaded)?;
         }
         if begun && Record::read(run)?.complete.is_some() {
-            return Ok((scene, settings));
+            return Ok(loaded.as_read());
         }
-        if !begun || checkpoint::list(run).is_empty() {
-            add_dense(self.gpu, path, &mut scene, &mut settings)?;
-        }
+        let goes_on = begun && !checkpoint::list(run).is_empty();
+        let ready = if goes_on { loaded.as_read() } else { loaded.ready(self.gpu)? };
         let manner = Manner { go_on: begun, ..Manner::default() };
-        train::train(self.gpu, &scene, &settings, &scene_name, run, &manner, &Judge::default())?;
-        Ok((scene, settings))
+        train::train(self.gpu, &ready.scene, &ready.settings, &scene_name, run, &manner, &Judge::default())?;
+        Ok(ready)
     }
 }

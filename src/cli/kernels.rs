@@ -5,10 +5,11 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 
 use super::preset;
-use super::shared::{DeviceArgs, SYNTHETIC, SceneArgs, with_gpu};
+use super::shared::{DeviceArgs, SceneArgs, with_gpu};
 use crate::config::SettingsArgs;
 use crate::gpu::{Compiled, Options};
 use crate::train::forecast::{self, Question};
+use crate::work::{Loaded, SYNTHETIC};
 
 /// Show what the driver's compiler makes of every kernel: time, registers, spills, shared memory, occupancy
 ///
@@ -49,7 +50,7 @@ struct Kernels<'a> {
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let given = SceneArgs { scene: args.scene.clone(), settings: args.settings.clone() };
-    let (scene, settings) = preset::load(&given, &args.device)?;
+    let Loaded { scene, settings, .. } = preset::load(&given, &args.device)?;
     // From the cache a kernel would have no compile time, and some drivers no figures.
     let options = Options { statistics: true, subgroup_size: args.subgroup, cache: None, ..args.device.options() };
     with_gpu(&options, |gpu| {

@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 
 use super::next;
 use super::preset;
-use super::shared::{DeviceArgs, SceneArgs, add_dense, with_gpu};
+use super::shared::{DeviceArgs, SceneArgs, with_gpu};
 use crate::config::Settings;
 use crate::gpu::{self, Entry, Gpu, Options, Schedule, Timings};
 use crate::scene::Scene;
@@ -17,6 +17,7 @@ use crate::train::forecast::{self, Question, Verdict};
 use crate::train::order::Order;
 use crate::train::plan::{Plan, Steps};
 use crate::train::run::Run;
+use crate::work::Ready;
 
 /// Show what a scene's training consists of, and the memory it will take
 ///
@@ -56,10 +57,10 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
-    let (mut scene, mut settings) = preset::load(&args.scene, &args.device)?;
+    let loaded = preset::load(&args.scene, &args.device)?;
     let options = Options { timestamps: args.measure.is_some(), ..args.device.options() };
     with_gpu(&options, |gpu| {
-        add_dense(gpu, &args.scene.scene, &mut scene, &mut settings)?;
+        let Ready { scene, settings } = loaded.ready(gpu)?;
         let question =
             Question { anchors: args.anchors, available: args.memory.map(|mib| mib << 20), also: Some(args.step) };
         let verdict = forecast::forecast(gpu, &scene, &settings, question)?;

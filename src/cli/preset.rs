@@ -2,10 +2,11 @@
 
 use std::path::Path;
 
-use super::shared::{DeviceArgs, SYNTHETIC, SceneArgs};
+use super::shared::{DeviceArgs, SceneArgs};
 use crate::config::Settings;
 use crate::gpu::{self, DeviceInfo};
-use crate::scene::{self, Scene};
+use crate::scene;
+use crate::work::{Loaded, SYNTHETIC};
 
 /// Longer side of the pictures that a CPU trains on in minutes, pixels: a quarter of SPIn-NeRF's 1008.
 const SIDE: f64 = 252.0;
@@ -36,11 +37,11 @@ fn choose(device: &DeviceInfo, scene: &Path, longest: Option<u32>) -> Choice {
 ///
 /// # Errors
 /// As [`SceneArgs::load`]; without a usable device.
-pub(super) fn load(given: &SceneArgs, device: &DeviceArgs) -> anyhow::Result<(Scene, Settings)> {
+pub(super) fn load(given: &SceneArgs, device: &DeviceArgs) -> anyhow::Result<Loaded> {
     let Some((chosen, choice, device)) = choice(given, device)? else { return given.load() };
-    let (scene, settings) = chosen.load()?;
-    eprintln!("{}", describe(&choice, &device, &settings));
-    Ok((scene, settings))
+    let loaded = chosen.load()?;
+    eprintln!("{}", describe(&choice, &device, &loaded.settings));
+    Ok(loaded)
 }
 
 /// The arguments with the preset that [`load`] takes.

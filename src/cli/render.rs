@@ -4,7 +4,7 @@ use anyhow::{Context as _, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::folders::Origin;
-use super::shared::{self, DeviceArgs};
+use super::shared::DeviceArgs;
 use super::{next, pictures};
 use crate::atomic::shortened;
 use crate::config::Source;
@@ -12,6 +12,7 @@ use crate::folder::{self, Lock};
 use crate::model::stored::Stored;
 use crate::render::view::Renderer;
 use crate::scene::{Camera, Scene, View, path};
+use crate::work;
 
 /// Render views of a trained model: colour as PNG, depth and transmittance as OpenEXR
 ///
@@ -110,7 +111,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let scene = args.scene.as_deref().or(own).with_context(|| {
         format!("{}: a model alone does not know its cameras; name the scene with --scene", args.model.display())
     })?;
-    let loaded = shared::load_scene(scene, &settings)?;
+    let loaded = work::load_scene(scene, &settings)?;
     // A model on disk has the lengths of the scene's own files.
     model.rescale(1.0 / loaded.unit);
     let cameras = args.views.cameras(&loaded, args.frames);

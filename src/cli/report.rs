@@ -7,7 +7,7 @@ use anyhow::{Context as _, bail};
 use super::folders::last_part;
 use super::next;
 use super::next::command_line;
-use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, add_dense, load_scene, only_anchors, with_gpu};
+use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, only_anchors, with_gpu};
 use super::train::default_folder;
 use crate::config::Settings;
 use crate::gpu::{Gpu, Options};
@@ -17,6 +17,7 @@ use crate::lab::report::training::Spacing;
 use crate::lab::report::{Report, SceneFacts, figures, kernels, tables, training};
 use crate::lab::variants::{self, Variant};
 use crate::scene::Scene;
+use crate::work::{Loaded, Ready};
 
 /// Measure error against run time, of a step's stages and of whole training runs, for a table of choices
 ///
@@ -75,8 +76,9 @@ const PAGE: &str = "report.html";
 const JSON: &str = "report.json";
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
-    let (mut scene, mut settings) = args.scene.load()?;
-    only_anchors(&settings, "report")?;
+    let loaded = args.scene.load()?;
+    let settings = &loaded.settings;
+    only_anchors(settings, "report")?;
     let name = args.scene.name();
     let out = args.out.clone().unwrap_or_else(|| {
         let mut folder = default_folder(&name).into_os_string();
@@ -86,8 +88,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     if out.join(JSON).exists() && !args.overwrite {
         bail!("{}: holds a report already: choose another --out, or --overwrite", out.display());
     }
-    let steps = choices(args, &settings, variants::KERNELS)?;
-    let runs = choices(args, &settings, variants::TRAINING)?;
+    let steps = choices(args, settings, variants::KERNELS)?;
+    let runs = choices(args, settings, variants::TRAINING)?;
     for wanted in &args.only {
         if !steps.iter().chain(&runs).any(|v| v.name == *wanted) {
             let mut names: Vec<&str> =
@@ -97,11 +99,12 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             bail!("--only {wanted}: no choice has this name; there are {}", names.join(", "));
         }
     }
-    if !args.kernels_only && scene.test.is_empty() {
+    if !args.kernels_only && loaded.scene.test.is_empty() {
         return Err(crate::lab::report::Error::NoTestViews.into());
     }
     std::fs::create_dir_all(&out).with_context(|| format!("{}: cannot be made", out.display()))?;
 
+    let Ready { scene, settings } = with_gpu(&args.device.options(), |gpu| loaded.ready(gpu))?;
     let mut device = None;
     let mut say = |line: &str| eprintln!("{line}");
     let kernels = if args.training_only {
@@ -110,7 +113,6 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         let options = Options { timestamps: true, ..args.device.options() };
         Some(with_gpu(&options, |gpu| {
             device = Some(gpu.info().clone());
-            add_dense(gpu, &args.scene.scene, &mut scene, &mut settings)?;
             let options = kernels::Options {
                 warm_up: args.measure.warm_up,
                 step: args.measure.step,
@@ -126,7 +128,6 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         // Without timestamps, as `train` runs.
         Some(with_gpu(&args.device.options(), |gpu| {
             device = Some(gpu.info().clone());
-            add_dense(gpu, &args.scene.scene, &mut scene, &mut settings)?;
             let options = training::Options { samples: args.samples, spacing: args.spacing, seeds: args.seeds };
             let read = |settings: &Settings| read(gpu, args, settings);
             training::measure(gpu, &scene, runs, options, read, &mut say)
@@ -164,9 +165,7 @@ fn choices(args: &Args, settings: &Settings, table: &[variants::Choice]) -> anyh
 
 /// Reads the scene again, at another size for instance.
 fn read(gpu: &Gpu, args: &Args, settings: &Settings) -> anyhow::Result<Scene> {
-    let mut scene = load_scene(&args.scene.scene, settings)?;
-    add_dense(gpu, &args.scene.scene, &mut scene, &mut settings.clone())?;
-    Ok(scene)
+    Ok(Loaded::read(&args.scene.scene, settings.clone())?.ready(gpu)?.scene)
 }
 
 fn write(report: &Report, out: &std::path::Path) -> anyhow::Result<Vec<&'static str>> {

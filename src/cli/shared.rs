@@ -2,16 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, bail};
+use anyhow::bail;
 
 use crate::config::{Settings, SettingsArgs};
 use crate::gpu::{Descriptors, Form, Gpu, Options};
 use crate::model::config;
-use crate::multiview;
-use crate::scene::{self, Scene, synthetic};
-
-/// The word that stands for the built-in scene where a folder is expected.
-pub const SYNTHETIC: &str = "synthetic";
+use crate::scene::Scene;
+use crate::work::{Loaded, SYNTHETIC, load_scene};
 
 /// Which device to compute on, and how closely to watch it.
 #[derive(Debug, Clone, Default, clap::Args)]
@@ -98,13 +95,12 @@ pub struct SceneArgs {
 }
 
 impl SceneArgs {
-    /// The scene and the resolved settings; what there is to know about the scene goes to stderr.
+    /// The scene, read with the resolved settings; what there is to know about it goes to stderr.
     ///
     /// # Errors
     /// Settings that make no sense; a scene that cannot be read.
-    pub fn load(&self) -> anyhow::Result<(Scene, Settings)> {
-        let settings = self.settings.resolve()?;
-        Ok((load_scene(&self.scene, &settings)?, settings))
+    pub fn load(&self) -> anyhow::Result<Loaded> {
+        Loaded::read(&self.scene, self.settings.resolve()?)
     }
 
     /// The scene as a run's record names it.
@@ -134,61 +130,6 @@ pub struct MeasureArgs {
     #[arg(long, value_name = "N", default_value_t = 9, value_parser = clap::value_parser!(u32).range(1..))]
     pub repetitions: u32,
 }
-
-/// Reads a scene, makes it ready for training and prints its notes to stderr. Its lengths are in [`Scene::unit`]s. `synthetic` writes the built-in scene of seed `train.seed` into a
-/// temporary folder and reads it like any other.
-///
-/// # Errors
-/// A scene that cannot be read, a temporary folder that cannot be written.
-pub fn load_scene(scene: &Path, settings: &Settings) -> anyhow::Result<Scene> {
-    let mut scene = if scene == Path::new(SYNTHETIC) {
-        let folder = tempfile::tempdir().context("no temporary folder for the synthetic scene can be made")?;
-        let options = synthetic::Options { seed: settings.train.seed, ..Default::default() };
-        let scene = folder.path().join(SYNTHETIC);
-        synthetic::write(&scene, &options)?;
-        scene::load(&scene, &settings.scene)?
-    } else {
-        scene::load(scene, &settings.scene)?
-    };
-    scene::condition(&mut scene, &settings.scene);
-    for note in &scene.notes {
-        eprintln!("scene: {note}");
-    }
-    Ok(scene)
-}
-
-/// Adds the points that the photographs add to the model's, where the settings ask for them: whatever makes or looks at the
-/// model before the first step needs them. Views that contradict the others are noted in the settings, and the scene is read
-/// from `path` again without them.
-///
-/// # Errors
-/// When the device has no room or is lost; as [`load_scene`].
-pub fn add_dense(gpu: &Gpu, path: &Path, scene: &mut Scene, settings: &mut Settings) -> anyhow::Result<()> {
-    if !settings.scene.dense || !scene.dense.is_empty() {
-        return Ok(());
-    }
-    loop {
-        let found = multiview::look(gpu, scene, settings.scene.object_point_share)?;
-        let views = scene.train.len() + scene.test.len();
-        if found.wrong.is_empty() || views - found.wrong.len() < FEWEST_VIEWS {
-            eprintln!("scene: {}", found.note);
-            scene.dense = found.points;
-            scene.notes.push(found.note);
-            return Ok(());
-        }
-        eprintln!(
-            "scene: the photographs of {} of {views} views agree with the others' next to nowhere, so that the model has \
-             their cameras in a wrong place, and they are left out (scene.leave_out): {}",
-            found.wrong.len(),
-            found.wrong.join(", ")
-        );
-        settings.scene.leave_out.extend(found.wrong);
-        *scene = load_scene(path, settings)?;
-    }
-}
-
-/// Views that are never gone below.
-const FEWEST_VIEWS: usize = 3;
 
 /// Refuses plain Gaussians for a command that knows anchors alone.
 ///
@@ -234,11 +175,11 @@ mod tests {
     #[test]
     fn the_built_in_scene_is_read_like_any_other() {
         let arguments = probe(&["synthetic", "--preset", "demo", "--seed", "5", "--downscale", "4"]);
-        let (scene, settings) = arguments.scene.load().expect("it needs no files");
+        let Loaded { scene, settings, .. } = arguments.scene.load().expect("it needs no files");
         assert_eq!((scene.train.len(), scene.train[0].camera.size), (24, [40, 30]));
         assert_eq!((settings.train.seed, settings.train.iterations), (5, 800));
-        let (other, _) = probe(&["synthetic", "--seed", "6", "--downscale", "4"]).scene.load().expect("likewise");
-        assert!(scene.train[0].image != other.train[0].image, "the seed is that of the scene");
+        let other = probe(&["synthetic", "--seed", "6", "--downscale", "4"]).scene.load().expect("likewise");
+        assert!(scene.train[0].image != other.scene.train[0].image, "the seed is that of the scene");
         assert_eq!(arguments.scene.name(), SYNTHETIC);
         let folder = probe(&["a/scene"]).scene.name();
         assert!(Path::new(&folder).is_absolute() && Path::new(&folder).ends_with("a/scene"), "{folder}");

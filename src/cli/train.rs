@@ -11,7 +11,7 @@ use anyhow::{Context as _, bail, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::folders::{Asked, MODEL, RECORD, Record, SEEN, SETTINGS, TEST};
-use super::shared::{DeviceArgs, SceneArgs, add_dense, load_scene, with_gpu};
+use super::shared::{DeviceArgs, SceneArgs, with_gpu};
 use super::{index, instruments, minutes, next, pictures, preset, signals};
 use crate::config::{Settings, SettingsArgs, Source};
 use crate::evaluate::{Judge, Report};
@@ -29,6 +29,7 @@ use crate::train::forecast::{self, Fitting, Question};
 use crate::train::run::{LOG, Observer, Progress, Run, Summary};
 use crate::view::live::{Board, Host};
 use crate::view::server;
+use crate::work::{Loaded, Ready};
 
 /// Train a scene without its object
 ///
@@ -141,7 +142,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     }
     let given = |scene: &PathBuf| SceneArgs { scene: scene.clone(), settings: settings.clone() };
     let given = args.scene.as_ref().map(given);
-    let (mut scene, mut settings, name, path, folder, begun, _lock) = if let Some(folder) = &args.resume {
+    let (loaded, name, folder, begun, _lock) = if let Some(folder) = &args.resume {
         let read = || {
             Record::read(folder)
                 .with_context(|| format!("{}: holds no run to go on with: start one with --out", folder.display()))
@@ -155,35 +156,34 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         let settings = Settings::resolve(&[Source::File(folder.join(SETTINGS))])?;
         let path = args.scene.clone().unwrap_or_else(|| PathBuf::from(&record.scene));
         let name = given.map_or(record.scene, |given| given.name());
-        (load_scene(&path, &settings)?, settings, name, path, folder.clone(), true, lock)
+        (Loaded::read(&path, settings)?, name, folder.clone(), true, lock)
     } else {
         let given = given.expect("clap asks for a scene where there is nothing to resume");
         let name = given.name();
         let folder = args.out.clone().unwrap_or_else(|| default_folder(&name));
         let lock = held(&folder, args.resume_or_start)?;
-        let (mut scene, mut settings) = preset::load(&given, &args.device)?;
-        let begun = args.resume_or_start && is_begun(&folder, &name, &settings)?;
+        let mut loaded = preset::load(&given, &args.device)?;
+        let begun = args.resume_or_start && is_begun(&folder, &name, &loaded.settings)?;
         if begun {
             if is_complete(&folder, &Record::read(&folder)?, lock.is_some())? {
                 return Ok(());
             }
-            go_on_without(&folder, &given.scene, &mut scene, &mut settings)?;
+            go_on_without(&folder, &mut loaded)?;
         } else if folder.join(RECORD).exists() && !args.overwrite {
             bail!(
                 "{}: holds a run already: choose another --out, go on with it by --resume, or replace it by --overwrite",
                 folder.display()
             );
         }
-        (scene, settings, name, given.scene, folder, begun, lock)
+        (loaded, name, folder, begun, lock)
     };
-    let looked = doctor::look(&scene);
+    let looked = doctor::look(&loaded.scene);
     eprintln!("doctor: {}", looked.verdict());
     let options = Options { timestamps: args.profile, ..args.device.options() };
     with_gpu(&options, |gpu| {
         // A checkpoint has the anchors.
-        if !begun || checkpoint::list(&folder).is_empty() {
-            add_dense(gpu, &path, &mut scene, &mut settings)?;
-        }
+        let goes_on = begun && !checkpoint::list(&folder).is_empty();
+        let Ready { scene, settings } = if goes_on { loaded.as_read() } else { loaded.ready(gpu)? };
         let (settings, clock) = match args.minutes {
             Some(time) => {
                 let (settings, clock) = minutes::fitted(gpu, &scene, &settings, time, began)?;
@@ -284,19 +284,9 @@ fn same_run(folder: &Path, record: &Record, name: &str, settings: &Settings) -> 
     Ok(())
 }
 
-/// Reads the scene at `path` again without the views that the run in `folder` left out when it began.
-pub(super) fn go_on_without(
-    folder: &Path,
-    path: &Path,
-    scene: &mut Scene,
-    settings: &mut Settings,
-) -> anyhow::Result<()> {
-    let theirs = Settings::resolve(&[Source::File(folder.join(SETTINGS))])?.scene.leave_out;
-    if theirs != settings.scene.leave_out {
-        settings.scene.leave_out = theirs;
-        *scene = load_scene(path, settings)?;
-    }
-    Ok(())
+/// Reads the scene again without the views that the run in `folder` left out when it began.
+pub(super) fn go_on_without(folder: &Path, loaded: &mut Loaded) -> anyhow::Result<()> {
+    loaded.leave_out(Settings::resolve(&[Source::File(folder.join(SETTINGS))])?.scene.leave_out)
 }
 
 /// `runs/` and the last part of the scene's name.

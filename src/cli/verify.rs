@@ -4,8 +4,9 @@ use anyhow::bail;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::next;
-use super::shared::{DeviceArgs, SceneArgs, add_dense, with_gpu};
+use super::shared::{DeviceArgs, SceneArgs, with_gpu};
 use crate::train::run::Run;
+use crate::work::Ready;
 
 /// Run every pass of a scene's step on the device and on the CPU reference path, and compare
 ///
@@ -30,9 +31,9 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
-    let (mut scene, mut settings) = args.scene.load()?;
+    let loaded = args.scene.load()?;
     with_gpu(&args.device.options(), |gpu| {
-        add_dense(gpu, &args.scene.scene, &mut scene, &mut settings)?;
+        let Ready { scene, settings } = loaded.ready(gpu)?;
         let mut run = Run::new(gpu, &scene, &settings)?;
         let style = ProgressStyle::with_template("warm-up {wide_bar} {pos}/{len} steps, {eta} left")?;
         let bar = ProgressBar::new(args.warm_up.into()).with_style(style);

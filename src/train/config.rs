@@ -38,7 +38,8 @@ pub struct Config {
 }
 
 /// Smaller pictures first: the first steps train on the training pictures at half their size, reduced as
-/// `scene.downscale` reduces them. Which steps those are depends on the step alone, so that a resumed run goes on as it would have.
+/// `scene.downscale` reduces them. Which steps those are depends on the step alone, so that a resumed run goes on as it
+/// would have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default, expecting = "a table")]
 pub struct Coarse {

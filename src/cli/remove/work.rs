@@ -12,7 +12,7 @@ use super::Args;
 use crate::atomic;
 use crate::cli::folders::{self, MODEL, Record as RunRecord};
 use crate::cli::prepare::Bars;
-use crate::cli::shared::{SceneArgs, add_dense};
+use crate::cli::shared::SceneArgs;
 use crate::cli::train::{self, Manner, Stop, Trained};
 use crate::cli::{doctor as findings, export, minutes, preset};
 use crate::config::SettingsArgs;
@@ -30,6 +30,7 @@ use crate::splat::read::Splat;
 use crate::splat::views::Seen;
 use crate::train::checkpoint::{self, Fingerprint};
 use crate::view::live::Board;
+use crate::work;
 
 /// The folders of a removal.
 pub struct Places {
@@ -280,10 +281,10 @@ impl Job<'_> {
         let given = SceneArgs { scene: folder.clone(), settings: settings.clone() };
         let name = given.name();
         let lock = train::held(run, false)?;
-        let (mut scene, mut settings) = preset::load(&given, device)?;
-        let fingerprint = serde_json::to_string(&Fingerprint::of(&scene)).context("names and hashes")?;
+        let mut loaded = preset::load(&given, device)?;
+        let fingerprint = serde_json::to_string(&Fingerprint::of(&loaded.scene)).context("names and hashes")?;
         let time = minutes.unwrap_or(0.0).to_le_bytes();
-        let inputs = Inputs::default().with(fingerprint).with(settings.to_toml()).with(time).finish();
+        let inputs = Inputs::default().with(fingerprint).with(loaded.settings.to_toml()).with(time).finish();
         let there = RunRecord::read(run).ok();
         let same = record.train == inputs;
         if let Some(there) = &there {
@@ -302,12 +303,14 @@ impl Job<'_> {
         record.write(root)?;
         let begun = same && there.is_some();
         if begun {
-            train::go_on_without(run, folder, &mut scene, &mut settings)?;
+            train::go_on_without(run, &mut loaded)?;
         }
-        if !begun || checkpoint::list(run).is_empty() {
+        let work::Ready { scene, settings } = if begun && !checkpoint::list(run).is_empty() {
+            loaded.as_read()
+        } else {
             audience.begin("points", 0);
-            add_dense(gpu, folder, &mut scene, &mut settings)?;
-        }
+            loaded.ready(gpu)?
+        };
         let (settings, clock) = match minutes {
             Some(time) if !begun => {
                 let (settings, clock) = minutes::fitted(gpu, &scene, &settings, *time, began)?;
