@@ -536,6 +536,12 @@ fn write_model(folder: &Path, train: &[Shot], test: &[Shot], cloud: &[(DVec3, Rg
     Ok(())
 }
 
+/// Whether nothing, the object included, stands between a camera's centre and a place: for tests.
+#[cfg(test)]
+pub(crate) fn reaches(seed: u64, center: DVec3, place: DVec3) -> bool {
+    Room::new(seed).cast(center, place - center, true).depth > 1.0 - 1e-3
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

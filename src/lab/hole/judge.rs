@@ -148,27 +148,21 @@ fn in_shadow(path: &Path, picture: &RgbImage, view: &View) -> Result<Option<f64>
     let dark =
         GrayImage::from_fn(left.width(), left.height(), |x, y| Luma([255 * u8::from(left.get_pixel(x, y).0[0] < LIT)]));
     let dark = resample::nearest(&dark, view.camera.size);
-    let (mut sum, mut n) = (0.0, 0usize);
-    for ((dark, own), true_one) in dark
-        .pixels()
-        .zip(picture.pixels())
-        .zip(view.image.pixels())
-        .enumerate()
-        .filter_map(|(i, pixels)| view.mask.as_ref().is_none_or(|mask| mask.as_raw()[i] == 0).then_some(pixels))
-    {
-        if dark.0[0] != 0 {
-            n += 1;
-            sum += own.0.iter().zip(true_one.0).map(|(a, b)| f64::from(*a) - f64::from(b)).sum::<f64>() / 3.0;
-        }
-    }
-    Ok((n >= PIXELS).then(|| sum / n as f64))
+    let outside = |i: usize| view.mask.as_ref().is_none_or(|mask| mask.as_raw()[i] == 0);
+    let (own, truth) = (picture.as_raw(), view.image.as_raw());
+    let brighter = |i: usize| (3 * i..3 * i + 3).map(|c| f64::from(own[c]) - f64::from(truth[c])).sum::<f64>() / 3.0;
+    let pixels: Vec<usize> = (0..dark.as_raw().len()).filter(|i| dark.as_raw()[*i] != 0 && outside(*i)).collect();
+    let mean = pixels.iter().map(|i| brighter(*i)).sum::<f64>() / pixels.len().max(1) as f64;
+    Ok((pixels.len() >= PIXELS).then_some(mean))
 }
 
-/// Means over the views that have a figure; beside them the worst hole and what is left of the object at most.
+/// Means over the views that have a figure; beside them the worst hole and what is left of the object at most. What is less
+/// than nothing of the object is another mistake, which must not make up for what is left of it in other views.
 fn summary(views: &[ViewFigures]) -> BTreeMap<String, Figure> {
     let mut by_name: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
     for (name, figure) in views.iter().flat_map(|view| &view.figures) {
-        by_name.entry(name).or_default().push(figure.0);
+        let value = if name == "residue" { figure.0.max(0.0) } else { figure.0 };
+        by_name.entry(name).or_default().push(value);
     }
     let mut all: BTreeMap<String, Figure> = by_name
         .iter()
@@ -263,8 +257,9 @@ mod tests {
             name: name.into(),
             figures: [("masked_psnr".to_owned(), Figure(psnr)), ("residue".to_owned(), Figure(left))].into(),
         };
-        let found = summary(&[view("a", 20.0, 0.1), view("b", 10.0, 0.3)]);
+        let found = summary(&[view("a", 20.0, -0.5), view("b", 10.0, 0.5)]);
         let of = |name: &str| found[name].0;
-        assert_eq!((of("masked_psnr"), of("masked_psnr_worst"), of("residue_worst")), (15.0, 10.0, 0.3));
+        assert_eq!((of("masked_psnr"), of("masked_psnr_worst")), (15.0, 10.0));
+        assert_eq!((of("residue"), of("residue_worst")), (0.25, 0.5), "what is missing makes up for nothing");
     }
 }

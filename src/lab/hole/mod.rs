@@ -118,8 +118,8 @@ pub(crate) struct Prepared {
     pub given: Vec<String>,
     /// Seconds by step.
     pub seconds: BTreeMap<String, f64>,
-    /// Mean and least intersection over union of the carried masks with the true ones, over the views that either shows
-    /// the object in.
+    /// Mean and least intersection over union of the carried masks with the true ones, over the views that show more than a
+    /// sliver of the object.
     pub iou: [f64; 2],
     /// The view of the least.
     pub worst: String,
@@ -140,7 +140,11 @@ pub(crate) fn prepared(
 ) -> Result<Prepared, Error> {
     let kept = folder.join(PREPARED);
     if kept.is_file() {
-        return read_json(&kept);
+        let prepared: Prepared = read_json(&kept)?;
+        return match masks.filter(|masks| *masks != prepared.given.len()) {
+            Some(_) => Err(Error::Record { path: kept, what: format!("it is of {} masks", prepared.given.len()) }),
+            None => Ok(prepared),
+        };
     }
     let given = given::choose(set, truth, masks)?;
     let out = folder.join(SCENE);
@@ -206,6 +210,9 @@ fn copy(from: &Path, to: &Path) -> Result<(), Error> {
     Ok(())
 }
 
+/// A view of which something hides all of the object but less than this share of its largest mask says nothing of a mask.
+const SLIVER: f64 = 0.05;
+
 /// Mean and least overlap of the carried masks with the true ones, and the view of the least.
 fn overlap(
     files: &BTreeMap<String, PathBuf>,
@@ -214,18 +221,52 @@ fn overlap(
     truth: &Truth,
 ) -> Result<([f64; 2], String), Error> {
     let carried = scene::pictures(&out.join("masks"))?;
-    let (mut sum, mut count, mut least, mut worst) = (0.0, 0u32, 1.0, String::new());
-    for (name, path) in files.iter().filter(|(name, _)| !given.contains(name) && !truth.wrong.contains(name)) {
+    let mut found: Vec<(usize, f64, &String)> = vec![];
+    for (name, path) in files.iter().filter(|(name, _)| !truth.wrong.contains(name)) {
         let Some(other) = carried.get(name) else { continue };
         let (own, other) = (scene::mask(path, 1)?, scene::mask(other, 1)?);
-        if own.as_raw().iter().chain(other.as_raw()).all(|v| *v == 0) || own.dimensions() != other.dimensions() {
-            continue;
-        }
-        let iou = doctor::iou(&own, &other);
-        (sum, count) = (sum + iou, count + 1);
-        if iou < least || worst.is_empty() {
-            (least, worst) = (iou, name.clone());
-        }
+        let pixels = own.as_raw().iter().filter(|v| **v != 0).count();
+        found.push((pixels, doctor::iou(&own, &other), name));
     }
-    Ok(([sum / f64::from(count.max(1)), least], worst))
+    let largest = found.iter().map(|(pixels, ..)| *pixels).max().unwrap_or(0) as f64;
+    found.retain(|(pixels, _, name)| *pixels as f64 > SLIVER * largest && !given.contains(name));
+    let mean = found.iter().map(|(_, iou, _)| iou).sum::<f64>() / found.len().max(1) as f64;
+    let worst = found.iter().min_by(|a, b| a.1.total_cmp(&b.1));
+    Ok(worst.map_or(([1.0; 2], String::new()), |(_, least, name)| ([mean, *least], (*name).clone())))
+}
+
+#[cfg(test)]
+mod tests {
+    use image::{GrayImage, Luma};
+
+    use super::*;
+
+    #[test]
+    fn slivers_given_masks_and_wrong_cameras_do_not_count() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let [set, out] = ["set", "out"].map(|name| folder.path().join(name));
+        // A true mask of so many columns beside a carried one.
+        let write = |name: &str, columns: [u32; 2]| {
+            for (root, columns) in [&set, &out].into_iter().zip(columns) {
+                let mask = GrayImage::from_fn(40, 10, |x, _| Luma([255 * u8::from(x < columns)]));
+                let mut png = std::io::Cursor::new(vec![]);
+                mask.write_to(&mut png, image::ImageFormat::Png).expect("a picture");
+                atomic::write_below(&root.join("masks").join(format!("{name}.png")), png.get_ref()).expect("writable");
+            }
+        };
+        for (name, columns) in [
+            ("a", [40, 40]),
+            ("b", [20, 40]),
+            ("c", [30, 30]),
+            ("given", [40, 0]),
+            ("hidden", [0, 1]),
+            ("wrong", [40, 0]),
+        ] {
+            write(name, columns);
+        }
+        let truth = Truth { wrong: vec!["wrong".into()], seen_share: 1.0, depth: String::new() };
+        let files = scene::pictures(&set.join("masks")).expect("masks");
+        let (iou, worst) = overlap(&files, &out, &["given".to_owned()], &truth).expect("they can be read");
+        assert_eq!((iou, worst.as_str()), ([2.5 / 3.0, 0.5], "b"));
+    }
 }

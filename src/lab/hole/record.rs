@@ -128,7 +128,7 @@ pub(crate) const COLUMNS: [Column; 20] = [
 /// scene has: its deviation is that of a seed.
 pub(crate) fn table(rows: &[Row]) -> String {
     let mut scenes: Vec<&str> = vec![];
-    for row in rows.iter().filter(|row| row.views > 0) {
+    for row in rows {
         if !scenes.contains(&row.scene.as_str()) {
             scenes.push(&row.scene);
         }
