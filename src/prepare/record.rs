@@ -282,6 +282,14 @@ impl Folder {
         file.exists() && folder.is_some_and(|folder| root.is_ok_and(|root| folder.starts_with(root)))
     }
 
+    /// Whether what is written at a path below the scene would come to lie outside of it, behind a link to a folder there.
+    fn leads_elsewhere(&self, path: &str) -> bool {
+        let target = self.root.join(path);
+        let there = target.ancestors().skip(1).find(|folder| folder.symlink_metadata().is_ok());
+        let [root, there] = [Some(self.root.as_path()), there].map(|folder| folder.and_then(|f| f.canonicalize().ok()));
+        !root.zip(there).is_some_and(|(root, there)| there.starts_with(root))
+    }
+
     /// Whether a step has nothing to do: its inputs are those of last time and its files are there.
     pub fn is_fresh(&self, step: &str, inputs: &str) -> bool {
         self.record.steps.get(step).is_some_and(|record| {
@@ -300,6 +308,12 @@ impl Folder {
         if let Some(outside) = files.keys().find(|path| !is_below(path)) {
             let what =
                 format!("the step {step} would write {outside:?}, which is no path below the scene; rename its source");
+            return Err(Error::File { path: self.root.clone(), what });
+        }
+        if let Some(elsewhere) = files.keys().find(|path| self.leads_elsewhere(path)) {
+            let what = format!(
+                "the step {step} would write {elsewhere:?} behind a link that leads out of the scene; put a folder in the link's place"
+            );
             return Err(Error::File { path: self.root.clone(), what });
         }
         let mut kept = vec![];
@@ -452,6 +466,32 @@ mod tests {
         std::os::unix::fs::symlink(&home, scene.join("masks")).unwrap();
         folder.write("masks", "2".into(), batch(&[])).unwrap();
         assert!(home.join("a").exists() && !scene.join("kept").exists());
+    }
+
+    /// Nor is anything written there, whatever the record says of it.
+    #[cfg(unix)]
+    #[test]
+    fn nothing_is_written_behind_a_link() {
+        let dir = tempfile::tempdir().unwrap();
+        let (scene, home) = (dir.path().join("scene"), dir.path().join("home"));
+        std::fs::create_dir_all(&home).unwrap();
+        let mut folder = Folder::open(&scene).unwrap();
+        std::fs::write(home.join("a"), "precious").unwrap();
+        folder.record.pending.insert("masks/a".into(), blake3::hash(b"precious").to_hex().to_string());
+        for (link, to) in [("masks", home.clone()), ("gone", dir.path().join("none"))] {
+            std::os::unix::fs::symlink(to, scene.join(link)).unwrap();
+        }
+        for path in ["masks/a", "masks/b", "masks/c/d", "gone/a"] {
+            let error = folder.write("masks", "1".into(), batch(&[("kept/a", "x"), (path, "y")])).unwrap_err();
+            assert!(error.to_string().contains("behind a link"), "{error}");
+        }
+        assert_eq!(std::fs::read_to_string(home.join("a")).unwrap(), "precious");
+        assert!(!home.join("b").exists() && !home.join("c").exists() && !scene.join("kept").exists());
+        // A link within the scene is the user's own business.
+        std::fs::create_dir(scene.join("large")).unwrap();
+        std::os::unix::fs::symlink("large", scene.join("small")).unwrap();
+        folder.write("masks", "1".into(), batch(&[("small/a", "x")])).unwrap();
+        assert!(scene.join("large/a").exists());
     }
 
     #[test]
