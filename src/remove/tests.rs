@@ -219,7 +219,7 @@ fn a_cut_after_reopening_begins_with_the_mask_on_disk() {
     // As no click would have it.
     let own = GrayImage::from_fn(SIZE[0], SIZE[1], |x, y| Luma([if x < 40 && y < 30 { 255 } else { 0 }]));
     let click = Mark::Object { at: [0.1, 0.1], scale: 0 };
-    objects::write(&place.objects(), "a", SIZE, &[click.clone()], Some(&own)).unwrap();
+    objects::write(&place.objects(), "a", SIZE, std::slice::from_ref(&click), Some(&own)).unwrap();
     let session = place.open();
     let brush = Mark::Brush { object: true, radius: 0.02, points: vec![[0.9, 0.9]] };
     session.mark(0, vec![click.clone(), brush.clone()]).unwrap();
