@@ -10,7 +10,7 @@ use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 
 use super::gradient::{self, Equation};
-use super::surface::{SAME, Sight, Sights};
+use super::surface::{SAME, Sight, Sights, Window};
 use crate::prepare::planes;
 use crate::scene::{Camera, resample};
 
@@ -125,6 +125,10 @@ fn sources(sights: &Sights, of: usize) -> Vec<Option<usize>> {
         }
         chosen.push(next);
     }
+    let Some(window) = Window::around(&own.grid, |site| own.near_hole(site)) else {
+        return vec![None; own.hole.len()];
+    };
+    let sites = window.sites();
     // The last label is for what nobody shows.
     let none = chosen.len();
     let cost = |label: usize, site: usize| -> f64 {
@@ -137,11 +141,14 @@ fn sources(sights: &Sights, of: usize) -> Vec<Option<usize>> {
             }
         }
     };
-    let sites = own.hole.len();
-    let costs: Vec<Vec<f64>> = (0..=none).map(|label| (0..sites).map(|site| cost(label, site)).collect()).collect();
-    let size = [own.grid.columns as usize, own.grid.rows as usize];
-    let labels = planes::cheapest(&costs, |_, _| SEAM, size);
-    (0..sites).map(|site| chosen.get(labels[site]).copied().filter(|_| costs[labels[site]][site] < HIDDEN)).collect()
+    let costs: Vec<Vec<f64>> = (0..=none).map(|label| sites.iter().map(|site| cost(label, *site)).collect()).collect();
+    let labels = planes::cheapest(&costs, |_, _| SEAM, window.size);
+    let mut sources = vec![None; own.hole.len()];
+    for (cell, site) in sites.iter().enumerate() {
+        let label = labels[cell];
+        sources[*site] = chosen.get(label).copied().filter(|_| costs[label][cell] < HIDDEN);
+    }
+    sources
 }
 
 /// Cost of a seam between two sources, per site of its length.

@@ -190,11 +190,12 @@ fn charted(
         let world = DVec3::from(own.camera.along(ray, point.z));
         if let Some([x, y]) = own.camera.project(world.to_array()) {
             let inside = x >= 0.0 && y >= 0.0 && (x as usize) < size[0] && (y as usize) < size[1];
-            if inside && sight.surface_at(sight.grid.place(ray)) == number {
-                let pixel = y as usize * w + x as usize;
-                if filling.guessed[pixel] {
-                    return Texel::Hole;
-                }
+            let pixel = if inside { y as usize * w + x as usize } else { 0 };
+            if inside && filling.guessed[pixel] {
+                let is_its = sight.surface_at(sight.grid.place(ray)) == number;
+                return if is_its { Texel::Hole } else { Texel::Nothing };
+            }
+            if inside {
                 let z = sight.depth_at(sight.grid.place(ray));
                 if (z / point.z - 1.0).abs() <= SAME {
                     let color = sample(|x, y| filling.rgb[y * w + x], own.camera.size, [x, y]);

@@ -242,6 +242,32 @@ pub fn complete(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage]
     grown
 }
 
+/// A rectangle of a view's sites.
+pub struct Window {
+    /// Columns and rows.
+    pub size: [usize; 2],
+    low: [usize; 2],
+    columns: usize,
+}
+
+impl Window {
+    /// The smallest with all sites for which `wanted` says so; nothing without any.
+    pub fn around(grid: &DepthGrid, wanted: impl Fn(usize) -> bool) -> Option<Self> {
+        let columns = grid.columns as usize;
+        let places = (0..grid.depth.len()).filter(|site| wanted(*site)).map(|site| [site % columns, site / columns]);
+        let (low, high) = places.fold(([usize::MAX; 2], [0; 2]), |(low, high), at| {
+            (std::array::from_fn(|a| at[a].min(low[a])), std::array::from_fn(|a: usize| at[a].max(high[a])))
+        });
+        (low[0] <= high[0]).then(|| Self { size: std::array::from_fn(|a| high[a] + 1 - low[a]), low, columns })
+    }
+
+    /// The view's sites in it, row by row.
+    pub fn sites(&self) -> Vec<usize> {
+        let Self { size: [w, h], low: [x, y], columns } = *self;
+        (y..y + h).flat_map(|row| (x..x + w).map(move |column| row * columns + column)).collect()
+    }
+}
+
 /// All views of the scene without the object.
 pub struct Sights(pub Vec<Sight>);
 
@@ -397,47 +423,40 @@ impl Sights {
         let (mut surface, mut found_planes) = (vec![0; own.hole.len()], vec![]);
         let first = !self.0.iter().any(|sight| sight.solved);
         if first || unknown.iter().filter(|unknown| **unknown).count() > FEW {
-            let rays: Vec<Option<[f64; 2]>> = (0..own.hole.len()).map(|site| Some(own.ray(site))).collect();
+            let window = Window::around(&own.grid, |site| near[site]).expect("a hole has surroundings");
+            let sites = window.sites();
+            let rays: Vec<Option<[f64; 2]>> = sites.iter().map(|site| Some(own.ray(*site))).collect();
             // Between what is known and the hole lies what the object's depth has bled into.
-            let ring = |site: usize| near[site] && !own.hole[site] && own.depth[site].is_nan();
-            let outline: Vec<bool> = (0..own.hole.len())
-                .map(|site| ring(site) || own.hole[site] && own.around(site).any(|s| !own.hole[s]))
-                .collect();
-            let open: Vec<bool> = (0..own.hole.len()).map(|site| unknown[site] || ring(site)).collect();
-            let against = |site: usize, d: f64| {
-                if d.is_nan() || d <= 0.0 {
-                    return 1.0;
-                }
-                if own.grid.confirmed[site] && own.hole[site] && 1.0 / d < (1.0 - APART) * own.grid.depth[site] {
+            let ring = |site: usize| !own.hole[site] && own.depth[site].is_nan();
+            let edge = |site: usize| own.hole[site] && own.around(site).any(|s| !own.hole[s]);
+            let outline: Vec<bool> = sites.iter().map(|site| ring(*site) || edge(*site)).collect();
+            let open: Vec<bool> = sites.iter().map(|site| unknown[*site] || ring(*site)).collect();
+            let known: Vec<f32> = sites.iter().map(|site| disparity[*site]).collect();
+            let against = |cell: usize, d: f64| {
+                let site = sites[cell];
+                let object = own.hole[site] && own.grid.confirmed[site];
+                if d.is_nan() || d <= 0.0 || object && 1.0 / d < (1.0 - APART) * own.grid.depth[site] {
                     return 1.0;
                 }
                 self.against(of, own.point(site, 1.0 / d))
             };
+            let size = window.size;
             let hole =
-                planes::Hole { size, disparity: &disparity, rays: &rays, unknown: &open, outline: &outline, against };
+                planes::Hole { size, disparity: &known, rays: &rays, unknown: &open, outline: &outline, against };
             let found = planes::surfaces(&hole, seed);
-            let count = |label: usize, of: &[bool]| {
-                found.label.iter().zip(of).filter(|(own, of)| usize::from(**own) == label && **of).count()
-            };
-            for label in 0..=found.planes.len() {
-                log::debug!(
-                    "surface {label}: {} sites of the surroundings, {} of what is unknown",
-                    count(label, &near),
-                    count(label, &unknown)
-                );
-            }
-            for site in (0..unknown.len()).filter(|site| own.hole[*site]) {
+            surface.fill(found.planes.len() as u8);
+            for (cell, &site) in sites.iter().enumerate() {
+                surface[site] = found.label[cell];
                 // What was measured to lie on a plane lies on it: single depths are noisier than all of them.
-                let plane = found.planes.get(usize::from(found.label[site])).filter(|_| !unknown[site]);
-                let on_plane = plane.map(|plane| planes::on(plane, own.ray(site)) as f32);
-                match on_plane {
-                    Some(flat) if (flat / disparity[site] - 1.0).abs() <= FLAT => disparity[site] = flat,
-                    Some(_) => {}
-                    None if unknown[site] => disparity[site] = found.disparity[site],
-                    None => {}
+                let plane = found.planes.get(usize::from(found.label[cell])).filter(|_| own.hole[site]);
+                let flat = plane.map_or(f32::NAN, |plane| planes::on(plane, own.ray(site)) as f32);
+                if unknown[site] {
+                    disparity[site] = found.disparity[cell];
+                } else if (flat / disparity[site] - 1.0).abs() <= FLAT {
+                    disparity[site] = flat;
                 }
             }
-            (surface, found_planes) = (found.label, found.planes);
+            found_planes = found.planes;
         }
         planes::membrane(&mut disparity, size, |site| own.hole[site]);
         let own = &mut self.0[of];
