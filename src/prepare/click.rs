@@ -6,17 +6,15 @@
 //! that pixels show tell what stands on a ground from the ground, and what lies metres behind from both, however alike
 //! their colours are; and a jump in depth is a border.
 //!
-//! The first click offers a whole thing: of the segments of several scales about it ([`tree`]) the one that looks most like one,
-//! or one so many steps larger or smaller. A cut at a small size draws it, a second one around it its border. Where the fit's depth
-//! changes along what places find, these take the segments' place.
-//!
-//! A further click changes a mask near it: afar from the outline by a segment about it, about the outline the farther from it
-//! the farther; so does the first one in a view to which other views' masks were carried. What it may not change is in [`next`].
+//! A cut at a small size finds the object, a second one around it draws its border. A further click changes the mask around
+//! it, the farther it is from the outline the farther, and leaves the rest as it is; so does the first one in a view to which
+//! other views' masks were carried.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
 use image::{GrayImage, RgbImage};
+use serde::{Deserialize, Serialize};
 
 use super::depth::DepthMap;
 use super::graph_cut::{self, COMPONENTS, Grid, Mixture, SHIFTS, SMOOTHNESS, UNIT};
@@ -24,19 +22,42 @@ use super::masks;
 use crate::scene::resample;
 use crate::statistics::median;
 
-mod mark;
-mod tree;
-
-pub use mark::{MOST_POINTS, Mark};
-use tree::Tree;
-
-/// The longer side of the pictures that are marked, pixels.
-const MARKED: u32 = 1024;
-
-/// The size at which a photograph of this size is marked: as it is, or with the longer side at 1,024 pixels.
-pub fn working(size: [u32; 2]) -> [u32; 2] {
-    graph_cut::within(size, MARKED)
+/// A user's mark in a photograph. Positions are parts of its width and height, 0 to 1.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
+pub enum Mark {
+    /// The object is here.
+    Object {
+        /// Where.
+        at: [f64; 2],
+    },
+    /// The object is not here.
+    Background {
+        /// Where.
+        at: [f64; 2],
+    },
+    /// The object is in here, and fills it: x0, y0, x1, y1.
+    Box {
+        /// Where.
+        bounds: [f64; 4],
+    },
 }
+
+impl Mark {
+    /// Whether it lies within the photograph; a box must have an inside.
+    pub fn is_sound(&self) -> bool {
+        let within = |v: &f64| (0.0..=1.0).contains(v);
+        match self {
+            Self::Object { at } | Self::Background { at } => at.iter().all(within),
+            Self::Box { bounds } => {
+                bounds.iter().all(within) && bounds[2] - bounds[0] >= SMALLEST && bounds[3] - bounds[1] >= SMALLEST
+            }
+        }
+    }
+}
+
+/// Least side of a box, of the photograph's.
+const SMALLEST: f64 = 0.004;
 
 /// Knowledge of a photograph besides its colours.
 #[derive(Clone, Copy, Default)]
@@ -47,19 +68,10 @@ pub struct Cues<'a> {
     pub carried: Option<(&'a [f32], [u32; 2])>,
 }
 
-impl Cues<'_> {
-    /// Without a depth that does not change across a mask's outline: of something flat on a wall, or a fit that does not know
-    /// it.
-    fn trusted(&self, picture: &RgbImage, mask: &GrayImage) -> Self {
-        let window = Window::whole(picture);
-        let knows = || {
-            let pixels = Pixels::of(picture, window, SIDES[0], &[], self);
-            pixels.jump(&labels(mask, window, pixels.size.map(|n| n as u32))) >= FLAT
-        };
-        Self { depth: self.depth.filter(|_| knows()), ..*self }
-    }
-}
-
+/// Radius of what a click touches, of the picture's longer side.
+const TOUCH: f64 = 0.006;
+/// Colours that differ by less, of 255, are touched by the same click.
+const ALIKE: f64 = 24.0;
 /// Rounds of models and cuts, of the first cut and the second.
 const ROUNDS: [u32; 2] = [4, 2];
 /// The longer sides of their pictures, pixels.
@@ -70,27 +82,19 @@ const SAMPLES: usize = 3000;
 const MOST: [f64; 2] = [8.0, 8.0];
 /// The weight of being nearer to a click than to anything else, in nats.
 const NEAR: f64 = 4.0;
-/// The weight of being within the segments that the clicks mean, in nats.
-const SHAPE: f64 = 3.0;
-/// Likewise where the user has clicked again, or gone to a larger or smaller one.
-const CERTAIN_SHAPE: f64 = 12.0;
 /// Nearer than this to a click, from -1 to 1, is the object to begin with.
 const NEARER: f64 = 0.33;
 /// A place so far from where the background is, squared and in its deviations, is as likely to be the object as not.
 const OFF: f64 = 9.0;
-/// Depth that changes by less than this part of a jump across an object's outline does not know the object.
-const FLAT: f64 = 0.2;
-/// The border of a changed mask is drawn anew within so many pixels of where it was found.
-const RIM: usize = 3;
-/// Changes are looked at over so many pixels: the fit's depth is not sharp.
-const BESIDE: usize = 6;
 /// Depths of the fit are right within this part.
 const ROUGH: f64 = 0.01;
 /// Neighbours whose depths differ by this part are parted.
 const JUMP: f64 = 0.04;
 /// The window of the second cut is larger than what the first one found by this part on every side.
 const AROUND: f64 = 0.35;
-/// A click nearer to the outline than this part of the root of the mask's area is about the outline.
+/// The first so many marks are taken together.
+const TOGETHER: usize = 3;
+/// With a depth, a click nearer to the outline than this part of the root of the mask's area is about the outline.
 const AFAR: f64 = 0.1;
 /// A click changes what lies within so many times its distance from the outline.
 const REACH: f64 = 6.0;
@@ -138,77 +142,31 @@ fn voted(picture: &RgbImage, cues: &Cues<'_>) -> GrayImage {
     cues.carried.map_or_else(|| GrayImage::new(to[0], to[1]), |(parts, from)| masks::threshold(parts, from, to, VOTED))
 }
 
-/// [`mask`] for one more mark, the last of these, than made the mask `before`.
-///
-/// What a click or a brush touches is in the mask, or out of it. A click for the object only adds, and a click beside it only
-/// takes away, in both cases one piece that hangs together with the click. A box or a lasso begins anew, unless there was one
-/// before: then it adds.
+/// [`mask`] for one more mark, the last of these, than made the mask `before`. A click on a mask changes what is around it, a
+/// box begins anew.
 pub fn next(picture: &RgbImage, marks: &[Mark], before: &GrayImage, cues: &Cues<'_>) -> GrayImage {
-    let Some((last, earlier)) = marks.split_last() else { return before.clone() };
     let there = before.as_raw().iter().any(|v| *v != 0);
-    let mut mask = match last.click() {
-        Some((_, false)) if !there => before.clone(),
-        Some(_) if !there => found(picture, marks, cues, None),
-        Some((at, adds)) => {
-            let cues = &cues.trusted(picture, before);
-            // What is within a box or a lasso is in the mask already.
-            let clicks: Vec<Mark> = marks.iter().filter(|mark| mark.bounds().is_none()).cloned().collect();
-            let afar = cues.carried.is_none() && is_afar(before, at, adds);
-            let by_segment = afar.then(|| found(picture, &clicks, cues, Some(before)));
-            let agrees = |mask: &GrayImage| holds(mask, at) == adds;
-            let mut new = by_segment
-                .filter(agrees)
-                .unwrap_or_else(|| edited(picture, &clicks, before, cues.depth).unwrap_or_else(|| before.clone()));
-            last.hold(&mut new, picture, marks);
-            changed(before, &new, at, adds)
+    match marks.last() {
+        // One click seldom finds it at once: the first ones are better taken together, unless all but the rim is there.
+        Some(last)
+            if cues.carried.is_none() && marks.len() <= TOGETHER && (cues.depth.is_none() || is_afar(before, last)) =>
+        {
+            found(picture, marks, cues)
         }
-        None if last.bounds().is_none() => before.clone(),
-        None if earlier.iter().any(|mark| mark.bounds().is_some()) => {
-            let beside = earlier.iter().filter(|mark| mark.bounds().is_none());
-            let own: Vec<Mark> = beside.chain(std::iter::once(last)).cloned().collect();
-            let mut sum = before.clone();
-            sum.iter_mut().zip(found(picture, &own, cues, None).as_raw()).for_each(|(sum, new)| *sum |= new);
-            sum
+        Some(Mark::Object { .. } | Mark::Background { .. }) if there => {
+            edited(picture, marks, before, cues.depth).unwrap_or_else(|| before.clone())
         }
-        None => found(picture, marks, cues, None),
-    };
-    marks.iter().for_each(|mark| mark.hold(&mut mask, picture, marks));
-    mask
-}
-
-/// Whether a mask has the pixel at a place.
-fn holds(mask: &GrayImage, at: [f64; 2]) -> bool {
-    let pixel = |k: usize, side: u32| ((at[k] * f64::from(side)) as u32).min(side - 1);
-    mask.get_pixel(pixel(0, mask.width()), pixel(1, mask.height())).0[0] != 0
-}
-
-/// A mask with the piece of what is new that a click is on, of what it adds or takes away.
-fn changed(before: &GrayImage, new: &GrayImage, at: [f64; 2], adds: bool) -> GrayImage {
-    let (w, h) = before.dimensions();
-    let changes = GrayImage::from_fn(w, h, |x, y| {
-        let [was, is] = [before, new].map(|mask| mask.get_pixel(x, y).0[0] != 0);
-        image::Luma([if was != is && is == adds { 255 } else { 0 }])
-    });
-    let click: [u32; 2] = std::array::from_fn(|k| ((at[k] * f64::from([w, h][k])) as u32).min([w, h][k] - 1));
-    let mut mask = before.clone();
-    let mut seen = vec![false; (w * h) as usize];
-    let mut open = vec![click];
-    while let Some([x, y]) = open.pop() {
-        let at = (y * w + x) as usize;
-        if seen[at] || changes.as_raw()[at] == 0 {
-            continue;
-        }
-        seen[at] = true;
-        mask.put_pixel(x, y, *new.get_pixel(x, y));
-        for v in y.saturating_sub(1)..(y + 2).min(h) {
-            open.extend((x.saturating_sub(1)..(x + 2).min(w)).map(|u| [u, v]));
-        }
+        _ => found(picture, marks, cues),
     }
-    mask
 }
 
 /// Whether a click is too far from a mask's outline to be about the outline alone.
-fn is_afar(before: &GrayImage, at: [f64; 2], adds: bool) -> bool {
+fn is_afar(before: &GrayImage, click: &Mark) -> bool {
+    let (at, adds) = match click {
+        Mark::Object { at } => (*at, true),
+        Mark::Background { at } => (*at, false),
+        Mark::Box { .. } => return true,
+    };
     let [x, y] = [at[0] * f64::from(before.width()), at[1] * f64::from(before.height())];
     let on = || before.enumerate_pixels().filter(|pixel| (pixel.2.0[0] != 0) == adds);
     let nearest = on().map(|(u, v, _)| f64::hypot(f64::from(u) + 0.5 - x, f64::from(v) + 0.5 - y));
@@ -216,39 +174,41 @@ fn is_afar(before: &GrayImage, at: [f64; 2], adds: bool) -> bool {
     nearest.fold(f64::INFINITY, f64::min) > AFAR * area.sqrt()
 }
 
-/// The object that the marks mean: from the beginning, or as the last of them changes a mask.
-fn found(picture: &RgbImage, marks: &[Mark], cues: &Cues<'_>, before: Option<&GrayImage>) -> GrayImage {
+/// The object that the marks mean, from the beginning.
+fn found(picture: &RgbImage, marks: &[Mark], cues: &Cues<'_>) -> GrayImage {
     let full = [picture.width(), picture.height()];
     let empty = GrayImage::new(full[0], full[1]);
-    let speaks = |mark: &Mark| !matches!(mark, Mark::Background { .. } | Mark::Brush { object: false, .. });
-    if before.is_none() && !marks.iter().any(speaks) {
+    if !marks.iter().any(|mark| !matches!(mark, Mark::Background { .. })) {
         return empty;
     }
-    let boxed = marks.iter().any(|mark| mark.bounds().is_some());
-    let of = |mark: &Mark| match mark {
-        Mark::Object { at: [x, y], .. } if boxed => Some([*x, *y, *x, *y]),
-        _ => mark.bounds(),
+    let mut bounds: Option<[f64; 4]> = None;
+    let scaled = |v: [f64; 4]| {
+        [0, 1, 0, 1].map(|axis| f64::from(full[axis])).iter().zip(v).map(|(s, v)| s * v).collect::<Vec<_>>()
     };
-    let joined = |a: [f64; 4], b: [f64; 4]| [a[0].min(b[0]), a[1].min(b[1]), a[2].max(b[2]), a[3].max(b[3])];
-    let first = match marks.iter().filter_map(of).reduce(joined) {
-        Some(bounds) => Window::around(std::array::from_fn(|k| bounds[k] * f64::from(full[k % 2])), 0.5, full),
+    let mut take = |v: &[f64]| {
+        let old = bounds.unwrap_or([v[0], v[1], v[2], v[3]]);
+        bounds = Some([old[0].min(v[0]), old[1].min(v[1]), old[2].max(v[2]), old[3].max(v[3])]);
+    };
+    let boxed = marks.iter().any(|mark| matches!(mark, Mark::Box { .. }));
+    for mark in marks {
+        match mark {
+            Mark::Box { bounds } => take(&scaled(*bounds)),
+            Mark::Object { at: [x, y] } if boxed => take(&scaled([*x, *y, *x, *y])),
+            _ => {}
+        }
+    }
+    let first = match bounds {
+        Some(bounds) => Window::around(bounds, 0.5, full),
         None => Window::whole(picture),
     };
-    let begins = before.is_none();
-    let pass = Pass { number: 0, begins, before };
-    let by_places = cut(picture, first, marks, cues, &pass);
-    let trusted = by_places.as_ref().map_or(*cues, |mask| cues.trusted(picture, mask));
-    let again = cues.depth.is_some() && trusted.depth.is_none() && begins;
-    let (found, cues) = if again { (cut(picture, first, marks, &trusted, &pass), &trusted) } else { (by_places, cues) };
-    let unchanged = || before.cloned().unwrap_or(empty);
-    let Some(found) = found else { return unchanged() };
-    let Some(bounds) = bounds_of(&found) else { return unchanged() };
+    let Some(found) = cut(picture, first, marks, cues, None) else { return empty };
+    let Some(bounds) = bounds_of(&found) else { return empty };
     let second = Window::around(bounds, AROUND, full);
     let side = |window: Window| window.0[2].max(window.0[3]);
     if f64::from(side(second)) > 0.7 * f64::from(side(first)) {
         return found;
     }
-    cut(picture, second, marks, cues, &Pass { number: 1, begins, before: Some(&found) }).unwrap_or(found)
+    cut(picture, second, marks, cues, Some(&found)).unwrap_or(found)
 }
 
 /// x0, y0 and one past x1, y1 of what is not 0.
@@ -286,16 +246,40 @@ impl Pixels {
             ]
         };
         let count = (to[0] * to[1]) as usize;
-        let outlines: Vec<&Mark> = marks.iter().filter(|mark| mark.bounds().is_some()).collect();
-        let outside = (0..count).map(|i| !outlines.is_empty() && !outlines.iter().any(|m| m.encloses(at(i)))).collect();
+        let boxes: Vec<[f64; 4]> =
+            marks.iter().filter_map(|m| if let Mark::Box { bounds } = m { Some(*bounds) } else { None }).collect();
+        let outside = (0..count)
+            .map(|i| {
+                let [x, y] = at(i);
+                let within = |b: &[f64; 4]| x >= b[0] && x <= b[2] && y >= b[1] && y <= b[3];
+                !boxes.is_empty() && !boxes.iter().any(within)
+            })
+            .collect();
         let mut touched = vec![None; count];
+        // At least the pixel that a click falls into, in a circle of the whole picture's proportions.
+        let pixel = f64::from(w) / f64::from(to[0]);
+        let radius = (TOUCH * full[0].max(full[1])).max(1.2 * pixel);
         for mark in marks {
-            let object = matches!(mark, Mark::Object { .. } | Mark::Brush { object: true, .. });
+            let (at_click, object) = match mark {
+                Mark::Object { at } => (at, true),
+                Mark::Background { at } => (at, false),
+                Mark::Box { .. } => continue,
+            };
+            let far = |i: usize| {
+                let d = at(i);
+                f64::hypot((d[0] - at_click[0]) * full[0], (d[1] - at_click[1]) * full[1])
+            };
+            // Of the pixels around the nearest one those that look like it: a click may lie at a rim.
+            let color = |i: usize| small.as_raw()[3 * i..3 * i + 3].iter().map(|v| f64::from(*v));
+            let Some(nearest) = (0..count).min_by(|a, b| far(*a).total_cmp(&far(*b))) else { continue };
             // In the window of the second cut there may be nothing of it.
-            for [x, y] in mark.certain(picture, marks) {
-                if (x0..x0 + w).contains(&x) && (y0..y0 + h).contains(&y) {
-                    let pixel = |v: u32, from: u32, to: u32| (u64::from(v) * u64::from(to) / u64::from(from)) as usize;
-                    touched[pixel(y - y0, h, to[1]) * to[0] as usize + pixel(x - x0, w, to[0])] = Some(object);
+            if far(nearest) > radius {
+                continue;
+            }
+            for (i, touched) in touched.iter_mut().enumerate().filter(|(i, _)| far(*i) <= radius) {
+                let differs: f64 = color(i).zip(color(nearest)).map(|(a, b)| (a - b).powi(2)).sum();
+                if differs <= ALIKE * ALIKE {
+                    *touched = Some(object);
                 }
             }
         }
@@ -328,23 +312,6 @@ impl Pixels {
         let Some(depth) = near(&on).or_else(|| near(&|i| !self.outside[i])) else { return };
         let unit = depth * ROUGH;
         self.places.iter_mut().flatten().for_each(|(place, _)| *place = place.map(|v| v / unit));
-    }
-
-    /// How much the depth changes across an object's outline, 0 to 1.
-    fn jump(&self, object: &[bool]) -> f64 {
-        let [w, h] = self.size;
-        let [mut sum, mut count] = [0.0; 2];
-        for i in 0..w * h {
-            for (j, inside) in [(i + BESIDE, i % w + BESIDE < w), (i + BESIDE * w, i / w + BESIDE < h)] {
-                if inside
-                    && object[i] != object[j]
-                    && let (Some((_, a)), Some((_, b))) = (self.places[i], self.places[j])
-                {
-                    (sum, count) = (sum + ((a - b) / JUMP).abs().min(1.0), count + 1.0);
-                }
-            }
-        }
-        if count > 0.0 { sum / count } else { 0.0 }
     }
 
     /// How far neighbours are apart: by colour, and by depth.
@@ -401,13 +368,6 @@ impl Pixels {
         distance
     }
 
-    /// The pixels within [`RIM`] of one.
-    fn around(&self, i: usize) -> impl Iterator<Item = usize> {
-        let [w, h] = self.size;
-        let range = |at: usize, side: usize| at.saturating_sub(RIM)..(at + RIM + 1).min(side);
-        range(i / w, h).flat_map(move |y| range(i % w, w).map(move |x| y * w + x))
-    }
-
     fn is_border(&self, i: usize) -> bool {
         let [w, h] = self.size;
         let (x, y) = (i % w, i / w);
@@ -418,11 +378,6 @@ impl Pixels {
 /// Some of these at most, evenly spread.
 fn some<T: Copy>(all: &[T]) -> Vec<T> {
     all.iter().step_by(all.len().div_ceil(SAMPLES).max(1)).copied().collect()
-}
-
-/// Where the background is, by places of it; nothing where there are next to none.
-fn behind(places: &[[f64; 3]]) -> Option<Mixture> {
-    (places.len() > 8).then(|| Mixture::of(&some(places), COMPONENTS[1], 3))
 }
 
 /// The models of the two sides: by how many nats a value speaks for the object.
@@ -467,7 +422,8 @@ fn solve(
         .collect();
     for round in 0..rounds {
         let of = |side: bool| -> Vec<usize> { (0..count).filter(|i| object[*i] == side).collect() };
-        let behind = behind(&of(false).iter().filter_map(|i| Some(pixels.places[*i]?.0)).collect::<Vec<_>>());
+        let behind: Vec<[f64; 3]> = of(false).iter().filter_map(|i| Some(pixels.places[*i]?.0)).collect();
+        let behind = (behind.len() > 8).then(|| Mixture::of(&some(&behind), COMPONENTS[1], 3));
         // By how much a pixel's place speaks for the object: how far it is from where the background goes on.
         let off = |i: usize| match (&behind, pixels.places[i]) {
             (Some(behind), Some((place, _))) => (0.5 * (behind.distance(place) - OFF)).clamp(-MOST[1], MOST[1]),
@@ -508,56 +464,29 @@ fn solve(
     Some(object)
 }
 
-/// Which of the two cuts it is.
-struct Pass<'a> {
-    /// 0 or 1.
-    number: usize,
-    /// Whether the marks are all that is known, no mask of earlier ones.
-    begins: bool,
-    /// The mask to begin with.
-    before: Option<&'a GrayImage>,
-}
-
 /// The object in a window, as a mask of the whole picture; nothing where one side runs out of pixels.
 fn cut(
     picture: &RgbImage,
     window: Window,
     marks: &[Mark],
     cues: &Cues<'_>,
-    &Pass { number: pass, begins, before }: &Pass<'_>,
+    found: Option<&GrayImage>,
 ) -> Option<GrayImage> {
+    let pass = usize::from(found.is_some());
     let pixels = Pixels::of(picture, window, SIDES[pass], marks, cues);
     let [w, h] = pixels.size;
     let count = w * h;
     let [x0, y0, wide, high] = window.0;
     let small = [w as u32, h as u32];
-    let before: Option<Vec<bool>> = before.map(|before| labels(before, window, small));
+    let before: Option<Vec<bool>> = found.map(|found| {
+        let part = image::imageops::crop_imm(found, x0, y0, wide, high).to_image();
+        resample::nearest(&part, small).as_raw().iter().map(|v| *v != 0).collect()
+    });
     let was = |i: usize| before.as_ref().is_some_and(|before| before[i]);
     let boxed = pixels.outside.iter().any(|outside| *outside);
-    let marked = pixels.touched.contains(&Some(true));
-    let last = marks.last()?.click();
-    let steps = if let Some(Mark::Object { scale, .. }) = marks.last() { *scale } else { 0 };
-    let tree = (pass == 0).then(|| Tree::of(&pixels));
-    let clicked = last.map(|(at, _)| {
-        let pixel = |k: usize| {
-            let own = at[k] * f64::from([picture.width(), picture.height()][k]) - f64::from([x0, y0][k]);
-            ((own * pixels.size[k] as f64 / f64::from([wide, high][k])) as usize).min(pixels.size[k] - 1)
-        };
-        pixel(1) * w + pixel(0)
-    });
-    let meant = tree
-        .as_ref()
-        .zip(last)
-        .zip(clicked)
-        .filter(|_| !boxed)
-        .and_then(|((tree, (_, adds)), pixel)| tree.meant(&pixels, (pixel, adds), steps, was));
-    let side = last.is_none_or(|(_, adds)| adds);
-    let in_box = tree.as_ref().filter(|_| boxed).and_then(|tree| tree.within(|i| !pixels.outside[i]));
-    // Places in space tell a whole thing from what it stands on better than its segment does.
-    let flat = pixels.places.iter().all(Option::is_none);
-    let meant = meant.filter(|_| flat || steps != 0 || !begins);
+    let clicked = pixels.touched.contains(&Some(true));
     // Nearer to the object's clicks, or to what is not the object: from -1 to 1.
-    let near: Option<Vec<f64>> = marked.then(|| {
+    let near: Option<Vec<f64>> = clicked.then(|| {
         let objects = (0..count).filter(|i| pixels.touched[*i] == Some(true));
         let objects = pixels.distances(objects);
         let others = (0..count)
@@ -567,36 +496,16 @@ fn cut(
         objects.iter().zip(&others).map(side).collect()
     });
     let object: Vec<bool> = (0..count)
-        .map(|i| match (&meant, &in_box, pixels.touched[i]) {
-            (.., Some(side)) => side,
-            (Some(meant), ..) if meant[i] => side,
-            (Some(_), ..) => was(i),
-            (None, Some(inside), None) => inside[i],
-            _ if boxed && pass == 0 => !pixels.outside[i],
-            _ if before.is_some() => was(i),
+        .map(|i| match (&before, pixels.touched[i]) {
+            (_, Some(side)) => side,
+            (Some(before), None) => before[i],
+            _ if boxed => !pixels.outside[i],
             _ => near.as_ref().is_some_and(|near| near[i] > NEARER),
         })
         .collect();
-    // A further click means its segment and nothing else; the second cut of it draws the border anew.
-    let is_rim = |i: usize| pixels.around(i).any(|j| was(j) != was(i));
-    let shape = if steps == 0 && begins { SHAPE } else { CERTAIN_SHAPE };
-    let signed = |weight: f64, object: bool| if object { weight } else { -weight };
-    let beside = |i: usize| match (&meant, &near) {
-        (Some(meant), _) if meant[i] => signed(shape, side),
-        (Some(_), _) if begins => -shape,
-        (meant, _) if !begins && (meant.is_some() || !is_rim(i)) => signed(STAYS, was(i)),
-        (_, Some(near)) => NEAR * near[i],
-        (_, None) => 0.0,
-    };
+    let beside = |i: usize| near.as_ref().map_or(0.0, |near| NEAR * near[i]);
     let object = solve(&pixels, object, ROUNDS[pass], beside, |_| true)?;
-    whole(picture, window, small, if begins { joined(object, &pixels, boxed) } else { object })
-}
-
-/// The labels that a mask gives the pixels of a window at another size.
-fn labels(mask: &GrayImage, window: Window, to: [u32; 2]) -> Vec<bool> {
-    let [x0, y0, w, h] = window.0;
-    let part = image::imageops::crop_imm(mask, x0, y0, w, h).to_image();
-    resample::nearest(&part, to).as_raw().iter().map(|v| *v != 0).collect()
+    whole(picture, window, small, joined(object, &pixels, boxed))
 }
 
 /// Labels of a window as a mask of the whole picture; nothing where there is no object.
@@ -616,7 +525,11 @@ fn whole(picture: &RgbImage, window: Window, small: [u32; 2], labels: Vec<bool>)
 /// A mask as one more click changes it, around the click: the farther it is from the outline, the farther.
 fn edited(picture: &RgbImage, marks: &[Mark], before: &GrayImage, depth: Option<&DepthMap>) -> Option<GrayImage> {
     let full = [picture.width(), picture.height()];
-    let (at, adds) = marks.last()?.click()?;
+    let (at, adds) = match marks.last()? {
+        Mark::Object { at } => (*at, true),
+        Mark::Background { at } => (*at, false),
+        Mark::Box { .. } => return None,
+    };
     let click: [u32; 2] = std::array::from_fn(|k| ((at[k] * f64::from(full[k])) as u32).min(full[k] - 1));
     if (before.get_pixel(click[0], click[1]).0[0] != 0) == adds {
         return Some(before.clone());
@@ -627,9 +540,10 @@ fn edited(picture: &RgbImage, marks: &[Mark], before: &GrayImage, depth: Option<
     let window = Window::around(bounds, AROUND, full);
     let pixels = Pixels::of(picture, window, SIDES[1], marks, &Cues { depth, carried: None });
     let [w, h] = pixels.size;
-    let [x0, y0, wide, _] = window.0;
+    let [x0, y0, wide, high] = window.0;
     let small = [w as u32, h as u32];
-    let was = labels(before, window, small);
+    let part = image::imageops::crop_imm(before, x0, y0, wide, high).to_image();
+    let was: Vec<bool> = resample::nearest(&part, small).as_raw().iter().map(|v| *v != 0).collect();
     let scale = w as f64 / f64::from(wide);
     let own = [(x - f64::from(x0)) * scale, (y - f64::from(y0)) * scale];
     let far = |i: usize| f64::hypot((i % w) as f64 + 0.5 - own[0], (i / w) as f64 + 0.5 - own[1]);
