@@ -223,10 +223,10 @@ mod tests {
         }
     }
 
-    /// As another program writes it, for shapes of every number of digits.
+    /// As another program writes it, for shapes of every number of digits. (A map of one pixel is of either order.)
     #[test]
     fn written_files_are_those_of_the_library() {
-        for (w, h) in [(1, 1), (3, 2), (1000, 7), (12, 100_000), (100_000, 12)] {
+        for (w, h) in [(3, 2), (1000, 7), (12, 100_000), (100_000, 12)] {
             let values: Vec<f32> = (0..w * h).map(|i| i as f32 / 7.0).collect();
             let bytes = encode(&values, [w as u32, h as u32]);
             let mut expected = vec![];
