@@ -70,7 +70,7 @@ pub fn write(dir: &Path, options: &Options) -> Result<(), Error> {
     write_room(dir, seed, &room, [&train, &test], &[], &cloud)
 }
 
-/// Adds to a scene that [`write`] has written with the same options what its train views would show without the object:
+/// Adds to a scene that [`write()`] has written with the same options what its train views would show without the object:
 /// photographs, masks and depth as test views of the same names.
 ///
 /// # Errors

@@ -1,8 +1,8 @@
 //! The scene without the object: one surface behind it, filled once, for every view.
 //!
-//! - [`surface`]: the depth of what is behind the object, in all views.
-//! - [`color`]: what photographs show of it, and what views that were filled before show of it.
-//! - [`guess`]: what nobody shows is filled with pieces of the same surface, seen straight on ([`texture`]), or by a network.
+//! - `surface`: the depth of what is behind the object, in all views.
+//! - `color`: what photographs show of it, and what views that were filled before show of it.
+//! - `guess`: what nobody shows is filled with pieces of the same surface, seen straight on (`texture`), or by a network.
 //!
 //! One view is the reference: its picture goes to `reference/`, where a better one may take its place. All other views'
 //! holes are filled from the same surface, into `hole/`.
