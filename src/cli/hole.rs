@@ -124,7 +124,7 @@ fn name(set: &Path) -> anyhow::Result<String> {
     Ok(last_part(&absolute.to_string_lossy()).to_owned())
 }
 
-/// What tells this build of the program from another.
+/// Hash of the program's own file, which tells one build from another.
 fn program() -> anyhow::Result<String> {
     let path = std::env::current_exe().context("the program's own file is not known")?;
     let bytes = std::fs::read(&path).with_context(|| format!("{}: cannot be read", path.display()))?;
@@ -137,7 +137,7 @@ struct Work<'a> {
     set: &'a Path,
     name: &'a str,
     seed: u64,
-    /// Of all that is made of this composed scene.
+    /// Folder of all that is made of this composed scene.
     folder: &'a Path,
     settings: &'a SettingsArgs,
     device: &'a DeviceArgs,
@@ -158,7 +158,7 @@ impl Work<'_> {
         settings.rescheduled(self.settings.iterations.unwrap_or(STEPS))
     }
 
-    /// Of all settings but the seed.
+    /// Hash of all settings but the seed.
     fn hash(&self) -> anyhow::Result<String> {
         let given = preset::chosen(&self.given(self.set.to_owned()), self.device)?;
         let mut settings = self.fitted(&given.settings.resolve()?);

@@ -31,12 +31,12 @@ pub struct DepthMap {
 }
 
 impl DepthMap {
-    /// The fit's, without the Gaussians for which `removed` says so.
+    /// The fit's depth, as a camera sees it.
     ///
     /// # Errors
     /// When the device has no room, or is lost.
-    pub fn of(splats: &mut Splats, camera: &Camera, removed: impl Fn(u32) -> bool) -> Result<Self, crate::gpu::Error> {
-        let drawn = splats.paint(camera, |name, own| (!removed(name)).then_some(own))?;
+    pub fn of(splats: &mut Splats, camera: &Camera) -> Result<Self, crate::gpu::Error> {
+        let drawn = splats.paint(camera, |_, own| Some(own))?;
         let depth = drawn.depth.iter().zip(&drawn.transmittance);
         let depth = depth.map(|(z, left)| if 1.0 - left < COVERED { f32::NAN } else { z / (1.0 - left) }).collect();
         Ok(Self { camera: *camera, depth })
@@ -131,7 +131,7 @@ pub fn enlarged(mask: &GrayImage, size: [u32; 2]) -> GrayImage {
 pub fn make(scene: &Scene, splats: &mut Splats, masks: &[GrayImage], watch: &mut dyn Watch) -> Result<Batch, Error> {
     let mut maps = vec![];
     for (i, view) in scene.train.iter().enumerate() {
-        maps.push(DepthMap::of(splats, &view.camera, |_| false)?);
+        maps.push(DepthMap::of(splats, &view.camera)?);
         watch.turn(i as u64 + 1)?;
     }
     let kept: Vec<Vec<f32>> = (0..maps.len()).into_par_iter().map(|i| agreed(&maps, i)).collect();

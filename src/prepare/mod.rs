@@ -677,11 +677,10 @@ impl Preparation<'_> {
         let mut batch = Batch::default();
         let names: Vec<&str> = given.keys().map(String::as_str).collect();
         let from = format!("carried from {}", abridged(&names));
-        let carry = |shares: &masks::Shares, splats: &mut Splats| -> Result<Vec<masks::Carried>, Error> {
-            let others = scene.train.iter().filter(|view| !given.contains_key(&view.name));
-            others.map(|view| Ok(shares.carry(splats, &view.camera)?)).collect()
-        };
         let others: Vec<&scene::View> = scene.train.iter().filter(|view| !given.contains_key(&view.name)).collect();
+        let carry = |shares: &masks::Shares, splats: &mut Splats| -> Result<Vec<masks::Carried>, Error> {
+            others.iter().map(|view| Ok(shares.carry(splats, &view.camera)?)).collect()
+        };
         let pictures: Vec<Result<_, scene::Error>> =
             others.par_iter().map(|view| scene::photograph_within(&files[&view.name], outline::SIDE)).collect();
         let pictures = pictures.into_iter().collect::<Result<Vec<_>, _>>()?;

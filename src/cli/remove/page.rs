@@ -178,7 +178,7 @@ impl Carrier {
         for (i, (view, number)) in scene.train.iter().zip(&numbers).enumerate() {
             check(job)?;
             if let Some(number) = number {
-                session.knows(*number, DepthMap::of(&mut splats, &view.camera, |_| false)?);
+                session.knows(*number, DepthMap::of(&mut splats, &view.camera)?);
             }
             session.at(i as u64 + 1);
         }

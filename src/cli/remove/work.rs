@@ -62,7 +62,7 @@ impl Places {
 pub struct Source {
     /// The file's Gaussians.
     pub(super) splat: Splat,
-    /// Those that the cameras see.
+    /// The Gaussians that the cameras see.
     pub(super) seen: Seen,
     /// For `prepare`.
     pub ready: Arc<Ready>,

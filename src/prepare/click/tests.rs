@@ -107,7 +107,7 @@ fn measure(request: &Request, truth: &Path, every: usize) -> Found {
         let view = &scene.train[i];
         let picture = small(&files[&view.name]);
         let own = truth(&view.name, [picture.width(), picture.height()]);
-        let depth = DepthMap::of(&mut splats, &view.camera, |_| false).expect("a depth");
+        let depth = DepthMap::of(&mut splats, &view.camera).expect("a depth");
         let with = Cues { depth: Some(&depth), carried: None };
         let share = 1.0 / looked.len() as f64;
         let mut line = view.name.clone();

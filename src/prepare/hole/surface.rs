@@ -72,8 +72,8 @@ struct Claim {
 }
 
 impl Sight {
-    /// A view whose photograph has this camera and whose object, with its margin, has this mask (as large as the camera's
-    /// picture); `wide` is the mask with the margin by which depth bleeds over the object's border.
+    /// A view whose photograph has this camera and whose object, with its margin, has this mask, as large as the camera's
+    /// picture.
     fn new(grid: DepthGrid, camera: &Camera, mask: &GrayImage) -> Self {
         let hole: Vec<bool> = (0..grid.depth.len()).map(|site| covers(mask, camera, &grid, site)).collect();
         let depth = grid.depth.iter().zip(&hole).map(|(z, hole)| if *hole { f64::NAN } else { *z }).collect();

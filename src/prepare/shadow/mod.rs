@@ -106,7 +106,7 @@ pub fn make(task: &Task<'_>, splats: &mut Splats, watch: &mut dyn Watch) -> Resu
     let n = task.scene.train.len() as u64;
     let mut maps = vec![];
     for (i, view) in task.scene.train.iter().enumerate() {
-        maps.push(DepthMap::of(splats, &view.camera, |_| false)?);
+        maps.push(DepthMap::of(splats, &view.camera)?);
         watch.turn(i as u64 + 1)?;
     }
     let views = task.fine.train.iter().zip(task.masks);
