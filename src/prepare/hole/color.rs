@@ -55,6 +55,20 @@ pub fn sample(at: impl Fn(usize, usize) -> [f32; 3], size: [u32; 2], position: [
     inside.then(|| resample::bilinear(size, position, color).map(|v| v as f32))
 }
 
+/// Bilinear between the pixels that have a colour; nothing where the nearest has none.
+pub fn between(at: impl Fn(i64, i64) -> Option<[f32; 3]>, [x, y]: [f64; 2]) -> Option<[f32; 3]> {
+    at(x.floor() as i64, y.floor() as i64)?;
+    let (mut sum, mut total) = ([0f32; 3], 0f32);
+    for (dx, dy) in [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)] {
+        let (u, v) = ((x - 0.5).floor() + dx, (y - 0.5).floor() + dy);
+        let Some(color) = at(u as i64, v as i64) else { continue };
+        let weight = ((1.0 - (x - 0.5 - u).abs()) * (1.0 - (y - 0.5 - v).abs())) as f32;
+        (0..3).for_each(|c| sum[c] += weight * color[c]);
+        total += weight;
+    }
+    (total > 0.0).then(|| sum.map(|v| v / total))
+}
+
 impl Photograph<'_> {
     /// The colour, 0 to 1, where it shows a point; nothing outside the picture, and where the object is.
     pub fn color(&self, point: DVec3) -> Option<[f32; 3]> {
@@ -162,7 +176,8 @@ fn shown(own: &Photograph<'_>, sight: &Sight, i: usize) -> Option<([f64; 2], DVe
     z.is_finite().then(|| (place, DVec3::from(own.camera.along(ray, z))))
 }
 
-/// What views that were filled before tell of the colours of a view's hole that no photograph shows.
+/// What views that were filled before tell of the colours of a view's hole that no photograph shows: their gradients, so
+/// that it goes on in the view's own light.
 pub fn repaint(
     sights: &Sights,
     photographs: &[Photograph<'_>],
@@ -171,8 +186,16 @@ pub fn repaint(
     filling: &mut Filling,
 ) {
     let (own, sight) = (&photographs[of], &sights.0[of]);
+    let [w, h] = own.camera.size.map(|n| n as usize);
     let painted: Vec<usize> = (0..filled.len()).filter(|view| *view != of && filled[*view].is_some()).collect();
-    let repainted = |i: usize| -> Option<[f32; 3]> {
+    let near = |i: usize| {
+        let (x, y) = (i % w, i / w);
+        let near =
+            [(x > 0).then(|| i - 1), (x + 1 < w).then(|| i + 1), (y > 0).then(|| i - w), (y + 1 < h).then(|| i + w)];
+        near.into_iter().flatten()
+    };
+    // Beside its hole another view is a photograph, which has been asked.
+    let repainted = |i: usize, beside: bool| -> Option<[f32; 3]> {
         let (_, point) = shown(own, sight, i)?;
         painted.iter().find_map(|view| {
             let (other, there) = (&photographs[*view], &sights.0[*view]);
@@ -180,23 +203,41 @@ pub fn repaint(
             let place = (c > 0.0).then(|| there.grid.place([a / c, b / c]))?;
             let agrees = (there.depth_at(place) / c - 1.0).abs() <= SAME;
             let pixel = other.camera.project(point.to_array()).filter(|_| agrees)?;
-            // Beside its hole it is a photograph, which has been asked.
-            other.hole.get_pixel_checked(pixel[0].max(0.0) as u32, pixel[1].max(0.0) as u32).filter(|p| p.0[0] != 0)?;
-            let rgb = filled[*view].as_ref()?;
+            let hole = other.hole.get_pixel_checked(pixel[0].max(0.0) as u32, pixel[1].max(0.0) as u32)?;
+            let rgb = filled[*view].as_ref().filter(|_| beside || hole.0[0] != 0)?;
             let width = other.camera.size[0] as usize;
             sample(|x, y| rgb[y * width + x], other.camera.size, pixel)
         })
     };
-    let told: Vec<Option<[f32; 3]>> = (0..filling.guessed.len())
+    let told: Vec<Option<[f32; 3]>> = (0..w * h)
         .into_par_iter()
-        .map(|i| if filling.guessed[i] { repainted(i) } else { None })
+        .map(|i| {
+            let edge = || near(i).any(|j| filling.guessed[j]);
+            if filling.guessed[i] || edge() { repainted(i, !filling.guessed[i]) } else { None }
+        })
         .collect();
-    for (i, color) in told.into_iter().enumerate() {
-        if let Some(color) = color {
-            filling.rgb[i] = color;
-            filling.guessed[i] = false;
+    let inside: Vec<usize> = (0..w * h).filter(|i| filling.guessed[*i] && told[*i].is_some()).collect();
+    let equation = |i: usize| {
+        let mut equation = Equation::new(i);
+        for (j, there) in near(i).filter_map(|j| Some((j, told[j]?))) {
+            let goes_on = filling.guessed[j] || alike(filling.rgb[j], there);
+            if let Some(here) = told[i].filter(|_| goes_on) {
+                equation.add(j, std::array::from_fn(|c| here[c] - there[c]));
+            }
         }
+        equation
+    };
+    let equations: Vec<Equation> = inside.par_iter().map(|i| equation(*i)).collect();
+    for i in inside {
+        filling.rgb[i] = told[i].unwrap_or(filling.rgb[i]);
+        filling.guessed[i] = false;
     }
+    gradient::solve(&mut filling.rgb, &equations);
+}
+
+/// Whether two colours of one place differ in brightness alone.
+fn alike(one: [f32; 3], other: [f32; 3]) -> bool {
+    (0..3).all(|c| (one[c] - other[c]).abs() <= BRIGHTER)
 }
 
 /// What photographs tell of the colours of a view's hole.
@@ -234,13 +275,13 @@ pub fn gather(sights: &Sights, photographs: &[Photograph<'_>], of: usize) -> Fil
     let inside: Vec<usize> = (0..w * h).filter(|i| hole(*i) && !colors[*i].is_empty()).collect();
     let mixed: Vec<[f32; 3]> = colors.par_iter().map(|shown| mean(shown)).collect();
     // Beside the hole a photograph differs from the others in brightness alone, or shows something else.
-    let alike = |i: usize| !colors[i].is_empty() && (0..3).all(|c| (filling.rgb[i][c] - mixed[i][c]).abs() <= BRIGHTER);
+    let goes_on = |i: usize| !colors[i].is_empty() && alike(filling.rgb[i], mixed[i]);
     let equation = |i: usize| {
         let mut equation = Equation::new(i);
         let (x, y) = (i % w, i / w);
         let near =
             [(x > 0).then(|| i - 1), (x + 1 < w).then(|| i + 1), (y > 0).then(|| i - w), (y + 1 < h).then(|| i + w)];
-        for j in near.into_iter().flatten().filter(|j| if hole(*j) { !colors[*j].is_empty() } else { alike(*j) }) {
+        for j in near.into_iter().flatten().filter(|j| if hole(*j) { !colors[*j].is_empty() } else { goes_on(*j) }) {
             equation.add(j, difference(&colors[i], &colors[j]));
         }
         equation
@@ -285,3 +326,20 @@ fn difference(one: &[Shown], other: &[Shown]) -> [f32; 3] {
 const RING: u32 = 2;
 /// Differences beyond this are of something else than brightness.
 const BRIGHTER: f32 = 0.12;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Next to a pixel without a colour the others' count alone, and nothing of it is mixed in.
+    #[test]
+    fn what_has_no_colour_is_not_mixed_in() {
+        let at = |x: i64, _: i64| (x < 3).then_some([0.25, 0.5, 0.75]);
+        for x in [1.5, 2.5, 2.999] {
+            assert_eq!(between(at, [x, 4.2]), Some([0.25, 0.5, 0.75]));
+        }
+        assert_eq!(between(at, [3.001, 4.2]), None);
+        let ramp = |x: i64, y: i64| Some([x as f32, y as f32, 0.0]);
+        assert_eq!(between(ramp, [2.0, 3.75]), Some([1.5, 3.25, 0.0]));
+    }
+}

@@ -6,7 +6,7 @@
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
-use super::color::{Filling, Photograph, sample};
+use super::color::{Filling, Photograph, between};
 use super::surface::{SAME, Sights};
 use super::texture::{self, Texture};
 use crate::prepare::planes::{Plane, membrane};
@@ -140,24 +140,15 @@ fn smooth(filling: &mut Filling, size: [usize; 2]) {
     filling.guessed.fill(false);
 }
 
-/// The colour at a place of a chart: linear between the texels that have one; nothing where the nearest has none.
-fn texel(texture: &Texture, wanted: &[bool], [x, y]: [f64; 2]) -> Option<[f32; 3]> {
+/// The colour at a place of a chart; nothing where the nearest texel has none.
+fn texel(texture: &Texture, wanted: &[bool], place: [f64; 2]) -> Option<[f32; 3]> {
     let [w, h] = texture.size;
-    let at = |x: f64, y: f64| {
-        let inside = x >= 0.0 && y >= 0.0 && (x as usize) < w && (y as usize) < h;
+    let at = |x: i64, y: i64| {
+        let inside = x >= 0 && y >= 0 && (x as usize) < w && (y as usize) < h;
         let i = inside.then(|| y as usize * w + x as usize)?;
         (texture.source[i] || wanted[i] && !texture.hole[i]).then(|| texture.rgb[i])
     };
-    at(x, y)?;
-    let (mut sum, mut total) = ([0f32; 3], 0f32);
-    for (dx, dy) in [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)] {
-        let (u, v) = ((x - 0.5).floor() + dx, (y - 0.5).floor() + dy);
-        let Some(color) = at(u, v) else { continue };
-        let weight = ((1.0 - (x - 0.5 - u).abs()) * (1.0 - (y - 0.5 - v).abs())) as f32;
-        (0..3).for_each(|c| sum[c] += weight * color[c]);
-        total += weight;
-    }
-    (total > 0.0).then(|| sum.map(|v| v / total))
+    between(at, place)
 }
 
 /// What is known of a plane, on its chart; the hole is what is to be filled there.
@@ -198,8 +189,13 @@ fn charted(
             if inside {
                 let z = sight.depth_at(sight.grid.place(ray));
                 if (z / point.z - 1.0).abs() <= SAME {
-                    let color = sample(|x, y| filling.rgb[y * w + x], own.camera.size, [x, y]);
-                    return color.map_or(Texel::Nothing, Texel::Known);
+                    // What is to be filled still shows the object.
+                    let known = |x: i64, y: i64| {
+                        let inside = x >= 0 && y >= 0 && (x as usize) < size[0] && (y as usize) < size[1];
+                        let pixel = inside.then(|| y as usize * w + x as usize)?;
+                        (!filling.guessed[pixel]).then(|| filling.rgb[pixel])
+                    };
+                    return between(known, [x, y]).map_or(Texel::Nothing, Texel::Known);
                 }
             }
         }

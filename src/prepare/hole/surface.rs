@@ -5,7 +5,7 @@
 //! them look through. What nobody shows continues the surfaces around it ([`planes`]). A view that is solved counts for
 //! all that follow, so that all views end with the same surface.
 
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 use image::GrayImage;
 use rayon::prelude::*;
 
@@ -69,6 +69,8 @@ struct Claim {
     weight: f64,
     /// Whether the view's photograph shows it.
     photographed: bool,
+    /// Number of the view's plane that it lies on, if on one.
+    surface: u8,
 }
 
 impl Sight {
@@ -126,6 +128,22 @@ impl Sight {
             }
         }
         votes.into_iter().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(0, |(surface, _)| surface)
+    }
+
+    /// The view's planes as another sees them: inverse depth by x/z, y/z and 1 of its camera.
+    fn planes_for(&self, other: &Self) -> Vec<planes::Plane> {
+        // A plane p is p . x = 1 in camera coordinates.
+        let rows = |sight: &Self| {
+            DMat3::from_cols_array_2d(&sight.grid.camera.rotation.map(|row| row.map(f64::from))).transpose()
+        };
+        let offset = |sight: &Self| DVec3::from(sight.grid.camera.translation);
+        let turn = rows(self) * rows(other).transpose();
+        let shift = offset(self) - turn * offset(other);
+        let plane = |plane: &planes::Plane| {
+            let plane = DVec3::from(*plane);
+            (turn.transpose() * plane / (1.0 - plane.dot(shift))).to_array()
+        };
+        self.planes.iter().map(plane).collect()
     }
 
     /// Normalised coordinates of a site's centre.
@@ -359,7 +377,8 @@ impl Sights {
                         (false, true) => 1.0,
                         (false, false) => UNCONFIRMED,
                     };
-                    found.push((there, Claim { depth: z, view, weight, photographed: !sight.hole[site] }));
+                    let (photographed, surface) = (!sight.hole[site], sight.surface[site]);
+                    found.push((there, Claim { depth: z, view, weight, photographed, surface }));
                 }
                 found
             })
@@ -373,6 +392,13 @@ impl Sights {
     pub fn carried(&self, of: usize) -> Vec<(f64, bool)> {
         let own = &self.0[of];
         let claims = self.claims(of);
+        let planes: Vec<Vec<planes::Plane>> = self.0.iter().map(|sight| sight.planes_for(own)).collect();
+        // A claim is of a point somewhere in the site: its plane tells the depth in the site's middle.
+        let in_middle = |site: usize, claim: &Claim| {
+            let plane = planes[claim.view].get(usize::from(claim.surface));
+            let depth = plane.map_or(f64::NAN, |plane| 1.0 / planes::on(plane, own.ray(site)));
+            if (depth / claim.depth - 1.0).abs() <= SAME { depth } else { claim.depth }
+        };
         let one = |site: usize| {
             if !own.hole[site] {
                 return (f64::NAN, false);
@@ -389,8 +415,9 @@ impl Sights {
                 views.dedup_by_key(|view| view.0);
                 let weight: f64 = views.iter().map(|view| view.1).sum();
                 // What a view was solved by is smoother than what was measured.
-                let solved: Vec<f64> =
-                    near[first..last].iter().filter(|claim| !claim.photographed).map(|claim| claim.depth).collect();
+                let solved = near[first..last].iter().filter(|claim| !claim.photographed);
+                let mut solved: Vec<f64> = solved.map(|claim| in_middle(site, claim)).collect();
+                solved.sort_unstable_by(f64::total_cmp);
                 let depth = match solved.len() {
                     0 => near[(first + last) / 2].depth,
                     n => solved[n / 2],
@@ -524,6 +551,23 @@ mod tests {
             assert!(holes.len() > 40, "{}", holes.len());
             assert!(holes.iter().all(|site| (sight.depth[*site] / 4.0 - 1.0).abs() < 0.01));
             assert!(holes.iter().all(|site| sight.measured[*site]));
+        }
+    }
+
+    /// A plane as another, turned and moved camera sees it has the same points.
+    #[test]
+    fn a_plane_is_the_same_for_another_camera() {
+        let (grids, cameras, masks) = views(0.2);
+        let mut sights = Sights::new(grids, &cameras, &masks, &masks);
+        let (sin, cos) = 0.3f32.sin_cos();
+        sights.0[1].grid.camera.rotation = [[cos, 0.0, -sin], [0.0, 1.0, 0.0], [sin, 0.0, cos]];
+        sights.0[0].planes = vec![[0.1, -0.05, 0.3]];
+        let seen = sights.0[0].planes_for(&sights.0[1])[0];
+        for site in [0, 100, 700, 1500] {
+            let ray = sights.0[0].ray(site);
+            let point = sights.0[0].point(site, 1.0 / planes::on(&[0.1, -0.05, 0.3], ray));
+            let [x, y, z] = sights.0[1].grid.camera.to_camera(point.to_array());
+            assert!((planes::on(&seen, [x / z, y / z]) * z - 1.0).abs() < 1e-5);
         }
     }
 

@@ -40,6 +40,9 @@ const SHORTEST: f64 = 0.06;
 const DIFFERENT: f32 = 0.6;
 /// Sum of the differences of the channels from which on a copy shows something else than what is known there.
 const ANOTHER: f32 = 0.3;
+/// Sum of the differences of the channels up to which surroundings are of one material in another light, which costs nothing:
+/// copies take the light of their place.
+const LIGHT: f32 = 0.15;
 /// Cost of a copy whose surroundings differ in one channel by the whole range from what goes on into the hole, at its border;
 /// it falls by a factor e every `FADES` of the hole's half width.
 const UNLIKE: f64 = 6.0;
@@ -306,7 +309,7 @@ impl Texture {
         move |pixel, from| {
             let apart: f32 = (0..3).map(|c| (around[from][c] - expected[pixel][c]).abs()).sum();
             let weight = UNLIKE * (-f64::from(inwards[pixel]) / fades).exp();
-            if apart.is_finite() { weight * f64::from(apart) } else { 0.0 }
+            if apart.is_finite() { weight * f64::from((apart - LIGHT).max(0.0)) } else { 0.0 }
         }
     }
 }
