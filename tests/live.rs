@@ -36,8 +36,8 @@ fn ask(address: SocketAddr, request: &[u8]) -> Vec<u8> {
 }
 
 /// Asks without pause until told to stop; counts the answers to requests that make sense.
-fn hostile(address: SocketAddr, number: usize, stop: &AtomicBool, answers: &AtomicU32) {
-    let get = |path: &str, host: &str| format!("GET {path} HTTP/1.1\r\nHost: {host}\r\n\r\n").into_bytes();
+fn hostile(address: SocketAddr, secret: &str, number: usize, stop: &AtomicBool, answers: &AtomicU32) {
+    let get = |path: &str, host: &str| format!("GET /{secret}{path} HTTP/1.1\r\nHost: {host}\r\n\r\n").into_bytes();
     let picture = "/picture.jpg?c=0,0,0&r=1,0,0,0,1,0,0,0,1&f=1,1&s=64,48";
     let requests = [
         get("/state.json", "localhost"),
@@ -83,12 +83,19 @@ fn hostile_clients_change_nothing_of_a_training() {
     let address = lines.find_map(|line| {
         line.expect("text").strip_prefix("view: http://").map(|rest| rest.trim_end_matches('/').to_owned())
     });
-    let address: SocketAddr = address.expect("it says where").parse().expect("an address");
+    let address = address.expect("it says where");
+    let (address, secret) = address.split_once('/').expect("an address and the secret");
+    let address: SocketAddr = address.parse().expect("an address");
+    // Whoever has only the port learns nothing.
+    for path in ["/", "/state.json", "/scene.json"] {
+        let told = ask(address, format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n").as_bytes());
+        assert!(told.is_empty() || told.starts_with(b"HTTP/1.1 403 "), "{}", String::from_utf8_lossy(&told));
+    }
     let (stop, answers) = (AtomicBool::new(false), AtomicU32::new(0));
     std::thread::scope(|scope| {
         for number in 0..8 {
             let (stop, answers) = (&stop, &answers);
-            scope.spawn(move || hostile(address, number, stop, answers));
+            scope.spawn(move || hostile(address, secret, number, stop, answers));
         }
         // Notes are read to the end, which is the program's.
         let rest: Vec<String> = lines.map(|line| line.expect("text")).collect();

@@ -226,13 +226,15 @@ fn visitors_change_no_byte() {
             break url.trim_end_matches('/').to_owned();
         }
     };
+    let (address, secret) = address.split_once('/').expect("an address and the secret");
+    let (address, secret) = (address.to_owned(), secret.to_owned());
     // Two programs cannot serve at one place; the second says so and leaves nothing.
     let other = fails(place.train("other", &[&format!("--view={address}")]), 1);
     assert!(
         other.contains(&format!("error: {address}: another program serves there; --view=127.0.0.1:0 takes a free one"))
     );
     assert!(!place.path().join("other").exists());
-    let get = |path: &str| format!("GET {path} HTTP/1.1\r\nHost: {address}\r\n\r\n").into_bytes();
+    let get = |path: &str| format!("GET /{secret}{path} HTTP/1.1\r\nHost: {address}\r\n\r\n").into_bytes();
     let page = text(&ask(&address, &get("/")));
     assert!(
         page.starts_with("HTTP/1.1 200") && !page.contains("src=\"http") && !page.contains("href=\"http"),

@@ -5,6 +5,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::shared::DeviceArgs;
 use super::{next, signals};
+use crate::prepare::click::MOST_POINTS;
 use crate::prepare::shadow::Answer;
 use crate::prepare::{self, Evidence, Request, Step, Watch};
 use crate::signal::Signal;
@@ -22,6 +23,7 @@ use crate::signal::Signal;
 #[command(after_help = "Examples:
   gscream-vk prepare photos --out scene --mask IMG_0012=box.png
   gscream-vk prepare photos --out scene --box IMG_0012=310,220,540,470
+  gscream-vk prepare photos --out scene --click IMG_0012=430,340 --not IMG_0012=520,460
   gscream-vk prepare photos --out scene --mask IMG_0012=a.png --mask IMG_0040=b.png --reference IMG_0025
   gscream-vk prepare photos --out scene --only masks --mask IMG_0012=better.png")]
 pub(super) struct Args {
@@ -85,6 +87,17 @@ pub(super) struct ObjectArgs {
     /// With a --box of the same view they count within it alone: for one leaf of many.
     #[arg(long, value_name = "NAME=FILE", value_parser = strokes)]
     strokes: Vec<(String, Evidence)>,
+    /// Rough line around the object in one view, in pixels of the photograph; it closes itself. As good as a box, for any shape
+    #[arg(long, value_name = "NAME=x,y,x,y,...", value_parser = lasso)]
+    lasso: Vec<(String, Evidence)>,
+    /// Pixel of the object in one view; may be given many times
+    ///
+    /// Marks of one view count together: boxes and lassos, then --click, then --not.
+    #[arg(long, value_name = "NAME=x,y", value_parser = click)]
+    click: Vec<(String, Evidence)>,
+    /// Pixel that is not of the object, where another mark of the view takes too much; may be given many times
+    #[arg(long, value_name = "NAME=x,y", value_parser = not)]
+    not: Vec<(String, Evidence)>,
 }
 
 /// What happens to the object's shadow.
@@ -117,7 +130,8 @@ impl ShadowArgs {
 impl ObjectArgs {
     /// All of it, by the name of a view.
     pub fn evidence(&self) -> Vec<(String, Evidence)> {
-        [&self.mask, &self.bounds, &self.strokes].into_iter().flatten().cloned().collect()
+        let Self { mask, bounds, strokes, lasso, click, not } = self;
+        [mask, bounds, strokes, lasso, click, not].into_iter().flatten().cloned().collect()
     }
 }
 
@@ -137,14 +151,41 @@ fn strokes(text: &str) -> Result<(String, Evidence), String> {
     named(text).map(|(name, file)| (name, Evidence::Strokes(file.into())))
 }
 
-fn bounds(text: &str) -> Result<(String, Evidence), String> {
+/// A view's name and whole numbers of pixels.
+fn pixels(text: &str) -> Result<(String, Vec<u32>), String> {
     let (name, numbers) = named(text)?;
-    let numbers: Vec<u32> = numbers
-        .split(',')
-        .map(|word| word.trim().parse().map_err(|_| format!("'{word}' is no whole number of pixels")))
-        .collect::<Result<_, _>>()?;
+    let number = |word: &str| word.trim().parse().map_err(|_| format!("'{word}' is no whole number of pixels"));
+    let numbers = numbers.split(',').map(number).collect::<Result<_, _>>()?;
+    Ok((name, numbers))
+}
+
+fn bounds(text: &str) -> Result<(String, Evidence), String> {
+    let (name, numbers) = pixels(text)?;
     let bounds = numbers.try_into().map_err(|_| "a box is four numbers: x0,y0,x1,y1")?;
     Ok((name, Evidence::Box(bounds)))
+}
+
+fn lasso(text: &str) -> Result<(String, Evidence), String> {
+    let (name, numbers) = pixels(text)?;
+    let (points, rest) = numbers.as_chunks::<2>();
+    if !rest.is_empty() || !(3..=MOST_POINTS).contains(&points.len()) {
+        return Err(format!("a lasso is x and y of 3 to {MOST_POINTS} corners: x,y,x,y,x,y,..."));
+    }
+    Ok((name, Evidence::Lasso(points.to_vec())))
+}
+
+/// A view's name and one of its pixels.
+fn pixel(text: &str) -> Result<(String, [u32; 2]), String> {
+    let (name, numbers) = pixels(text)?;
+    Ok((name, numbers.try_into().map_err(|_| "a pixel is two numbers: x,y")?))
+}
+
+fn click(text: &str) -> Result<(String, Evidence), String> {
+    pixel(text).map(|(name, at)| (name, Evidence::Click(at)))
+}
+
+fn not(text: &str) -> Result<(String, Evidence), String> {
+    pixel(text).map(|(name, at)| (name, Evidence::Not(at)))
 }
 
 fn step(text: &str) -> Result<Step, String> {

@@ -28,7 +28,7 @@ use crate::train::checkpoint::{self, Owner, Search};
 use crate::train::forecast::{self, Fitting, Question};
 use crate::train::run::{LOG, Observer, Progress, Run, Summary};
 use crate::view::live::{Board, Host};
-use crate::view::server;
+use crate::view::server::{self, Secret};
 use crate::work::{Loaded, Ready};
 
 /// Train a scene without its object
@@ -128,9 +128,10 @@ fn show(address: SocketAddr, name: &str, scene: &Scene, settings: &Settings) -> 
     let listener = super::view::bind(address, "--view=127.0.0.1:0")?;
     let title = Path::new(name).file_name().map_or_else(|| name.into(), |name| name.to_string_lossy().into_owned());
     let board = Board::new(title, scene, settings.train.iterations);
-    eprintln!("view: http://{}/", listener.local_addr().unwrap_or(address));
+    let secret = Secret::random();
+    eprintln!("view: {}", secret.url(listener.local_addr().unwrap_or(address)));
     let site = board.clone();
-    std::thread::spawn(move || server::serve(&listener, &site));
+    std::thread::spawn(move || server::serve(&listener, &site, &secret));
     Ok(board)
 }
 

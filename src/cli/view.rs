@@ -13,7 +13,8 @@ use super::next;
 use super::shared;
 use crate::export;
 use crate::scene::Camera;
-use crate::view::{self, Page, Start, server};
+use crate::view::server::{self, Secret};
+use crate::view::{self, Page, Start};
 
 /// Show an exported scene in the browser
 ///
@@ -56,8 +57,10 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     }
     let address = SocketAddr::new(args.host, args.port);
     let listener = bind(address, "--port 0")?;
-    println!("http://{}/ (Ctrl-C ends it)", listener.local_addr().unwrap_or(address));
-    server::serve(&listener, &Arc::new(page.resources())).with_context(|| format!("{address}: cannot be served on"))
+    let secret = Secret::random();
+    println!("{} (Ctrl-C ends it)", secret.url(listener.local_addr().unwrap_or(address)));
+    server::serve(&listener, &Arc::new(page.resources()), &secret)
+        .with_context(|| format!("{address}: cannot be served on"))
 }
 
 /// Binds the address; `other` is what asks for a free port.

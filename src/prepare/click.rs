@@ -1,20 +1,20 @@
 //! A few clicks become a mask: colours, places in space, distances along the picture and what other views say, in one
 //! minimum cut.
 //!
-//! Geodesic graph cuts (Price et al. 2010) over the colour models of [`super::graph_cut`]. A pixel is the nearer to a click
-//! the less the picture changes on the way to it. With a depth map, places join in: mixtures of Gaussians over the points
-//! that pixels show tell what stands on a ground from the ground, and what lies metres behind from both, however alike
-//! their colours are; and a jump in depth is a border.
+//! Geodesic graph cuts (Price et al. 2010) over the colour models of [`super::graph_cut`]. A pixel is the nearer to a
+//! click the less the picture changes on the way to it. With a depth map, places join in: mixtures of Gaussians over
+//! the points that pixels show tell what stands on a ground from the ground, and what lies metres behind from both,
+//! however alike their colours are; and a jump in depth is a border.
 //!
-//! A cut at a small size finds the object, a second one around it draws its border. A further click changes the mask around
-//! it, the farther it is from the outline the farther, and leaves the rest as it is; so does the first one in a view to which
-//! other views' masks were carried.
+//! A cut at a small size finds the object, a second one around it draws its border. A further click changes the mask
+//! around it, the farther it is from the outline the farther, and leaves the rest as it is; so does the first one in a
+//! view to which other views' masks were carried. What it may not change is in [`next`]. Who wants a larger or smaller
+//! part than a click takes by itself goes along the segments of several scales about it ([`tree`]).
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
 use image::{GrayImage, RgbImage};
-use serde::{Deserialize, Serialize};
 
 use super::depth::DepthMap;
 use super::graph_cut::{self, COMPONENTS, Grid, Mixture, SHIFTS, SMOOTHNESS, UNIT};
@@ -22,42 +22,19 @@ use super::masks;
 use crate::scene::resample;
 use crate::statistics::median;
 
-/// A user's mark in a photograph. Positions are parts of its width and height, 0 to 1.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
-pub enum Mark {
-    /// The object is here.
-    Object {
-        /// Where.
-        at: [f64; 2],
-    },
-    /// The object is not here.
-    Background {
-        /// Where.
-        at: [f64; 2],
-    },
-    /// The object is in here, and fills it: x0, y0, x1, y1.
-    Box {
-        /// Where.
-        bounds: [f64; 4],
-    },
-}
+mod mark;
+mod tree;
 
-impl Mark {
-    /// Whether it lies within the photograph; a box must have an inside.
-    pub fn is_sound(&self) -> bool {
-        let within = |v: &f64| (0.0..=1.0).contains(v);
-        match self {
-            Self::Object { at } | Self::Background { at } => at.iter().all(within),
-            Self::Box { bounds } => {
-                bounds.iter().all(within) && bounds[2] - bounds[0] >= SMALLEST && bounds[3] - bounds[1] >= SMALLEST
-            }
-        }
-    }
-}
+pub use mark::{MOST_POINTS, Mark};
+use tree::Tree;
 
-/// Least side of a box, of the photograph's.
-const SMALLEST: f64 = 0.004;
+/// The longer side of the pictures that are marked, pixels.
+const MARKED: u32 = 1024;
+
+/// The size at which a photograph of this size is marked: as it is, or with the longer side at 1,024 pixels.
+pub fn working(size: [u32; 2]) -> [u32; 2] {
+    graph_cut::within(size, MARKED)
+}
 
 /// Knowledge of a photograph besides its colours.
 #[derive(Clone, Copy, Default)]
@@ -68,10 +45,19 @@ pub struct Cues<'a> {
     pub carried: Option<(&'a [f32], [u32; 2])>,
 }
 
-/// Radius of what a click touches, of the picture's longer side.
-const TOUCH: f64 = 0.006;
-/// Colours that differ by less, of 255, are touched by the same click.
-const ALIKE: f64 = 24.0;
+impl Cues<'_> {
+    /// Without a depth that does not change across a mask's outline: of something flat on a wall, or a fit that does
+    /// not know it.
+    fn trusted(&self, picture: &RgbImage, mask: &GrayImage) -> Self {
+        let window = Window::whole(picture);
+        let knows = || {
+            let pixels = Pixels::of(picture, window, SIDES[0], &[], self);
+            pixels.jump(&labels(mask, window, pixels.size.map(|n| n as u32))) >= FLAT
+        };
+        Self { depth: self.depth.filter(|_| knows()), ..*self }
+    }
+}
+
 /// Rounds of models and cuts, of the first cut and the second.
 const ROUNDS: [u32; 2] = [4, 2];
 /// The longer sides of their pictures, pixels.
@@ -82,10 +68,18 @@ const SAMPLES: usize = 3000;
 const MOST: [f64; 2] = [8.0, 8.0];
 /// The weight of being nearer to a click than to anything else, in nats.
 const NEAR: f64 = 4.0;
+/// The weight of being within the segment that a click means, in nats.
+const SHAPE: f64 = 12.0;
 /// Nearer than this to a click, from -1 to 1, is the object to begin with.
 const NEARER: f64 = 0.33;
 /// A place so far from where the background is, squared and in its deviations, is as likely to be the object as not.
 const OFF: f64 = 9.0;
+/// Depth that changes by less than this part of a jump across an object's outline does not know the object.
+const FLAT: f64 = 0.2;
+/// The border of a changed mask is drawn anew within so many pixels of where it was found.
+const RIM: usize = 3;
+/// Changes are looked at over so many pixels: the fit's depth is not sharp.
+const BESIDE: usize = 6;
 /// Depths of the fit are right within this part.
 const ROUGH: f64 = 0.01;
 /// Neighbours whose depths differ by this part are parted.
@@ -94,7 +88,7 @@ const JUMP: f64 = 0.04;
 const AROUND: f64 = 0.35;
 /// The first so many marks are taken together.
 const TOGETHER: usize = 3;
-/// With a depth, a click nearer to the outline than this part of the root of the mask's area is about the outline.
+/// A click nearer to the outline than this part of the root of the mask's area is about the outline.
 const AFAR: f64 = 0.1;
 /// A click changes what lies within so many times its distance from the outline.
 const REACH: f64 = 6.0;
@@ -104,6 +98,8 @@ const AGAIN: f64 = 8.0;
 const SURE: f64 = 0.6;
 /// The weight of leaving the rest as it is, in nats.
 const STAYS: f64 = 16.0;
+/// A further click adds nothing, and takes nothing away, beyond so many times the reach of the piece that it is on.
+const NEARBY: [f64; 2] = [1.0, 2.0];
 /// Votes of other views beyond this are the object.
 const VOTED: f32 = masks::OBJECT;
 
@@ -130,7 +126,8 @@ impl Window {
     }
 }
 
-/// The object that the marks mean, as large as the picture: one mark after the other. Without a mark what other views say.
+/// The object that the marks mean, as large as the picture: one mark after the other. Without a mark what other views
+/// say.
 pub fn mask(picture: &RgbImage, marks: &[Mark], cues: &Cues<'_>) -> GrayImage {
     let before = voted(picture, cues);
     (1..=marks.len()).fold(before, |before, count| next(picture, &marks[..count], &before, cues))
@@ -142,31 +139,123 @@ fn voted(picture: &RgbImage, cues: &Cues<'_>) -> GrayImage {
     cues.carried.map_or_else(|| GrayImage::new(to[0], to[1]), |(parts, from)| masks::threshold(parts, from, to, VOTED))
 }
 
-/// [`mask`] for one more mark, the last of these, than made the mask `before`. A click on a mask changes what is around it, a
-/// box begins anew.
+/// [`mask`] for one more mark, the last of these, on the mask `before` that the others made.
+///
+/// What a click or a brush touches is in the mask, or out of it. A click for the object only adds, and a click beside
+/// it only takes away: the piece that hangs together with the click, and what else is near. A box or a lasso begins
+/// anew, unless there was one before: then it adds.
 pub fn next(picture: &RgbImage, marks: &[Mark], before: &GrayImage, cues: &Cues<'_>) -> GrayImage {
+    let Some((last, earlier)) = marks.split_last() else { return before.clone() };
     let there = before.as_raw().iter().any(|v| *v != 0);
-    match marks.last() {
-        // One click seldom finds it at once: the first ones are better taken together, unless all but the rim is there.
-        Some(last)
-            if cues.carried.is_none() && marks.len() <= TOGETHER && (cues.depth.is_none() || is_afar(before, last)) =>
-        {
-            found(picture, marks, cues)
+    let mut mask = match last.click() {
+        Some((_, false)) if !there => before.clone(),
+        Some((at, adds)) => {
+            let piece = |mut new: GrayImage| {
+                last.hold(&mut new, picture, marks);
+                changed(before, &new, at, adds)
+            };
+            let own = piece(if there { further(picture, marks, before, cues) } else { found(picture, marks, cues) });
+            let steps = if let Mark::Object { scale, .. } = last { *scale } else { 0 };
+            match (steps != 0).then(|| resized(picture, &clicks(marks), before, &own, steps)).flatten() {
+                Some(resized) => piece(resized),
+                None => own,
+            }
         }
-        Some(Mark::Object { .. } | Mark::Background { .. }) if there => {
-            edited(picture, marks, before, cues.depth).unwrap_or_else(|| before.clone())
+        None if last.bounds().is_none() => before.clone(),
+        None if earlier.iter().any(|mark| mark.bounds().is_some()) => {
+            let beside = earlier.iter().filter(|mark| mark.bounds().is_none());
+            let own: Vec<Mark> = beside.chain(std::iter::once(last)).cloned().collect();
+            let mut sum = before.clone();
+            sum.iter_mut().zip(found(picture, &own, cues).as_raw()).for_each(|(sum, new)| *sum |= new);
+            sum
         }
-        _ => found(picture, marks, cues),
+        None => found(picture, marks, cues),
+    };
+    marks.iter().for_each(|mark| mark.hold(&mut mask, picture, marks));
+    mask
+}
+
+/// What the last of these marks, a click, makes of a mask, where it may change all of it.
+fn further(picture: &RgbImage, marks: &[Mark], before: &GrayImage, cues: &Cues<'_>) -> GrayImage {
+    let Some((at, adds)) = marks.last().and_then(Mark::click) else { return before.clone() };
+    let cues = &cues.trusted(picture, before);
+    let afar = cues.depth.is_none() || is_afar(before, at, adds);
+    let anew = (cues.carried.is_none() && marks.len() <= TOGETHER && afar).then(|| found(picture, marks, cues));
+    let agrees = |mask: &GrayImage| holds(mask, at) == adds;
+    anew.filter(agrees)
+        .or_else(|| edited(picture, &clicks(marks), before, cues.depth))
+        .unwrap_or_else(|| before.clone())
+}
+
+/// The marks besides boxes and lassos: what is within those is in the mask already.
+fn clicks(marks: &[Mark]) -> Vec<Mark> {
+    marks.iter().filter(|mark| mark.bounds().is_none()).cloned().collect()
+}
+
+/// A mask `before` the last of these clicks, with a segment about that in the place of what the click takes by itself,
+/// which gives the mask `own`: the one most like it, or one so many steps larger.
+fn resized(picture: &RgbImage, clicks: &[Mark], before: &GrayImage, own: &GrayImage, steps: i32) -> Option<GrayImage> {
+    let full = [picture.width(), picture.height()];
+    let (at, _) = clicks.last()?.click()?;
+    let first = Window::whole(picture);
+    let pixels = Pixels::of(picture, first, SIDES[0], clicks, &Cues::default());
+    let small = pixels.size.map(|n| n as u32);
+    let [was, is] = [before, own].map(|mask| labels(mask, first, small));
+    let pixel = |k: usize| ((at[k] * pixels.size[k] as f64) as usize).min(pixels.size[k] - 1);
+    let taken = Tree::of(&pixels).about(&pixels, pixel(1) * pixels.size[0] + pixel(0), steps, |i| is[i] && !was[i])?;
+    let object = (0..taken.len()).map(|i| taken[i] || was[i]).collect();
+    let stays = |object: bool| if object { STAYS } else { -STAYS };
+    let segment = |i: usize| if taken[i] { SHAPE } else { stays(was[i]) };
+    let coarse = whole(picture, first, small, solve(&pixels, object, ROUNDS[0], segment, |_| true)?)?;
+    // The border is drawn anew.
+    let second = Window::around(bounds_of(&coarse)?, AROUND, full);
+    let pixels = Pixels::of(picture, second, SIDES[1], clicks, &Cues::default());
+    let small = pixels.size.map(|n| n as u32);
+    let found = labels(&coarse, second, small);
+    let is_rim = |i: usize| pixels.around(i).any(|j| found[j] != found[i]);
+    let rim = |i: usize| if is_rim(i) { 0.0 } else { stays(found[i]) };
+    let fine =
+        solve(&pixels, found.clone(), ROUNDS[1], rim, |_| true).and_then(|fine| whole(picture, second, small, fine));
+    Some(fine.unwrap_or(coarse))
+}
+
+/// Whether a mask has the pixel at a place.
+fn holds(mask: &GrayImage, at: [f64; 2]) -> bool {
+    let pixel = |k: usize, side: u32| ((at[k] * f64::from(side)) as u32).min(side - 1);
+    mask.get_pixel(pixel(0, mask.width()), pixel(1, mask.height())).0[0] != 0
+}
+
+/// A mask with what is new of the kind that a click adds or takes away: the piece that it is on, and what else is
+/// [`NEARBY`].
+fn changed(before: &GrayImage, new: &GrayImage, at: [f64; 2], adds: bool) -> GrayImage {
+    let (w, h) = before.dimensions();
+    let click: [u32; 2] = std::array::from_fn(|k| ((at[k] * f64::from([w, h][k])) as u32).min([w, h][k] - 1));
+    let changes = |x: u32, y: u32| {
+        let [was, is] = [before, new].map(|mask| mask.get_pixel(x, y).0[0] != 0);
+        was != is && is == adds
+    };
+    let far = |x: u32, y: u32| f64::hypot(f64::from(x) - f64::from(click[0]), f64::from(y) - f64::from(click[1]));
+    let mut seen = vec![false; (w * h) as usize];
+    let (mut open, mut reach) = (vec![click], 0.0f64);
+    while let Some([x, y]) = open.pop() {
+        let at = (y * w + x) as usize;
+        if seen[at] || !changes(x, y) {
+            continue;
+        }
+        seen[at] = true;
+        reach = reach.max(far(x, y));
+        for v in y.saturating_sub(1)..(y + 2).min(h) {
+            open.extend((x.saturating_sub(1)..(x + 2).min(w)).map(|u| [u, v]));
+        }
     }
+    let there = seen[(click[1] * w + click[0]) as usize];
+    let within = NEARBY[usize::from(!adds)] * reach;
+    let taken = |x: u32, y: u32| there && changes(x, y) && far(x, y) <= within;
+    GrayImage::from_fn(w, h, |x, y| *if taken(x, y) { new } else { before }.get_pixel(x, y))
 }
 
 /// Whether a click is too far from a mask's outline to be about the outline alone.
-fn is_afar(before: &GrayImage, click: &Mark) -> bool {
-    let (at, adds) = match click {
-        Mark::Object { at } => (*at, true),
-        Mark::Background { at } => (*at, false),
-        Mark::Box { .. } => return true,
-    };
+fn is_afar(before: &GrayImage, at: [f64; 2], adds: bool) -> bool {
     let [x, y] = [at[0] * f64::from(before.width()), at[1] * f64::from(before.height())];
     let on = || before.enumerate_pixels().filter(|pixel| (pixel.2.0[0] != 0) == adds);
     let nearest = on().map(|(u, v, _)| f64::hypot(f64::from(u) + 0.5 - x, f64::from(v) + 0.5 - y));
@@ -178,30 +267,25 @@ fn is_afar(before: &GrayImage, click: &Mark) -> bool {
 fn found(picture: &RgbImage, marks: &[Mark], cues: &Cues<'_>) -> GrayImage {
     let full = [picture.width(), picture.height()];
     let empty = GrayImage::new(full[0], full[1]);
-    if !marks.iter().any(|mark| !matches!(mark, Mark::Background { .. })) {
+    let speaks = |mark: &Mark| !matches!(mark, Mark::Background { .. } | Mark::Brush { object: false, .. });
+    if !marks.iter().any(speaks) {
         return empty;
     }
-    let mut bounds: Option<[f64; 4]> = None;
-    let scaled = |v: [f64; 4]| {
-        [0, 1, 0, 1].map(|axis| f64::from(full[axis])).iter().zip(v).map(|(s, v)| s * v).collect::<Vec<_>>()
+    let boxed = marks.iter().any(|mark| mark.bounds().is_some());
+    let of = |mark: &Mark| match mark {
+        Mark::Object { at: [x, y], .. } if boxed => Some([*x, *y, *x, *y]),
+        _ => mark.bounds(),
     };
-    let mut take = |v: &[f64]| {
-        let old = bounds.unwrap_or([v[0], v[1], v[2], v[3]]);
-        bounds = Some([old[0].min(v[0]), old[1].min(v[1]), old[2].max(v[2]), old[3].max(v[3])]);
-    };
-    let boxed = marks.iter().any(|mark| matches!(mark, Mark::Box { .. }));
-    for mark in marks {
-        match mark {
-            Mark::Box { bounds } => take(&scaled(*bounds)),
-            Mark::Object { at: [x, y] } if boxed => take(&scaled([*x, *y, *x, *y])),
-            _ => {}
-        }
-    }
-    let first = match bounds {
-        Some(bounds) => Window::around(bounds, 0.5, full),
+    let joined = |a: [f64; 4], b: [f64; 4]| [a[0].min(b[0]), a[1].min(b[1]), a[2].max(b[2]), a[3].max(b[3])];
+    let first = match marks.iter().filter_map(of).reduce(joined) {
+        Some(bounds) => Window::around(std::array::from_fn(|k| bounds[k] * f64::from(full[k % 2])), 0.5, full),
         None => Window::whole(picture),
     };
-    let Some(found) = cut(picture, first, marks, cues, None) else { return empty };
+    let by_places = cut(picture, first, marks, cues, None);
+    let trusted = by_places.as_ref().map_or(*cues, |mask| cues.trusted(picture, mask));
+    let again = cues.depth.is_some() && trusted.depth.is_none();
+    let (found, cues) = if again { (cut(picture, first, marks, &trusted, None), &trusted) } else { (by_places, cues) };
+    let Some(found) = found else { return empty };
     let Some(bounds) = bounds_of(&found) else { return empty };
     let second = Window::around(bounds, AROUND, full);
     let side = |window: Window| window.0[2].max(window.0[3]);
@@ -246,40 +330,16 @@ impl Pixels {
             ]
         };
         let count = (to[0] * to[1]) as usize;
-        let boxes: Vec<[f64; 4]> =
-            marks.iter().filter_map(|m| if let Mark::Box { bounds } = m { Some(*bounds) } else { None }).collect();
-        let outside = (0..count)
-            .map(|i| {
-                let [x, y] = at(i);
-                let within = |b: &[f64; 4]| x >= b[0] && x <= b[2] && y >= b[1] && y <= b[3];
-                !boxes.is_empty() && !boxes.iter().any(within)
-            })
-            .collect();
+        let outlines: Vec<&Mark> = marks.iter().filter(|mark| mark.bounds().is_some()).collect();
+        let outside = (0..count).map(|i| !outlines.is_empty() && !outlines.iter().any(|m| m.encloses(at(i)))).collect();
         let mut touched = vec![None; count];
-        // At least the pixel that a click falls into, in a circle of the whole picture's proportions.
-        let pixel = f64::from(w) / f64::from(to[0]);
-        let radius = (TOUCH * full[0].max(full[1])).max(1.2 * pixel);
         for mark in marks {
-            let (at_click, object) = match mark {
-                Mark::Object { at } => (at, true),
-                Mark::Background { at } => (at, false),
-                Mark::Box { .. } => continue,
-            };
-            let far = |i: usize| {
-                let d = at(i);
-                f64::hypot((d[0] - at_click[0]) * full[0], (d[1] - at_click[1]) * full[1])
-            };
-            // Of the pixels around the nearest one those that look like it: a click may lie at a rim.
-            let color = |i: usize| small.as_raw()[3 * i..3 * i + 3].iter().map(|v| f64::from(*v));
-            let Some(nearest) = (0..count).min_by(|a, b| far(*a).total_cmp(&far(*b))) else { continue };
+            let object = matches!(mark, Mark::Object { .. } | Mark::Brush { object: true, .. });
             // In the window of the second cut there may be nothing of it.
-            if far(nearest) > radius {
-                continue;
-            }
-            for (i, touched) in touched.iter_mut().enumerate().filter(|(i, _)| far(*i) <= radius) {
-                let differs: f64 = color(i).zip(color(nearest)).map(|(a, b)| (a - b).powi(2)).sum();
-                if differs <= ALIKE * ALIKE {
-                    *touched = Some(object);
+            for [x, y] in mark.certain(picture, marks) {
+                if (x0..x0 + w).contains(&x) && (y0..y0 + h).contains(&y) {
+                    let pixel = |v: u32, from: u32, to: u32| (u64::from(v) * u64::from(to) / u64::from(from)) as usize;
+                    touched[pixel(y - y0, h, to[1]) * to[0] as usize + pixel(x - x0, w, to[0])] = Some(object);
                 }
             }
         }
@@ -312,6 +372,23 @@ impl Pixels {
         let Some(depth) = near(&on).or_else(|| near(&|i| !self.outside[i])) else { return };
         let unit = depth * ROUGH;
         self.places.iter_mut().flatten().for_each(|(place, _)| *place = place.map(|v| v / unit));
+    }
+
+    /// How much the depth changes across an object's outline, 0 to 1.
+    fn jump(&self, object: &[bool]) -> f64 {
+        let [w, h] = self.size;
+        let [mut sum, mut count] = [0.0; 2];
+        for i in 0..w * h {
+            for (j, inside) in [(i + BESIDE, i % w + BESIDE < w), (i + BESIDE * w, i / w + BESIDE < h)] {
+                if inside
+                    && object[i] != object[j]
+                    && let (Some((_, a)), Some((_, b))) = (self.places[i], self.places[j])
+                {
+                    (sum, count) = (sum + ((a - b) / JUMP).abs().min(1.0), count + 1.0);
+                }
+            }
+        }
+        if count > 0.0 { sum / count } else { 0.0 }
     }
 
     /// How far neighbours are apart: by colour, and by depth.
@@ -368,6 +445,13 @@ impl Pixels {
         distance
     }
 
+    /// The pixels within [`RIM`] of one.
+    fn around(&self, i: usize) -> impl Iterator<Item = usize> {
+        let [w, h] = self.size;
+        let range = |at: usize, side: usize| at.saturating_sub(RIM)..(at + RIM + 1).min(side);
+        range(i / w, h).flat_map(move |y| range(i % w, w).map(move |x| y * w + x))
+    }
+
     fn is_border(&self, i: usize) -> bool {
         let [w, h] = self.size;
         let (x, y) = (i % w, i / w);
@@ -378,6 +462,11 @@ impl Pixels {
 /// Some of these at most, evenly spread.
 fn some<T: Copy>(all: &[T]) -> Vec<T> {
     all.iter().step_by(all.len().div_ceil(SAMPLES).max(1)).copied().collect()
+}
+
+/// Where the background is, by places of it; nothing where there are next to none.
+fn behind(places: &[[f64; 3]]) -> Option<Mixture> {
+    (places.len() > 8).then(|| Mixture::of(&some(places), COMPONENTS[1], 3))
 }
 
 /// The models of the two sides: by how many nats a value speaks for the object.
@@ -422,8 +511,7 @@ fn solve(
         .collect();
     for round in 0..rounds {
         let of = |side: bool| -> Vec<usize> { (0..count).filter(|i| object[*i] == side).collect() };
-        let behind: Vec<[f64; 3]> = of(false).iter().filter_map(|i| Some(pixels.places[*i]?.0)).collect();
-        let behind = (behind.len() > 8).then(|| Mixture::of(&some(&behind), COMPONENTS[1], 3));
+        let behind = behind(&of(false).iter().filter_map(|i| Some(pixels.places[*i]?.0)).collect::<Vec<_>>());
         // By how much a pixel's place speaks for the object: how far it is from where the background goes on.
         let off = |i: usize| match (&behind, pixels.places[i]) {
             (Some(behind), Some((place, _))) => (0.5 * (behind.distance(place) - OFF)).clamp(-MOST[1], MOST[1]),
@@ -464,7 +552,8 @@ fn solve(
     Some(object)
 }
 
-/// The object in a window, as a mask of the whole picture; nothing where one side runs out of pixels.
+/// The object in a window, as a mask of the whole picture; nothing where one side runs out of pixels. A second cut
+/// begins with what the first one found.
 fn cut(
     picture: &RgbImage,
     window: Window,
@@ -476,17 +565,16 @@ fn cut(
     let pixels = Pixels::of(picture, window, SIDES[pass], marks, cues);
     let [w, h] = pixels.size;
     let count = w * h;
-    let [x0, y0, wide, high] = window.0;
     let small = [w as u32, h as u32];
-    let before: Option<Vec<bool>> = found.map(|found| {
-        let part = image::imageops::crop_imm(found, x0, y0, wide, high).to_image();
-        resample::nearest(&part, small).as_raw().iter().map(|v| *v != 0).collect()
-    });
+    let before: Option<Vec<bool>> = found.map(|found| labels(found, window, small));
     let was = |i: usize| before.as_ref().is_some_and(|before| before[i]);
     let boxed = pixels.outside.iter().any(|outside| *outside);
-    let clicked = pixels.touched.contains(&Some(true));
+    let marked = pixels.touched.contains(&Some(true));
+    // Places in space know more of what is in a box than segments do.
+    let flat = pixels.places.iter().all(Option::is_none);
+    let within = (boxed && flat && pass == 0).then(|| Tree::of(&pixels).within(|i| !pixels.outside[i])).flatten();
     // Nearer to the object's clicks, or to what is not the object: from -1 to 1.
-    let near: Option<Vec<f64>> = clicked.then(|| {
+    let near: Option<Vec<f64>> = marked.then(|| {
         let objects = (0..count).filter(|i| pixels.touched[*i] == Some(true));
         let objects = pixels.distances(objects);
         let others = (0..count)
@@ -496,9 +584,10 @@ fn cut(
         objects.iter().zip(&others).map(side).collect()
     });
     let object: Vec<bool> = (0..count)
-        .map(|i| match (&before, pixels.touched[i]) {
-            (_, Some(side)) => side,
-            (Some(before), None) => before[i],
+        .map(|i| match (&before, &within, pixels.touched[i]) {
+            (.., Some(side)) => side,
+            (Some(before), ..) => before[i],
+            (None, Some(within), None) => within[i],
             _ if boxed => !pixels.outside[i],
             _ => near.as_ref().is_some_and(|near| near[i] > NEARER),
         })
@@ -506,6 +595,13 @@ fn cut(
     let beside = |i: usize| near.as_ref().map_or(0.0, |near| NEAR * near[i]);
     let object = solve(&pixels, object, ROUNDS[pass], beside, |_| true)?;
     whole(picture, window, small, joined(object, &pixels, boxed))
+}
+
+/// The labels that a mask gives the pixels of a window at another size.
+fn labels(mask: &GrayImage, window: Window, to: [u32; 2]) -> Vec<bool> {
+    let [x0, y0, w, h] = window.0;
+    let part = image::imageops::crop_imm(mask, x0, y0, w, h).to_image();
+    resample::nearest(&part, to).as_raw().iter().map(|v| *v != 0).collect()
 }
 
 /// Labels of a window as a mask of the whole picture; nothing where there is no object.
@@ -525,11 +621,7 @@ fn whole(picture: &RgbImage, window: Window, small: [u32; 2], labels: Vec<bool>)
 /// A mask as one more click changes it, around the click: the farther it is from the outline, the farther.
 fn edited(picture: &RgbImage, marks: &[Mark], before: &GrayImage, depth: Option<&DepthMap>) -> Option<GrayImage> {
     let full = [picture.width(), picture.height()];
-    let (at, adds) = match marks.last()? {
-        Mark::Object { at } => (*at, true),
-        Mark::Background { at } => (*at, false),
-        Mark::Box { .. } => return None,
-    };
+    let (at, adds) = marks.last()?.click()?;
     let click: [u32; 2] = std::array::from_fn(|k| ((at[k] * f64::from(full[k])) as u32).min(full[k] - 1));
     if (before.get_pixel(click[0], click[1]).0[0] != 0) == adds {
         return Some(before.clone());
@@ -540,10 +632,9 @@ fn edited(picture: &RgbImage, marks: &[Mark], before: &GrayImage, depth: Option<
     let window = Window::around(bounds, AROUND, full);
     let pixels = Pixels::of(picture, window, SIDES[1], marks, &Cues { depth, carried: None });
     let [w, h] = pixels.size;
-    let [x0, y0, wide, high] = window.0;
+    let [x0, y0, wide, _] = window.0;
     let small = [w as u32, h as u32];
-    let part = image::imageops::crop_imm(before, x0, y0, wide, high).to_image();
-    let was: Vec<bool> = resample::nearest(&part, small).as_raw().iter().map(|v| *v != 0).collect();
+    let was = labels(before, window, small);
     let scale = w as f64 / f64::from(wide);
     let own = [(x - f64::from(x0)) * scale, (y - f64::from(y0)) * scale];
     let far = |i: usize| f64::hypot((i % w) as f64 + 0.5 - own[0], (i / w) as f64 + 0.5 - own[1]);

@@ -29,6 +29,7 @@ use crate::sentence::one_line;
 use crate::signal::Signal;
 use crate::train::checkpoint::Fingerprint;
 
+use click::{Cues, Mark};
 use fit::Fit;
 use network::Inpainting;
 use poses::Capture;
@@ -152,6 +153,45 @@ pub enum Evidence {
     Box([u32; 4]),
     /// A picture of strokes: white or green on the object, black or red beside it, transparent or grey elsewhere.
     Strokes(PathBuf),
+    /// A rough line around it, which closes itself: x and y of its corners, in pixels of the photograph.
+    Lasso(Vec<[u32; 2]>),
+    /// A pixel of it.
+    Click([u32; 2]),
+    /// A pixel that is none of it.
+    Not([u32; 2]),
+}
+
+impl Evidence {
+    /// The option that says so.
+    fn option(&self) -> &'static str {
+        match self {
+            Self::Mask(_) => "--mask",
+            Self::Box(_) => "--box",
+            Self::Strokes(_) => "--strokes",
+            Self::Lasso(_) => "--lasso",
+            Self::Click(_) => "--click",
+            Self::Not(_) => "--not",
+        }
+    }
+
+    /// A mark of the page in a photograph of this size, which counts together with the others of its view; nothing for what
+    /// is a mask by itself.
+    fn mark(&self, size: [u32; 2], beside_marks: bool) -> Option<Mark> {
+        // The middle of a pixel.
+        let at =
+            |[x, y]: [u32; 2]| [(f64::from(x) + 0.5) / f64::from(size[0]), (f64::from(y) + 0.5) / f64::from(size[1])];
+        match self {
+            Self::Box([x0, y0, x1, y1]) if beside_marks => {
+                let corner = |x: u32, y: u32| [f64::from(x) / f64::from(size[0]), f64::from(y) / f64::from(size[1])];
+                let [[x0, y0], [x1, y1]] = [corner(*x0, *y0), corner(*x1, *y1)];
+                Some(Mark::Box { bounds: [x0, y0, x1, y1] })
+            }
+            Self::Lasso(points) => Some(Mark::Lasso { points: points.iter().map(|point| at(*point)).collect() }),
+            Self::Click(point) => Some(Mark::Object { at: at(*point), scale: 0 }),
+            Self::Not(point) => Some(Mark::Background { at: at(*point) }),
+            Self::Mask(_) | Self::Strokes(_) | Self::Box(_) => None,
+        }
+    }
 }
 
 /// What to make of which photographs.
@@ -286,8 +326,8 @@ fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(
     object.extend(corrected(&folder, &capture, &object)?);
     if object.is_empty() && request.wants(Step::Masks) && request.only.is_empty() {
         return Err(Error::Request(
-            "what is to be removed? name one view and its mask, --mask NAME=FILE.png, or a box around the object, --box \
-             NAME=x0,y0,x1,y1"
+            "what is to be removed? name one view and its mask, --mask NAME=FILE.png, a box around the object, --box \
+             NAME=x0,y0,x1,y1, or a pixel of it, --click NAME=x,y"
                 .into(),
         ));
     }
@@ -388,16 +428,20 @@ fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>
     };
     for (name, evidence) in &request.object {
         let stem = scene::stem(name).to_owned();
-        let option = match evidence {
-            Evidence::Mask(_) => "--mask",
-            Evidence::Box(_) => "--box",
-            Evidence::Strokes(_) => "--strokes",
-        };
+        let option = evidence.option();
         let Some(photograph) = capture.photographs.get(&stem) else {
             return Err(no_such_view(name, option, capture.photographs.keys().map(String::as_str)));
         };
         let size = picture_size(photograph)?;
+        let is_mark = |other: &Evidence| matches!(other, Evidence::Lasso(_) | Evidence::Click(_) | Evidence::Not(_));
+        let marked = on(&stem, &is_mark).is_some();
+        if all.contains_key(&stem) && marked && evidence.mark(size, true).is_some() {
+            // They were taken together.
+            continue;
+        }
         let given = match evidence {
+            Evidence::Lasso(_) | Evidence::Click(_) | Evidence::Not(_) => of_marks(request, &stem, photograph, size)?,
+            Evidence::Box(_) if marked => of_marks(request, &stem, photograph, size)?,
             Evidence::Mask(path) => {
                 let mask = checked(path, read_mask(path, size)?, size, false)?;
                 Given { mask, from: format!("--mask {}", path.display()) }
@@ -454,6 +498,46 @@ fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>
         all.insert(stem, Given { mask, ..given });
     }
     Ok(all)
+}
+
+/// The mask of all marks in one view: boxes and lassos first, then the clicks on the object, then those beside it.
+fn of_marks(request: &Request, stem: &str, photograph: &Path, size: [u32; 2]) -> Result<Given, Error> {
+    let rank = |evidence: &Evidence| match evidence {
+        Evidence::Box(_) | Evidence::Lasso(_) => 0,
+        Evidence::Not(_) => 2,
+        _ => 1,
+    };
+    let mut own: Vec<&Evidence> =
+        request.object.iter().filter(|(name, _)| scene::stem(name) == stem).map(|(_, evidence)| evidence).collect();
+    own.sort_by_key(|evidence| rank(evidence));
+    let mut marks = vec![];
+    for evidence in own {
+        let Some(mark) = evidence.mark(size, true) else {
+            let (option, clicks) = (evidence.option(), "--lasso, --click and --not");
+            return Err(Error::Request(format!(
+                "{option} {stem}: does not go with {clicks} of the same view; give one of them"
+            )));
+        };
+        if !mark.is_sound() {
+            return Err(Error::Request(format!(
+                "{} {stem}: not within the photograph, which is {}x{}, or with nothing in it",
+                evidence.option(),
+                size[0],
+                size[1]
+            )));
+        }
+        marks.push(mark);
+    }
+    let picture = resample::photograph(&scene::photograph(photograph, 1)?, click::working(size));
+    let mask = click::mask(&picture, &marks, &Cues::default());
+    if mask.as_raw().iter().all(|v| *v == 0) {
+        return Err(Error::Request(format!(
+            "--not {stem}: says nothing without a --click, --lasso or --box in the same view; say where the object is"
+        )));
+    }
+    let own = [mask.width(), mask.height()];
+    let mask = masks::threshold(&masks::parts(&mask, own), own, size, 0.5);
+    Ok(Given { mask, from: format!("{} marks", marks.len()) })
 }
 
 /// Masks in the scene's folder that are not the program's own: the user has put or corrected them there.

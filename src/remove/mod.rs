@@ -18,15 +18,13 @@ use std::time::Duration;
 use image::{GrayImage, RgbImage};
 use serde::Serialize;
 
-use crate::prepare::click::{self, Cues, Mark};
+use crate::prepare::click::{self, Cues, Mark, working};
 use crate::prepare::depth::DepthMap;
 use crate::prepare::masks::{self, Carried};
 use crate::scene::{self, resample};
 use crate::view::live::Board;
 use crate::view::server::{Refusal, Resource};
 
-/// The longer side of the pictures that are marked, pixels.
-const SIDE: u32 = 1024;
 /// Marks of a view at most.
 const MOST_MARKS: usize = 400;
 /// Masks of a view that are kept for a step back.
@@ -70,12 +68,15 @@ struct View {
     marks: Vec<Mark>,
     origin: Origin,
     mask: Option<Arc<GrayImage>>,
+    /// The part of the photograph that the mask covers.
+    share: f64,
     /// Counts what was said of this view.
     version: u64,
     /// The version that the mask is of.
     drawn: u64,
-    /// Masks of marks, the latest last, and whether the depth was known to them: what one more mark begins with.
-    made: Vec<(Vec<Mark>, bool, Arc<GrayImage>)>,
+    /// Masks of marks, the latest last, and whether the depth was known to them: what one more mark begins with. One that was on
+    /// disk counts as it is.
+    made: Vec<(Vec<Mark>, Option<bool>, Arc<GrayImage>)>,
     carried: Option<Arc<Shown>>,
 }
 
@@ -84,6 +85,7 @@ struct Shown {
     parts: Vec<f32>,
     size: [u32; 2],
     mask: GrayImage,
+    share: f64,
     doubt: f64,
     /// The revision of the masks that it was carried from.
     revision: u64,
@@ -118,6 +120,8 @@ struct State {
     /// Counts changes of masks.
     revision: u64,
     views: Vec<View>,
+    /// What the page is told of the views; nothing where that has changed since.
+    said: Option<Arc<site::Views>>,
     phase: Phase,
     part: Option<Part>,
     /// Whether the fit is there.
@@ -143,14 +147,13 @@ pub enum Wish {
 /// The results of the work.
 #[derive(Default)]
 struct Results {
-    page: Vec<Resource>,
+    page: Vec<Arc<Resource>>,
     files: Vec<(String, PathBuf)>,
 }
 
 /// The state that the page and the worker share.
 pub struct Session {
     title: String,
-    token: String,
     folder: PathBuf,
     photos: Vec<Photo>,
     numbers: BTreeMap<String, usize>,
@@ -159,6 +162,8 @@ pub struct Session {
     depths: RwLock<BTreeMap<usize, Arc<DepthMap>>>,
     /// One mask is cut at a time, and its files are written.
     cutting: Mutex<()>,
+    /// One photograph is decoded at a time.
+    decoding: Mutex<()>,
     thumbs: Vec<OnceLock<Vec<u8>>>,
     pictures: Mutex<VecDeque<(usize, Arc<RgbImage>)>>,
     live: RwLock<Option<Arc<Board>>>,
@@ -175,15 +180,6 @@ fn read<T>(lock: &RwLock<T>) -> std::sync::RwLockReadGuard<'_, T> {
 
 fn write<T>(lock: &RwLock<T>) -> std::sync::RwLockWriteGuard<'_, T> {
     lock.write().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// A size with the longer side at most [`SIDE`].
-fn working(size: [u32; 2]) -> [u32; 2] {
-    let longest = size[0].max(size[1]).max(1);
-    if longest <= SIDE {
-        return size;
-    }
-    size.map(|n| (u64::from(n) * u64::from(SIDE) / u64::from(longest)).max(1) as u32)
 }
 
 impl Session {
@@ -210,14 +206,18 @@ impl Session {
             if let Some((marks, mask)) = kept.or(own) {
                 view.origin = if marks.is_empty() { Origin::File } else { Origin::Marks };
                 view.marks = marks;
-                view.mask = Some(Arc::new(resample::nearest(&mask, working(photo.size))));
+                let mask = Arc::new(resample::nearest(&mask, working(photo.size)));
+                view.share = share(&mask);
+                if !view.marks.is_empty() {
+                    view.made.push((view.marks.clone(), None, mask.clone()));
+                }
+                view.mask = Some(mask);
             }
             state.views.push(view);
         }
         let numbers = photos.iter().enumerate().map(|(i, photo)| (photo.name.clone(), i)).collect();
         Ok(Arc::new(Self {
             title: title.to_owned(),
-            token: token(),
             folder: folder.to_owned(),
             numbers,
             thumbs: photos.iter().map(|_| OnceLock::new()).collect(),
@@ -226,6 +226,7 @@ impl Session {
             changed: Condvar::new(),
             depths: RwLock::default(),
             cutting: Mutex::default(),
+            decoding: Mutex::default(),
             pictures: Mutex::default(),
             live: RwLock::default(),
             results: RwLock::default(),
@@ -254,6 +255,11 @@ impl Session {
     /// A file that cannot be read.
     pub fn picture(&self, number: usize) -> Result<Arc<RgbImage>, scene::Error> {
         let kept = || self.pictures.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, picture)) = kept().iter().find(|(of, _)| *of == number) {
+            return Ok(picture.clone());
+        }
+        // Large photographs are decoded one at a time.
+        let _turn = self.decoding.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((_, picture)) = kept().iter().find(|(of, _)| *of == number) {
             return Ok(picture.clone());
         }
@@ -289,73 +295,99 @@ impl Session {
         }
     }
 
-    /// Makes the mask of a view of these marks, or of those that it has.
+    /// Makes the mask of a view of these marks, or of those that it has. Marks and mask change together, or not at all.
     fn cut(&self, number: usize, marks: Option<Vec<Mark>>) -> Result<u64, Refused> {
-        let working = || (Refusal::Conflict, "the object is being removed; stop that first to change it".to_owned());
-        let (version, marks) = {
+        let version = {
             let mut state = self.lock();
             if state.phase == Phase::Working {
-                return Err(working());
+                return Err((Refusal::Conflict, "the object is being removed; stop that first to change it".into()));
             }
-            let view = &mut state.views[number];
-            view.version += 1;
-            view.marks = marks.unwrap_or_else(|| view.marks.clone());
-            (view.version, view.marks.clone())
+            state.said = None;
+            state.views[number].version += 1;
+            state.views[number].version
         };
+        // The object is not removed meanwhile: that waits for its turn, too.
         let _turn = self.cutting.lock().unwrap_or_else(PoisonError::into_inner);
-        let (carried, made) = {
+        let (view, revision) = {
             let state = self.lock();
-            // Somebody was faster: the last one wins.
-            if state.views[number].version != version {
-                return Ok(state.revision);
-            }
-            (state.views[number].carried.clone(), state.views[number].made.clone())
+            (state.views[number].clone(), state.revision)
         };
+        // Somebody was faster: the last one wins.
+        if view.version != version {
+            return Ok(revision);
+        }
         let depth = read(&self.depths).get(&number).cloned();
+        let marks = marks.unwrap_or_else(|| view.marks.clone());
+        let made = self.made(number, &view, &marks, depth.as_deref());
+        let mut state = self.lock();
+        state.said = None;
+        // A later one goes on with what was there before.
+        let drawn = state.views[number].version == version;
+        let own = &mut state.views[number];
+        match made {
+            Ok(mask) => {
+                own.origin = if mask.is_some() { Origin::Marks } else { Origin::None };
+                if let Some(mask) = &mask {
+                    own.share = share(mask);
+                    own.made.retain(|(other, ..)| *other != marks);
+                    own.made.push((marks.clone(), Some(depth.is_some()), mask.clone()));
+                    let many = own.made.len().saturating_sub(KEPT_MASKS);
+                    own.made.drain(..many);
+                }
+                (own.marks, own.mask) = (marks, mask);
+                own.drawn = version;
+                state.revision += 1;
+                state.error = None;
+                self.changed.notify_all();
+                Ok(state.revision)
+            }
+            Err(refused) => {
+                if drawn {
+                    own.drawn = version;
+                }
+                Err(refused)
+            }
+        }
+    }
+
+    /// The mask that marks make of a view, on disk as well. Where that fails, what was on disk stays or is put back.
+    fn made(
+        &self,
+        number: usize,
+        view: &View,
+        marks: &[Mark],
+        depth: Option<&DepthMap>,
+    ) -> Result<Option<Arc<GrayImage>>, Refused> {
         let mask = if marks.is_empty() {
             None
         } else {
             let picture = self.picture(number).map_err(|error| (Refusal::Busy, error.to_string()))?;
-            let cues = Cues {
-                depth: depth.as_deref(),
-                carried: carried.as_ref().map(|shown| (shown.parts.as_slice(), shown.size)),
-            };
+            let carried = view.carried.as_ref().map(|shown| (shown.parts.as_slice(), shown.size));
+            let cues = Cues { depth, carried };
             // From the longest beginning of the marks that was made already.
-            let begun = made.iter().filter(|(own, with, _)| *with == depth.is_some() && marks.starts_with(own));
+            let fits = |with: &Option<bool>| with.is_none_or(|with| with == depth.is_some());
+            let begun = view.made.iter().filter(|(own, with, _)| fits(with) && marks.starts_with(own));
             Some(match begun.max_by_key(|(own, ..)| own.len()) {
                 Some((own, _, mask)) => (own.len() + 1..=marks.len()).fold(mask.clone(), |before, count| {
                     Arc::new(click::next(&picture, &marks[..count], &before, &cues))
                 }),
-                None => Arc::new(click::mask(&picture, &marks, &cues)),
+                None => Arc::new(click::mask(&picture, marks, &cues)),
             })
         };
-        let mut state = self.lock();
-        if state.phase == Phase::Working {
-            return Err(working());
-        }
-        if state.views[number].version == version {
-            let Photo { name, size, .. } = &self.photos[number];
-            objects::write(&self.folder, name, *size, &marks, mask.as_deref())
-                .map_err(|error| (Refusal::Busy, format!("{}: cannot be written: {error}", self.folder.display())))?;
-            state.revision += 1;
-            state.error = None;
-            let view = &mut state.views[number];
-            view.origin = if mask.is_some() { Origin::Marks } else { Origin::None };
-            if let Some(mask) = &mask {
-                view.made.retain(|(own, ..)| *own != marks);
-                view.made.push((marks, depth.is_some(), mask.clone()));
-                let many = view.made.len().saturating_sub(KEPT_MASKS);
-                view.made.drain(..many);
+        let Photo { name, size, .. } = &self.photos[number];
+        if let Err(error) = objects::write(&self.folder, name, *size, marks, mask.as_deref()) {
+            if view.origin == Origin::Marks {
+                // The mask may have been written and its marks not. The error that is told is the first one.
+                let _ = objects::write(&self.folder, name, *size, &view.marks, view.mask.as_deref());
             }
-            (view.mask, view.drawn) = (mask, version);
-            self.changed.notify_all();
+            return Err((Refusal::Busy, format!("{}: cannot be written: {error}", self.folder.display())));
         }
-        Ok(state.revision)
+        Ok(mask)
     }
 
     /// Whether some view has a mask of something.
     fn has_object(state: &State) -> bool {
-        state.views.iter().filter_map(|view| view.mask.as_ref()).any(|mask| mask.as_raw().iter().any(|v| *v != 0))
+        state.views.iter().any(|view| view.mask.is_some() && view.share > 0.0)
     }
 
     /// Asks for the object to be removed, also in spite of what was found.
@@ -366,7 +398,7 @@ impl Session {
         let _turn = self.cutting.lock().unwrap_or_else(PoisonError::into_inner);
         let mut state = self.lock();
         if !Self::has_object(&state) {
-            return Err((Refusal::Conflict, "nothing is marked yet; click on what is to be removed".into()));
+            return Err((Refusal::Conflict, "nothing is marked yet; draw around what is to be removed".into()));
         }
         if state.phase == Phase::Working {
             return Err((Refusal::Conflict, "the object is being removed already".into()));
@@ -448,7 +480,7 @@ impl Session {
 
     /// The object is gone: the page that shows it, and the files to take away.
     pub fn done(&self, page: Vec<Resource>, files: Vec<(String, PathBuf)>) {
-        *write(&self.results) = Results { page, files };
+        *write(&self.results) = Results { page: page.into_iter().map(Arc::new).collect(), files };
         let mut state = self.lock();
         (state.phase, state.part) = (Phase::Done, None);
     }
@@ -468,11 +500,13 @@ impl Session {
         let mask = masks::threshold(&carried.object, size, working(self.photos[number].size), masks::OBJECT);
         let doubt = carried.thinness().unwrap_or(0.0);
         let mask = masks::without_specks(&mask, SPECK);
+        let share = share(&mask);
         let mut state = self.lock();
         if state.revision != revision || state.phase == Phase::Working {
             return false;
         }
-        let shown = Shown { parts: carried.object, size, mask, doubt, revision };
+        let shown = Shown { parts: carried.object, size, mask, share, doubt, revision };
+        state.said = None;
         state.views[number].carried = Some(Arc::new(shown));
         true
     }
@@ -482,6 +516,7 @@ impl Session {
         let mut state = self.lock();
         state.carried = revision;
         if state.revision == revision && !Self::has_object(&state) {
+            state.said = None;
             state.views.iter_mut().for_each(|view| view.carried = None);
         }
     }
@@ -509,10 +544,9 @@ impl Session {
     }
 }
 
-/// 128 random bits as hexadecimal digits.
-fn token() -> String {
-    use rand::RngExt as _;
-    format!("{:032x}", rand::rng().random::<u128>())
+/// The part of a mask's pixels that are the object.
+fn share(mask: &GrayImage) -> f64 {
+    mask.as_raw().iter().filter(|v| **v != 0).count() as f64 / mask.as_raw().len().max(1) as f64
 }
 
 #[cfg(test)]

@@ -1,8 +1,8 @@
 'use strict';
 const $ = (id) => document.getElementById(id);
 const touch = matchMedia('(pointer: coarse)').matches;
+const click = touch ? 'tap' : 'click';
 const much = touch ? 'with “Not object” on what is too much' : 'with Shift on what is too much';
-const token = document.querySelector('meta[name=token]').content;
 const stage = $('stage');
 const PARTS = {
   poses: 'Finding out where the photographs were taken from',
@@ -23,7 +23,7 @@ const waiting = new Map(), sending = new Set();
 // Marks of a view before and after each change.
 let past = [], future = [];
 // The photograph's place on the stage: zoom is 1 when all of it is shown.
-let zoom = 1, shift = [0, 0], cross, corner, changing = false;
+let zoom = 1, shift = [0, 0], cross, corner, corners = [], changing = false;
 
 const view = (name = current) => state?.views.find((v) => v.name === name);
 const marksOf = (name = current) => waiting.get(name) ?? view(name)?.marks ?? [];
@@ -36,7 +36,7 @@ const url = (path, name, more = '') => `${path}?view=${encodeURIComponent(name)}
 
 async function post(path, body) {
   const answer = await fetch(path, {
-    method: 'POST', headers: { 'Content-Type': 'application/json', 'X-Token': token }, body: JSON.stringify(body),
+    method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify(body),
   });
   if (!answer.ok) throw new Error((await answer.text()).trim());
   take(await answer.json());
@@ -56,7 +56,12 @@ async function send(name) {
       await post('api/marks', { view: name, marks });
       say('');
     } catch (error) {
-      say(`This could not be marked: ${error.message}`);
+      // What was marked before counts, here as well.
+      say(`This could not be marked, and nothing was changed: ${error.message}`);
+      past = past.filter((change) => change[2] !== marks);
+      try {
+        take(await (await fetch('api/state')).json());
+      } catch { /* The next poll says so. */ }
     }
     if (waiting.get(name) === marks) waiting.delete(name);
   }
@@ -76,6 +81,14 @@ function mark(marks, name = current, remember = true) {
 }
 
 const add = (one) => mark([...marksOf(), one]);
+
+// The last click on the object takes a larger or smaller part.
+function resize(by) {
+  const marks = marksOf(), last = marks.at(-1);
+  if (last?.kind !== 'object') return;
+  const scale = Math.min(30, Math.max(-30, (last.scale ?? 0) + by));
+  mark([...marks.slice(0, -1), scale ? { ...last, scale } : { kind: 'object', at: last.at }]);
+}
 
 function undo() {
   const change = past.pop();
@@ -138,6 +151,54 @@ function lay(element, [x0, y0, x1, y1]) {
 }
 
 const mode = () => document.querySelector('input[name=mode]:checked').value;
+const HINTS = {
+  lasso: 'Lasso: drag a rough line around the object. Good for any shape.',
+  box: 'Box: drag from corner to corner, closely around the object. Good for what is upright.',
+  object: `Object: ${click} on the object, or on what is missing of it. Part − and Part + step from a part to the whole.`,
+  background: `Not object: ${click} on what was taken and is not the object.`,
+  brush: 'Brush: paint what is missing. It counts exactly as it is painted.',
+  erase: 'Erase: paint over what is too much. It counts exactly as it is painted.',
+};
+// Half of the brush's width, of the photograph's longer side.
+const radius = () => 0.0015 * Math.exp(Number($('radius').value) * 0.04);
+const round = (p) => p.map((v) => Math.round(v * 1e4) / 1e4);
+
+// A line of so many corners at most, none nearer to the next than is seen.
+function thinned(points, most = 200) {
+  const kept = points.filter((p, i) => i === 0 || i === points.length - 1 || Math.hypot(p[0] - points[i - 1][0], p[1] - points[i - 1][1]) > 0);
+  const every = Math.ceil(kept.length / most);
+  return kept.filter((_, i) => i % every === 0 || i === kept.length - 1).map(round);
+}
+
+function line(points, kind) {
+  const path = document.createElementNS('http://www.w3.org/2000/svg', 'path');
+  const shut = kind === 'lasso' ? 'Z' : points.length === 1 ? `L${points[0].join(' ')}` : '';
+  path.setAttribute('d', `M${points.map((p) => p.join(' ')).join('L')}${shut}`);
+  path.setAttribute('class', kind);
+  if (kind !== 'lasso') {
+    const [w, h] = view().size;
+    path.style.strokeWidth = `${2 * radius() * $('picture').getBoundingClientRect().width * Math.max(1, h / w)}px`;
+  }
+  return path;
+}
+
+// What is being drawn.
+function sketch(points, kind) {
+  $('lines').querySelector('.sketch')?.remove();
+  if (!points?.length) return;
+  const path = line(points, kind);
+  path.classList.add('sketch');
+  $('lines').append(path);
+}
+
+function ring(event) {
+  const paints = ['brush', 'erase'].includes(mode()) && event && event.pointerType !== 'touch' && state?.phase === 'choosing';
+  $('ring').hidden = !paints;
+  if (!paints) return;
+  const [w, h] = view().size, [x, y] = at(event);
+  const [rx, ry] = [radius() * Math.max(1, h / w), radius() * Math.max(1, w / h)];
+  lay($('ring'), [x - rx, y - ry, x + rx, y + ry]);
+}
 const pointers = new Map();
 let drag, pinch;
 
@@ -149,15 +210,19 @@ stage.addEventListener('pointerdown', (e) => {
   if (pointers.size === 2) {
     drag = undefined;
     $('rubber').hidden = true;
+    sketch();
     const [a, b] = [...pointers.values()];
     pinch = { far: Math.hypot(a[0] - b[0], a[1] - b[1]), middle: [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2] };
   } else if (pointers.size === 1) {
-    const pans = e.button === 1 || (e.pointerType === 'touch' && mode() !== 'box');
-    drag = { from: at(e), start: [e.clientX, e.clientY], last: [e.clientX, e.clientY], pans, other: e.button === 2 || e.shiftKey, moved: false };
+    const clicks = ['object', 'background'].includes(mode());
+    const pans = e.button === 1 || (e.pointerType === 'touch' && clicks);
+    const kind = clicks ? 'box' : mode();
+    drag = { kind, from: at(e), points: [clip(at(e))], start: [e.clientX, e.clientY], last: [e.clientX, e.clientY], pans, other: e.button === 2 || e.shiftKey, moved: false };
   }
   e.preventDefault();
 });
 stage.addEventListener('pointermove', (e) => {
+  ring(e);
   if (!pointers.has(e.pointerId)) return;
   pointers.set(e.pointerId, [e.clientX, e.clientY]);
   if (pinch && pointers.size === 2) {
@@ -177,11 +242,15 @@ stage.addEventListener('pointermove', (e) => {
     shift = [shift[0] + e.clientX - drag.last[0], shift[1] + e.clientY - drag.last[1]];
     drag.last = [e.clientX, e.clientY];
     place();
-  } else {
+  } else if (drag.kind === 'box') {
     $('rubber').hidden = false;
     lay($('rubber'), bounds(clip(drag.from), clip(at(e))));
+  } else {
+    drag.points.push(clip(at(e)));
+    sketch(drag.points, drag.kind);
   }
 });
+stage.addEventListener('pointerleave', () => ring());
 function lifted(e, counts) {
   pointers.delete(e.pointerId);
   if (pinch) {
@@ -191,20 +260,38 @@ function lifted(e, counts) {
   const done = drag;
   drag = undefined;
   $('rubber').hidden = true;
+  sketch();
   if (!done || !counts) return;
-  if (done.moved && !done.pans) {
-    const box = bounds(clip(done.from), clip(at(e)));
-    if (large(box)) add({ kind: 'box', bounds: box });
-  } else if (!done.moved && within(done.from) && e.button !== 1) {
+  const paints = ['brush', 'erase'].includes(done.kind) && e.button !== 1;
+  if (paints && within(done.from)) stroke(done.kind, done.points);
+  else if (done.moved && !done.pans && done.kind === 'box') enclose('box', [done.from, at(e)]);
+  else if (done.moved && !done.pans && done.kind === 'lasso') enclose('lasso', done.points);
+  else if (!done.moved && within(done.from) && e.button !== 1) {
     const not = (mode() === 'background') !== done.other;
     add({ kind: not ? 'background' : 'object', at: done.from });
   }
+}
+
+function stroke(kind, points) {
+  add({ kind: 'brush', object: kind === 'brush', radius: Math.round(radius() * 1e5) / 1e5, points: thinned(points) });
+}
+
+// What has no inside is nothing.
+function enclose(kind, points) {
+  const [x, y] = [0, 1].map((i) => points.map((p) => Math.min(1, Math.max(0, p[i]))));
+  const around = [Math.min(...x), Math.min(...y), Math.max(...x), Math.max(...y)];
+  if (!large(around)) return;
+  add(kind === 'box' ? { kind, bounds: around } : { kind, points: thinned(points) });
 }
 stage.addEventListener('pointerup', (e) => lifted(e, true));
 stage.addEventListener('pointercancel', (e) => lifted(e, false));
 stage.addEventListener('contextmenu', (e) => e.preventDefault());
 stage.addEventListener('wheel', (e) => {
   e.preventDefault();
+  if (e.altKey) {
+    resize(e.deltaY < 0 ? 1 : -1);
+    return;
+  }
   const box = stage.getBoundingClientRect();
   magnify(Math.exp(-e.deltaY * 0.0015), e.clientX - box.left, e.clientY - box.top);
 }, { passive: false });
@@ -217,6 +304,7 @@ function crosshair() {
   if (!cross) return;
   $('cross').style.left = `${100 * cross[0]}%`;
   $('cross').style.top = `${100 * cross[1]}%`;
+  sketch(corners.length ? [...corners, cross] : undefined, 'lasso');
   $('rubber').hidden = !corner;
   if (corner) lay($('rubber'), bounds(corner, cross));
 }
@@ -237,16 +325,23 @@ addEventListener('keydown', (e) => {
   else if (arrows && e.shiftKey) {
     const [w, h] = view().size;
     const far = (e.altKey ? 0.002 : 0.02) * Math.max(w, h);
-    cross = clip((cross ?? [0.5, 0.5]).map((v, i) => v + arrows[i] * far / (i ? h : w)));
+    cross = clip(cross ? cross.map((v, i) => v + arrows[i] * far / (i ? h : w)) : [0.5, 0.5]);
     crosshair();
   } else if (arrows && arrows[0]) step(arrows[0]);
   else if (e.key === 'Enter' && cross && !onButton && document.activeElement === stage) add({ kind: e.shiftKey ? 'background' : 'object', at: cross });
   else if ((e.key === 'Backspace' || e.key === 'Delete') && cross) add({ kind: 'background', at: cross });
   else if (e.key.toLowerCase() === 'b' && cross) {
-    if (corner && large(bounds(corner, cross))) add({ kind: 'box', bounds: bounds(corner, cross) });
+    if (corner) enclose('box', [corner, cross]);
     corner = corner ? undefined : cross;
     crosshair();
-  } else if (e.key === 'Escape') { cross = corner = undefined; $('rubber').hidden = true; crosshair(); }
+  } else if (e.key.toLowerCase() === 'l' && cross) {
+    if (e.shiftKey && corners.length > 1) enclose('lasso', [...corners, cross]);
+    corners = e.shiftKey ? [] : [...corners, cross];
+    crosshair();
+  } else if (e.key.toLowerCase() === 'p' && cross) stroke(e.shiftKey ? 'erase' : 'brush', [cross]);
+  else if (e.key === '[' || e.key === ']') $('radius').value = Number($('radius').value) + (e.key === ']' ? 5 : -5);
+  else if (e.key === 'PageUp' || e.key === 'PageDown') resize(e.key === 'PageUp' ? 1 : -1);
+  else if (e.key === 'Escape') { cross = corner = drag = undefined; corners = []; $('rubber').hidden = true; crosshair(); }
   else if (e.key === '+' || e.key === '=') magnify(1.4);
   else if (e.key === '-') magnify(1 / 1.4);
   else if (e.key === '0') { zoom = 1; place(); }
@@ -254,6 +349,9 @@ addEventListener('keydown', (e) => {
   e.preventDefault();
 });
 
+$('less').onclick = () => resize(-1);
+$('more').onclick = () => resize(1);
+for (const input of document.querySelectorAll('input[name=mode]')) input.onchange = () => { ring(); draw(); };
 $('undo').onclick = undo;
 $('redo').onclick = redo;
 $('clear').onclick = () => marksOf().length || view()?.origin === 'file' ? mark([]) : undefined;
@@ -312,6 +410,7 @@ function show(name, focus) {
     current = name;
     zoom = 1;
     cross = corner = undefined;
+    corners = [];
     crosshair();
     $('photo').src = url('photo.jpg', name);
     $('photo').alt = `Photograph ${name}`;
@@ -354,7 +453,10 @@ function draw() {
   if (v) {
     const key = v.overlay ? `${v.name} ${v.overlay}` : '';
     overlay($('overlay'), url('overlay.png', v.name, `&v=${v.overlay}`), working ? '' : key);
-    $('marks').replaceChildren(...(working ? [] : marksOf()).map((m) => {
+    const shown = working ? [] : marksOf();
+    const sketched = $('lines').querySelector('.sketch');
+    $('lines').replaceChildren(...shown.filter((m) => m.kind === 'lasso').map((m) => line(m.points, 'lasso')), ...(sketched ? [sketched] : []));
+    $('marks').replaceChildren(...shown.filter((m) => m.at || m.bounds).map((m) => {
       const element = document.createElement(m.kind === 'box' ? 'b' : 'i');
       if (m.kind === 'box') lay(element, m.bounds);
       else {
@@ -365,6 +467,10 @@ function draw() {
       return element;
     }));
   }
+  $('width').hidden = !['brush', 'erase'].includes(mode());
+  $('scale').hidden = !$('width').hidden;
+  $('less').disabled = $('more').disabled = marksOf().at(-1)?.kind !== 'object';
+  $('hint').textContent = HINTS[mode()];
   $('undo').disabled = !past.length && !marksOf().length;
   $('redo').disabled = !future.length;
   $('clear').disabled = !marksOf().length && v?.origin !== 'file';
@@ -374,12 +480,12 @@ function draw() {
   const advice = working ? 'You can leave this page open or close it: the work goes on, and this page finds it again.'
     : done ? 'Look around: drag turns, the wheel goes nearer, the slider shows the photograph.'
     : state.problems.length ? 'Something speaks against going on. Mend what is named, or go on anyway.'
-    : empty ? 'Nothing was found there. Click in the middle of the object, or draw a box around it.'
-    : !marked ? 'Click on what is to be removed. Drag a box around it if that is easier.'
-    : !state.ready ? `Click again where the outline is wrong: on what is missing, or ${much}. Soon the object will be looked for in the other photographs as well.`
+    : empty ? `Nothing was found there. Draw a line around the object, or ${click} in the middle of it.`
+    : !marked ? `What is to be removed? Draw a rough line around it, or ${click} on it.`
+    : !state.ready ? `Where the outline is wrong, ${click} on what is missing, or ${much}, or paint it. Soon the object will be looked for in the other photographs as well.`
     : state.carrying ? 'The object is being looked for in the other photographs.'
-    : state.next ? `${percent(state.doubt)} of the object in ${state.next} is not known from what is marked so far. Click on it there, too.`
-    : `Look through the photographs. Where an outline is wrong, click on what is missing, or ${much}.`;
+    : state.next ? `${percent(state.doubt)} of the object in ${state.next} is not known from what is marked so far. Draw around it there, too.`
+    : `Look through the photographs. Where an outline is wrong, ${click} on what is missing, or ${much}, or paint it.`;
   $('advice').textContent = advice;
   $('next').hidden = working || done || !state.next || state.carrying || state.next === current;
   $('next').textContent = `Show ${state.next}`;

@@ -1,17 +1,18 @@
 //! The page over HTTP: what is asked for, and what is said.
 
-use std::borrow::Cow;
+use std::fs::File;
 use std::io::Cursor;
+use std::sync::{Arc, PoisonError};
 
 use image::codecs::jpeg::JpegEncoder;
 use image::{GrayImage, ImageFormat, Rgba, RgbaImage};
 use serde::Deserialize;
 use serde_json::json;
 
-use super::{Origin, Phase, Refused, Session, THIN, View, read};
+use super::{Origin, Phase, Photo, Refused, Session, THIN, View, read};
 use crate::prepare::click::Mark;
 use crate::scene::{self, resample};
-use crate::view::server::{Answer, Refusal, Site};
+use crate::view::server::{Answer, Body, Refusal, Resource, Site};
 
 const PAGE: &str = include_str!("page.html");
 const STYLE: &str = include_str!("page.css");
@@ -39,15 +40,11 @@ struct Removed {
 }
 
 fn text(kind: &'static str, text: &'static str) -> Answer<'static> {
-    Answer { kind, gzip: false, bytes: Cow::Borrowed(text.as_bytes()) }
+    Answer { kind, gzip: false, bytes: Body::Borrowed(text.as_bytes()) }
 }
 
 fn owned(kind: &'static str, bytes: Vec<u8>) -> Answer<'static> {
-    Answer { kind, gzip: false, bytes: Cow::Owned(bytes) }
-}
-
-fn answer(value: &serde_json::Value) -> Answer<'static> {
-    owned("application/json", value.to_string().into_bytes())
+    Answer { kind, gzip: false, bytes: Body::Owned(bytes) }
 }
 
 /// The value of a field of a query, its escapes undone; nothing where it is not there or is no text.
@@ -103,6 +100,44 @@ impl View {
             (None, None) => None,
         }
     }
+
+    /// As the page reads it.
+    fn status(&self, photo: &Photo) -> serde_json::Value {
+        let carried = self.carried.as_ref().filter(|_| self.mask.is_none());
+        let shown = self.mask.is_some() || carried.is_some();
+        json!({
+            "name": photo.name, "size": photo.size, "marks": self.marks, "origin": self.origin,
+            "busy": self.version != self.drawn,
+            // Changes with the overlay.
+            "overlay": shown.then(|| format!("{}-{}", self.drawn, carried.map_or(0, |c| c.revision))),
+            "doubt": carried.map(|c| c.doubt), "share": shown.then(|| carried.map_or(self.share, |c| c.share)),
+        })
+    }
+}
+
+/// What the page is told of the views.
+pub(super) struct Views {
+    /// JSON of all of them.
+    text: String,
+    /// How many have a mask of their own.
+    marked: usize,
+    /// The one that is worth a look most, and how much of the object is not known there.
+    next: Option<(f64, String)>,
+}
+
+impl Views {
+    fn of(photos: &[Photo], views: &[View]) -> Self {
+        let all: Vec<_> = photos.iter().zip(views).map(|(photo, view)| view.status(photo)).collect();
+        let unsure = |(photo, view): (&Photo, &View)| {
+            let carried = view.carried.as_ref().filter(|carried| view.mask.is_none() && carried.doubt > THIN)?;
+            Some((carried.doubt, photo.name.clone()))
+        };
+        Self {
+            text: serde_json::Value::from(all).to_string(),
+            marked: views.iter().filter(|view| view.origin != Origin::None).count(),
+            next: photos.iter().zip(views).filter_map(unsure).max_by(|a, b| a.0.total_cmp(&b.0)),
+        }
+    }
 }
 
 impl Session {
@@ -116,7 +151,11 @@ impl Session {
             return Ok(made.clone());
         }
         let photo = &self.photos[number];
-        let picture = scene::photograph(&photo.path, 1).map_err(|_| Refusal::NotFound)?;
+        let picture = {
+            // Large photographs are decoded one at a time.
+            let _turn = self.decoding.lock().unwrap_or_else(PoisonError::into_inner);
+            scene::photograph(&photo.path, 1).map_err(|_| Refusal::NotFound)?
+        };
         let made = jpeg(&resample::photograph(&picture, thumb(photo.size)), 80)?;
         Ok(self.thumbs[number].get_or_init(|| made).clone())
     }
@@ -130,50 +169,38 @@ impl Session {
         overlay(mask, COLORS[kind])
     }
 
-    /// The state as the page reads it.
-    fn status(&self) -> serde_json::Value {
+    /// The state as the page reads it. That of the views is made when it changes, not when it is asked for.
+    pub(super) fn status(&self) -> String {
         let files: Vec<_> = {
             let results = read(&self.results);
             let size = |path: &std::path::Path| std::fs::metadata(path).map_or(0, |file| file.len());
             results.files.iter().map(|(name, path)| json!({ "name": name, "bytes": size(path) })).collect()
         };
         let steps = read(&self.live).as_ref().map(|board| board.steps().map(u64::from));
-        let state = self.lock();
-        let mut part = state.part.clone();
-        if let (Some(part), Some([done, all])) = (part.as_mut().filter(|part| part.name == "train"), steps) {
-            (part.done, part.all) = (done, all);
-        }
-        let views: Vec<_> = self
-            .photos
-            .iter()
-            .zip(&state.views)
-            .map(|(photo, view)| {
-                let carried = view.carried.as_ref().filter(|_| view.mask.is_none());
-                let shown = view.shown();
-                let pixels = |mask: &GrayImage| mask.as_raw().iter().filter(|v| **v != 0).count() as f64;
-                let share = shown.map(|(mask, _)| pixels(mask) / mask.as_raw().len().max(1) as f64);
-                json!({
-                    "name": photo.name, "size": photo.size, "marks": view.marks, "origin": view.origin,
-                    "busy": view.version != view.drawn,
-                    // Changes with the overlay.
-                    "overlay": shown.map(|_| format!("{}-{}", view.drawn, carried.map_or(0, |c| c.revision))),
-                    "doubt": carried.map(|c| c.doubt), "share": share,
-                })
-            })
-            .collect();
-        let unsure = |(photo, view): (&super::Photo, &View)| {
-            let carried = view.carried.as_ref().filter(|carried| view.mask.is_none() && carried.doubt > THIN)?;
-            Some((carried.doubt, photo.name.clone()))
+        let (views, status) = {
+            let mut state = self.lock();
+            let views = match &state.said {
+                Some(said) => said.clone(),
+                None => Arc::new(Views::of(&self.photos, &state.views)),
+            };
+            state.said = Some(views.clone());
+            let mut part = state.part.clone();
+            if let (Some(part), Some([done, all])) = (part.as_mut().filter(|part| part.name == "train"), steps) {
+                (part.done, part.all) = (done, all);
+            }
+            let status = json!({
+                "title": self.title, "revision": state.revision, "phase": state.phase, "part": part,
+                "ready": state.ready, "carrying": state.ready && state.carried != state.revision,
+                "marked": views.marked,
+                "next": views.next.as_ref().map(|(_, name)| name), "doubt": views.next.as_ref().map(|(doubt, _)| doubt),
+                "problems": state.problems, "error": state.error,
+                "live": steps.is_some() && state.phase == Phase::Working, "files": files,
+            });
+            (views, status)
         };
-        let next = self.photos.iter().zip(&state.views).filter_map(unsure).max_by(|a, b| a.0.total_cmp(&b.0));
-        json!({
-            "title": self.title, "revision": state.revision, "phase": state.phase, "part": part,
-            "ready": state.ready, "carrying": state.ready && state.carried != state.revision,
-            "marked": state.views.iter().filter(|view| view.origin != Origin::None).count(),
-            "next": next.as_ref().map(|(_, name)| name), "doubt": next.as_ref().map(|(doubt, _)| doubt),
-            "problems": state.problems, "error": state.error, "live": steps.is_some() && state.phase == Phase::Working,
-            "files": files, "views": views,
-        })
+        let status = status.to_string();
+        let open = status.strip_suffix('}').expect("an object in JSON ends with a brace");
+        format!("{open},\"views\":{}}}", views.text)
     }
 }
 
@@ -188,24 +215,26 @@ impl Site for Session {
         if let Some(rest) = path.strip_prefix("/live/") {
             let board = read(&self.live).clone().ok_or(Refusal::NotFound)?;
             let Answer { kind, gzip, bytes } = board.get(&format!("/{rest}"), query)?;
-            return Ok(Answer { kind, gzip, bytes: Cow::Owned(bytes.into_owned()) });
+            return Ok(Answer { kind, gzip, bytes: bytes.into_static() });
         }
         if let Some(rest) = path.strip_prefix("/result") {
             let results = read(&self.results);
             let resource = results.page.iter().find(|resource| resource.path == rest).ok_or(Refusal::NotFound)?;
-            return Ok(Answer { kind: resource.kind, gzip: resource.gzip, bytes: Cow::Owned(resource.bytes.clone()) });
+            let Resource { kind, gzip, .. } = **resource;
+            return Ok(Answer { kind, gzip, bytes: Body::Shared(resource.clone()) });
         }
         if let Some(name) = path.strip_prefix("/download/") {
             let results = read(&self.results);
             let (_, path) = results.files.iter().find(|(own, _)| own == name).ok_or(Refusal::NotFound)?;
-            let bytes = std::fs::read(path).map_err(|_| Refusal::NotFound)?;
-            return Ok(owned("application/octet-stream", bytes));
+            let file = File::open(path).map_err(|_| Refusal::NotFound)?;
+            let length = file.metadata().map_err(|_| Refusal::NotFound)?.len();
+            return Ok(Answer { kind: "application/octet-stream", gzip: false, bytes: Body::File(file, length) });
         }
         match path {
-            "/" => Ok(owned("text/html; charset=utf-8", PAGE.replace("<!--token-->", &self.token).into_bytes())),
+            "/" => Ok(text("text/html; charset=utf-8", PAGE)),
             "/page.css" => Ok(text("text/css", STYLE)),
             "/page.js" => Ok(text("text/javascript", PROGRAM)),
-            "/api/state" => Ok(answer(&self.status())),
+            "/api/state" => Ok(owned("application/json", self.status().into_bytes())),
             "/photo.jpg" => {
                 let number = self.named(query)?;
                 let picture = self.picture(number).map_err(|_| Refusal::NotFound)?;
@@ -220,8 +249,8 @@ impl Site for Session {
         }
     }
 
-    fn token(&self) -> Option<&str> {
-        Some(&self.token)
+    fn posts(&self) -> bool {
+        true
     }
 
     fn post(&self, path: &str, body: &[u8]) -> Result<Answer<'_>, Refused> {
@@ -244,6 +273,6 @@ impl Site for Session {
             }
             _ => return Err((Refusal::NotFound, "there is nothing of this name".into())),
         }
-        Ok(answer(&self.status()))
+        Ok(owned("application/json", self.status().into_bytes()))
     }
 }

@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 
 use super::*;
 use crate::scene::doctor::iou;
-use crate::view::server;
+use crate::view::server::{self, Secret};
 
 const SIZE: [u32; 2] = [160, 120];
 
@@ -52,11 +52,14 @@ impl Place {
     }
 }
 
+/// The secret of the tests' servers.
+const DOOR: &str = "door";
+
 fn serve(session: &Arc<Session>) -> SocketAddr {
     let listener = server::bind(([127, 0, 0, 1], 0).into()).unwrap();
     let address = listener.local_addr().unwrap();
     let site = session.clone();
-    std::thread::spawn(move || server::serve(&listener, &site));
+    std::thread::spawn(move || server::serve(&listener, &site, &Secret::known(DOOR)));
     address
 }
 
@@ -73,17 +76,18 @@ fn ask(address: SocketAddr, request: &[u8]) -> (u32, Vec<u8>) {
 }
 
 fn get(address: SocketAddr, path: &str) -> (u32, Vec<u8>) {
-    ask(address, format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n").as_bytes())
+    ask(address, format!("GET /{DOOR}{path} HTTP/1.1\r\nHost: localhost\r\n\r\n").as_bytes())
 }
 
 fn post_as(address: SocketAddr, path: &str, fields: &str, body: &str) -> (u32, String) {
-    let head = format!("POST {path} HTTP/1.1\r\nHost: localhost\r\n{fields}Content-Length: {}\r\n\r\n", body.len());
+    let head =
+        format!("POST /{DOOR}{path} HTTP/1.1\r\nHost: localhost\r\n{fields}Content-Length: {}\r\n\r\n", body.len());
     let (status, text) = ask(address, &[head.as_bytes(), body.as_bytes()].concat());
     (status, String::from_utf8(text).unwrap())
 }
 
-fn post(address: SocketAddr, session: &Session, path: &str, body: &str) -> (u32, String) {
-    post_as(address, path, &format!("X-Token: {}\r\nContent-Type: application/json\r\n", session.token), body)
+fn post(address: SocketAddr, path: &str, body: &str) -> (u32, String) {
+    post_as(address, path, "Content-Type: application/json\r\n", body)
 }
 
 fn state(address: SocketAddr) -> Value {
@@ -99,7 +103,7 @@ fn the_page_and_its_pictures_are_there_and_name_nothing_but_views() {
     let address = serve(&session);
     let (status, page) = get(address, "/");
     let page = String::from_utf8(page).unwrap();
-    assert!(status == 200 && page.contains(&session.token) && !page.contains("<!--token-->"));
+    assert!(status == 200 && !page.contains(DOOR));
     for path in ["/page.js", "/page.css", "/photo.jpg?view=a", "/thumb.jpg?view=c%20%26%20%3Cd%3E"] {
         assert_eq!(get(address, path).0, 200, "{path}");
     }
@@ -120,37 +124,129 @@ fn the_page_and_its_pictures_are_there_and_name_nothing_but_views() {
     ] {
         assert_eq!(get(address, path).0, 404, "{path}");
     }
-    assert_eq!(ask(address, b"GET / HTTP/1.1\r\nHost: evil.example\r\n\r\n").0, 421);
+    assert_eq!(ask(address, b"GET /door/ HTTP/1.1\r\nHost: evil.example\r\n\r\n").0, 421);
     let names: Vec<_> = state(address)["views"].as_array().unwrap().iter().map(|view| view["name"].clone()).collect();
     assert_eq!(names, ["a", "b", "c & <d>"]);
 }
 
+/// A second client that has only the port learns nothing and changes nothing; nor does another site's page with the secret.
 #[test]
-fn nothing_changes_without_the_token_or_for_another_sites_page() {
+fn nothing_is_told_or_changed_without_the_secret() {
     let place = Place::new();
     let session = place.open();
     let address = serve(&session);
-    let token = format!("X-Token: {}\r\n", session.token);
     let json = "Content-Type: application/json\r\n";
+    for path in
+        ["/", "/api/state", "/photo.jpg?view=a", "/download/scene.ply", "/door", "/doors/", "/live/", "/result/"]
+    {
+        let (status, told) = ask(address, format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n").as_bytes());
+        assert_eq!(status, 403, "{path}");
+        let told = String::from_utf8(told).unwrap();
+        assert!(["place", "view", DOOR, "Remove"].iter().all(|word| !told.contains(word)), "{told}");
+    }
+    let length = CLICK.len();
+    let begun = format!("HTTP/1.1\r\nHost: localhost\r\n{json}Content-Length: {length}\r\n\r\n{CLICK}");
+    for path in ["/api/marks", "/0/api/marks", "//api/marks"] {
+        assert_eq!(ask(address, format!("POST {path} {begun}").as_bytes()).0, 403, "{path}");
+    }
     let send = |fields: &str| post_as(address, "/api/marks", fields, CLICK).0;
-    assert_eq!(send(json), 403);
-    assert_eq!(send(&format!("{json}X-Token: \r\n")), 403);
-    assert_eq!(send(&format!("{json}X-Token: {:032x}\r\n", 0)), 403);
-    assert_eq!(send(&format!("{token}{json}Origin: http://evil.example\r\n")), 403);
-    assert_eq!(send(&format!("{token}{json}Origin: null\r\n")), 403);
+    assert_eq!(send(&format!("{json}Origin: http://evil.example\r\n")), 403);
+    assert_eq!(send(&format!("{json}Origin: null\r\n")), 403);
+    assert_eq!(send(&format!("{json}Sec-Fetch-Site: cross-site\r\n")), 403);
     // What a form of another site can send.
-    assert_eq!(send(&format!("{token}Content-Type: text/plain\r\n")), 415);
-    assert_eq!(send(&token), 415);
-    let foreign = format!("POST /api/marks HTTP/1.1\r\nHost: evil.example\r\n{token}{json}Content-Length: 0\r\n\r\n");
+    assert_eq!(send("Content-Type: text/plain\r\n"), 415);
+    assert_eq!(send(""), 415);
+    let foreign = format!("POST /{DOOR}/api/marks HTTP/1.1\r\nHost: evil.example\r\n{json}Content-Length: 0\r\n\r\n");
     assert_eq!(ask(address, foreign.as_bytes()).0, 421);
-    let endless = format!("POST /api/marks HTTP/1.1\r\nHost: localhost\r\n{token}{json}\r\n");
+    let endless = format!("POST /{DOOR}/api/marks HTTP/1.1\r\nHost: localhost\r\n{json}\r\n");
     assert_eq!(ask(address, endless.as_bytes()).0, 411);
     assert_eq!(get(address, "/api/remove").0, 404);
-    assert_eq!(ask(address, b"PUT / HTTP/1.1\r\nHost: localhost\r\n\r\n").0, 405);
+    assert_eq!(ask(address, b"PUT /door/ HTTP/1.1\r\nHost: localhost\r\n\r\n").0, 405);
     assert_eq!(state(address)["revision"], 1);
     assert!(!place.objects().exists());
-    assert_eq!(send(&format!("{token}{json}Origin: http://localhost:{}\r\n", address.port())), 200);
+    assert_eq!(send(&format!("{json}Origin: http://localhost:{}\r\n", address.port())), 200);
     assert_eq!(state(address)["revision"], 2);
+}
+
+/// A photograph that is gone, a folder that cannot be written: the marks are those of before, and the page is told why.
+#[test]
+fn a_mark_that_fails_leaves_things_as_they_were() {
+    let place = Place::new();
+    let session = place.open();
+    let address = serve(&session);
+    assert_eq!(post(address, "/api/marks", CLICK).0, 200);
+    let before = state(address);
+    let [mask, marks] = ["a.png", "a.json"].map(|name| std::fs::read(place.objects().join(name)).unwrap());
+    // A file where the folder was.
+    let aside = place.folder.path().join("aside");
+    std::fs::rename(place.objects(), &aside).unwrap();
+    std::fs::write(place.objects(), "").unwrap();
+    let further = r#"{"view":"a","marks":[{"kind":"object","at":[0.44,0.5]},{"kind":"background","at":[0.1,0.1]}]}"#;
+    for view in ["a", "b"] {
+        let (status, why) = post(address, "/api/marks", &further.replace("\"a\"", &format!("\"{view}\"")));
+        assert!(status == 503 && why.contains("objects: cannot be written"), "{status} {why}");
+    }
+    assert_eq!(state(address)["views"][0]["marks"], before["views"][0]["marks"]);
+    assert_eq!(state(address)["views"][1], before["views"][1]);
+    std::fs::remove_file(place.objects()).unwrap();
+    std::fs::rename(&aside, place.objects()).unwrap();
+    // The marks cannot be written, the mask can.
+    std::fs::remove_file(place.objects().join("a.json")).unwrap();
+    std::fs::create_dir(place.objects().join("a.json")).unwrap();
+    assert_eq!(post(address, "/api/marks", r#"{"view":"a","marks":[{"kind":"object","at":[0.1,0.1]}]}"#).0, 503);
+    assert!(std::fs::read(place.objects().join("a.png")).unwrap() == mask);
+    std::fs::remove_dir(place.objects().join("a.json")).unwrap();
+    std::fs::write(place.objects().join("a.json"), &marks).unwrap();
+    // Nothing is waited for, and what was marked counts.
+    let after = state(address);
+    assert_eq!(
+        (&after["views"][0]["busy"], &after["views"][0]["marks"]),
+        (&json!(false), &before["views"][0]["marks"])
+    );
+    assert_eq!(after["views"][0]["share"], before["views"][0]["share"]);
+    let gone = "c & <d>";
+    std::fs::remove_file(&place.photographs[gone]).unwrap();
+    let (status, why) = post(address, "/api/marks", &CLICK.replace("\"a\"", &format!("\"{gone}\"")));
+    assert!(status == 503 && why.contains(gone), "{status} {why}");
+    assert_eq!(state(address)["views"][2]["busy"], false);
+    assert_eq!(post(address, "/api/marks", further).0, 200);
+}
+
+/// What is on disk is begun with when the folder is opened again, not made anew of all marks.
+#[test]
+fn a_cut_after_reopening_begins_with_the_mask_on_disk() {
+    let place = Place::new();
+    // As no click would have it.
+    let own = GrayImage::from_fn(SIZE[0], SIZE[1], |x, y| Luma([if x < 40 && y < 30 { 255 } else { 0 }]));
+    let click = Mark::Object { at: [0.1, 0.1], scale: 0 };
+    objects::write(&place.objects(), "a", SIZE, std::slice::from_ref(&click), Some(&own)).unwrap();
+    let session = place.open();
+    let brush = Mark::Brush { object: true, radius: 0.02, points: vec![[0.9, 0.9]] };
+    session.mark(0, vec![click.clone(), brush.clone()]).unwrap();
+    let mask = scene::mask(&place.objects().join("a.png"), 1).unwrap();
+    let differs = |(x, y, v): (u32, u32, &Luma<u8>)| (x < 130 && v != own.get_pixel(x, y)).then_some([x, y]);
+    assert_eq!(mask.enumerate_pixels().find_map(differs), None);
+    assert_eq!(mask.get_pixel(144, 108).0, [255]);
+    // One that is known to be made of other marks is not.
+    session.mark(0, vec![brush]).unwrap();
+    assert_eq!(scene::mask(&place.objects().join("a.png"), 1).unwrap().get_pixel(10, 10).0, [0]);
+}
+
+/// Pixels are counted when a mask is made: a hundred views of large masks cost a poll nothing.
+#[test]
+fn what_is_said_of_views_is_made_once() {
+    let place = Place::new();
+    let session = place.open();
+    session.mark(0, vec![Mark::Object { at: [0.44, 0.5], scale: 0 }]).unwrap();
+    let said = || session.status();
+    let first = said();
+    let kept = session.lock().said.clone().unwrap();
+    assert!(first == said() && Arc::ptr_eq(&kept, session.lock().said.as_ref().unwrap()));
+    let share = serde_json::from_str::<Value>(&first).unwrap()["views"][0]["share"].as_f64().unwrap();
+    let truth = truth().as_raw().iter().filter(|v| **v != 0).count() as f64 / f64::from(SIZE[0] * SIZE[1]);
+    assert!((share / truth - 1.0).abs() < 0.1, "{share} {truth}");
+    session.mark(0, vec![]).unwrap();
+    assert!(serde_json::from_str::<Value>(&said()).unwrap()["views"][0]["share"].is_null());
 }
 
 #[test]
@@ -158,7 +254,7 @@ fn nonsense_is_refused_in_a_sentence() {
     let place = Place::new();
     let session = place.open();
     let address = serve(&session);
-    let send = |path: &str, body: &str| post(address, &session, path, body);
+    let send = |path: &str, body: &str| post(address, path, body);
     let (status, said) = send("/api/marks", &CLICK.replace("\"a\"", "\"../a\""));
     assert_eq!((status, said.as_str()), (404, "no photograph is called \"../a\"\n"));
     for body in [
@@ -177,11 +273,11 @@ fn nonsense_is_refused_in_a_sentence() {
         let (status, said) = send("/api/marks", body);
         assert!(status == 400 && said.lines().count() == 1, "{body}: {status} {said}");
     }
-    let (status, _) = send("/api/marks", &format!("{}{}", " ".repeat(1 << 17), CLICK));
+    let (status, _) = send("/api/marks", &format!("{}{}", " ".repeat(1 << 19), CLICK));
     assert_eq!(status, 413);
     assert_eq!(send("/api/other", "{}").0, 404);
     let (status, said) = send("/api/remove", "{}");
-    assert_eq!((status, said.as_str()), (409, "nothing is marked yet; click on what is to be removed\n"));
+    assert_eq!((status, said.as_str()), (409, "nothing is marked yet; draw around what is to be removed\n"));
     assert_eq!(state(address)["revision"], 1);
 }
 
@@ -191,7 +287,7 @@ fn what_is_marked_is_kept_and_found_again() {
     let place = Place::new();
     let session = place.open();
     let address = serve(&session);
-    let (status, said) = post(address, &session, "/api/marks", CLICK);
+    let (status, said) = post(address, "/api/marks", CLICK);
     let said: Value = serde_json::from_str(&said).unwrap();
     assert_eq!((status, &said["views"][0]["origin"]), (200, &json!("marks")), "{said}");
     let [png, kept] = ["a.png", "a.json"].map(|name| place.objects().join(name));
@@ -211,7 +307,7 @@ fn what_is_marked_is_kept_and_found_again() {
     GrayImage::new(3, 3).save(&png).unwrap();
     assert!(Session::open("place", &place.photographs, &place.objects(), &BTreeMap::new()).is_err());
 
-    let (status, _) = post(address, &session, "/api/marks", r#"{"view":"a","marks":[]}"#);
+    let (status, _) = post(address, "/api/marks", r#"{"view":"a","marks":[]}"#);
     assert_eq!(status, 200);
     assert!(!png.exists() && !kept.exists());
     assert_eq!(get(address, "/overlay.png?view=a").0, 404);
@@ -225,12 +321,11 @@ fn the_last_of_two_pages_wins() {
     let address = serve(&session);
     std::thread::scope(|scope| {
         for page in 0..2 {
-            let session = &session;
             scope.spawn(move || {
                 for turn in 0..6 {
                     let x = 0.36 + 0.01 * f64::from(turn + 6 * page);
                     let body = CLICK.replace("0.44", &x.to_string());
-                    assert_eq!(post(address, session, "/api/marks", &body).0, 200);
+                    assert_eq!(post(address, "/api/marks", &body).0, 200);
                 }
             });
         }
@@ -249,7 +344,7 @@ fn work_is_asked_for_once_and_can_be_stopped() {
     let place = Place::new();
     let session = place.open();
     let address = serve(&session);
-    let send = |path: &str, body: &str| post(address, &session, path, body).0;
+    let send = |path: &str, body: &str| post(address, path, body).0;
     assert!(matches!(session.wish(Duration::ZERO), Wish::Nothing), "nothing is carried without a fit");
     assert_eq!(send("/api/marks", CLICK), 200);
     session.ready();

@@ -10,7 +10,6 @@
 //! Rendering changes nothing of the model, and what fails is said to the visitor alone: the trained bytes are the same with
 //! visitors and without.
 
-use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -21,7 +20,7 @@ use image::codecs::jpeg::JpegEncoder;
 use serde::Serialize;
 use serde_json::json;
 
-use super::server::{Answer, Refusal, Site};
+use super::server::{Answer, Body, Refusal, Site};
 use crate::evaluate::Report;
 use crate::gpu;
 use crate::render::view::Rendered;
@@ -320,9 +319,9 @@ fn numbers<const N: usize>(text: &str) -> Option<[f64; N]> {
 impl Site for Board {
     fn get(&self, path: &str, query: &str) -> Result<Answer<'_>, Refusal> {
         fn borrowed<'a>(kind: &'static str, text: &'a str) -> Result<Answer<'a>, Refusal> {
-            Ok(Answer { kind, gzip: false, bytes: Cow::Borrowed(text.as_bytes()) })
+            Ok(Answer { kind, gzip: false, bytes: Body::Borrowed(text.as_bytes()) })
         }
-        let owned = |kind, bytes: Vec<u8>| Ok(Answer { kind, gzip: false, bytes: Cow::Owned(bytes) });
+        let owned = |kind, bytes: Vec<u8>| Ok(Answer { kind, gzip: false, bytes: Body::Owned(bytes) });
         match path {
             "/" => borrowed("text/html; charset=utf-8", PAGE),
             "/live.js" => borrowed("text/javascript", PROGRAM),
@@ -491,7 +490,11 @@ mod tests {
         let visitors: Vec<_> = (0..3)
             .map(|_| {
                 let board = board.clone();
-                std::thread::spawn(move || board.get("/picture.jpg", QUERY).map(|answer| answer.bytes.into_owned()))
+                std::thread::spawn(move || {
+                    let answer = board.get("/picture.jpg", QUERY)?;
+                    let Body::Owned(jpeg) = answer.bytes else { panic!("a picture is made for its visitor") };
+                    Ok(jpeg)
+                })
             })
             .collect();
         let mut drawn = 0;

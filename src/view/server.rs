@@ -5,17 +5,21 @@
 //! for its request and one for taking the answer; where there are too many, the one that has used most of its time goes;
 //! and only so many requests a second are looked at.
 //!
+//! Whoever can reach a port can ask: every user of the machine, and every page in their browsers. So a request must know the
+//! server's [`Secret`], which is in the address that the program prints and opens, and no request learns anything without it.
 //! A request must name this machine as its host. Otherwise the name of any web site could be pointed at the loopback
 //! address, and its pages would read what is served here (DNS rebinding). Pages may load nothing from elsewhere
-//! ([`POLICY`]), and other sites may embed nothing from here. What is posted must be JSON, which no other site's page sends
-//! unasked, must not say that it comes from another site's page, and must have the site's own token.
+//! ([`POLICY`]), other sites may embed nothing from here, and what a browser asks for another site's page is refused. What is
+//! posted must be JSON, which no other site's page sends unasked, and must not say that it comes from another site's page.
 
-use std::borrow::Cow;
 use std::collections::{BTreeMap, VecDeque};
+use std::fs::File;
 use std::io::{self, Read as _, Write as _};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
+
+use rand::RngExt as _;
 
 /// A file to serve.
 #[derive(Debug, Clone)]
@@ -30,6 +34,41 @@ pub struct Resource {
     pub bytes: Vec<u8>,
 }
 
+/// The bytes of an answer. Large ones are not copied for a request.
+#[derive(Debug)]
+pub enum Body<'a> {
+    /// The site's own.
+    Borrowed(&'a [u8]),
+    /// Made for this answer.
+    Owned(Vec<u8>),
+    /// Those of a resource that is shared.
+    Shared(Arc<Resource>),
+    /// A file of so many bytes, which is read while it is sent.
+    File(File, u64),
+}
+
+impl Body<'_> {
+    /// The number of bytes.
+    fn len(&self) -> u64 {
+        match self {
+            Self::Borrowed(bytes) => bytes.len() as u64,
+            Self::Owned(bytes) => bytes.len() as u64,
+            Self::Shared(resource) => resource.bytes.len() as u64,
+            Self::File(_, length) => *length,
+        }
+    }
+
+    /// The same bytes without what the site lends.
+    pub fn into_static(self) -> Body<'static> {
+        match self {
+            Self::Borrowed(bytes) => Body::Owned(bytes.to_vec()),
+            Self::Owned(bytes) => Body::Owned(bytes),
+            Self::Shared(resource) => Body::Shared(resource),
+            Self::File(file, length) => Body::File(file, length),
+        }
+    }
+}
+
 /// What is answered with.
 #[derive(Debug)]
 pub struct Answer<'a> {
@@ -38,7 +77,35 @@ pub struct Answer<'a> {
     /// Whether the bytes are compressed, to be unpacked by the client.
     pub gzip: bool,
     /// Its bytes.
-    pub bytes: Cow<'a, [u8]>,
+    pub bytes: Body<'a>,
+}
+
+/// The secret of a server: the first part of every path.
+#[derive(Clone)]
+pub struct Secret(String);
+
+impl Secret {
+    /// 128 random bits as hexadecimal digits.
+    pub fn random() -> Self {
+        Self(format!("{:032x}", rand::rng().random::<u128>()))
+    }
+
+    /// One that a test knows.
+    #[cfg(test)]
+    pub(crate) fn known(text: &str) -> Self {
+        Self(text.into())
+    }
+
+    /// The address to open.
+    pub fn url(&self, address: SocketAddr) -> String {
+        format!("http://{address}/{}/", self.0)
+    }
+
+    /// A path without the secret; nothing where it is not in it.
+    fn admits<'a>(&self, path: &'a str) -> Option<&'a str> {
+        let end = path[1..].find('/')? + 1;
+        same(&path[1..end], &self.0).then_some(&path[end..])
+    }
 }
 
 /// Why there is no answer, as HTTP has it.
@@ -48,7 +115,7 @@ pub enum Refusal {
     BadRequest,
     /// There is nothing of this name.
     NotFound,
-    /// A POST lacks the site's token, or comes from another site's page.
+    /// The secret is not in the path, or another site's page asks.
     Forbidden,
     /// Only GET and HEAD are answered, and POST by sites that take it.
     Method,
@@ -100,12 +167,12 @@ pub trait Site: Send + Sync + 'static {
     /// What is said to the client instead.
     fn get(&self, path: &str, query: &str) -> Result<Answer<'_>, Refusal>;
 
-    /// The token that whoever changes something must show, in the field `X-Token`; without one nothing is taken.
-    fn token(&self) -> Option<&str> {
-        None
+    /// Whether it takes what is posted.
+    fn posts(&self) -> bool {
+        false
     }
 
-    /// Takes what was posted to a path, with the right token.
+    /// Takes what was posted to a path.
     ///
     /// # Errors
     /// What is said to the client instead: a status and a sentence.
@@ -118,7 +185,7 @@ impl Site for Vec<Resource> {
     fn get(&self, path: &str, _query: &str) -> Result<Answer<'_>, Refusal> {
         let resource = self.iter().find(|resource| resource.path == path).ok_or(Refusal::NotFound)?;
         let Resource { kind, gzip, ref bytes, .. } = *resource;
-        Ok(Answer { kind, gzip, bytes: Cow::Borrowed(bytes) })
+        Ok(Answer { kind, gzip, bytes: Body::Borrowed(bytes) })
     }
 }
 
@@ -158,7 +225,7 @@ const MOST_BYTES: usize = 16 << 10;
 /// Most fields of a head.
 const MOST_FIELDS: usize = 64;
 /// Longest body that is read, bytes.
-const MOST_BODY: usize = 64 << 10;
+const MOST_BODY: usize = 256 << 10;
 /// What is still read of a request that was refused, bytes and time: closing a connection with unread bytes resets it, and
 /// the refusal would be lost.
 const REST: (usize, Duration) = (1 << 20, Duration::from_millis(500));
@@ -185,15 +252,15 @@ pub fn bind(address: SocketAddr) -> io::Result<TcpListener> {
 ///
 /// # Errors
 /// Never while the listener is whole.
-pub fn serve(listener: &TcpListener, site: &Arc<impl Site>) -> io::Result<()> {
-    serve_within(listener, site, Limits::default())
+pub fn serve(listener: &TcpListener, site: &Arc<impl Site>, secret: &Secret) -> io::Result<()> {
+    serve_within(listener, site, secret, Limits::default())
 }
 
 /// [`serve`] with limits of one's own.
 ///
 /// # Errors
 /// As [`serve`].
-pub fn serve_within(listener: &TcpListener, site: &Arc<impl Site>, limits: Limits) -> io::Result<()> {
+pub fn serve_within(listener: &TcpListener, site: &Arc<impl Site>, secret: &Secret, limits: Limits) -> io::Result<()> {
     let clients = Arc::new(Clients::default());
     // Kept for a while: their requests are unread, see [`REST`].
     let mut turned_away = VecDeque::new();
@@ -219,7 +286,8 @@ pub fn serve_within(listener: &TcpListener, site: &Arc<impl Site>, limits: Limit
             }
             continue;
         };
-        let client = Client { site: site.clone(), clients: clients.clone(), number, limits, stream };
+        let (site, secret, clients) = (site.clone(), secret.clone(), clients.clone());
+        let client = Client { site, secret, clients, number, limits, stream };
         // Errors are the client's: it went away. Without a thread for it, it is as good as gone.
         let _ = std::thread::Builder::new().spawn(move || client.talk());
     }
@@ -266,6 +334,7 @@ impl Clients {
 /// One connection; it is counted until this is gone.
 struct Client<S> {
     site: Arc<S>,
+    secret: Secret,
     clients: Arc<Clients>,
     number: u64,
     limits: Limits,
@@ -303,16 +372,43 @@ impl<S: Site> Client<S> {
                 return self.drain();
             }
         };
-        let head = head("200 OK", answer.kind, answer.bytes.len(), answer.gzip);
-        let body: &[u8] = if method == Method::Head { &[] } else { &answer.bytes };
-        let time = self.limits.answer + Duration::from_secs_f64(body.len() as f64 / self.limits.rate);
+        let length = answer.bytes.len();
+        let head = head("200 OK", answer.kind, length, answer.gzip);
+        let sent = if method == Method::Head { 0 } else { length };
+        let time = self.limits.answer + Duration::from_secs_f64(sent as f64 / self.limits.rate);
         self.waits(Some(time));
         let until = Instant::now() + time;
-        if body.len() < PIECE {
-            return self.write(&[head.as_bytes(), body].concat(), until);
+        let bytes = match &answer.bytes {
+            _ if sent == 0 => &[],
+            Body::Borrowed(bytes) => *bytes,
+            Body::Owned(bytes) => bytes,
+            Body::Shared(resource) => &resource.bytes,
+            Body::File(file, length) => {
+                self.write(head.as_bytes(), until)?;
+                return self.copy(file, *length, until);
+            }
+        };
+        if bytes.len() < PIECE {
+            return self.write(&[head.as_bytes(), bytes].concat(), until);
         }
         self.write(head.as_bytes(), until)?;
-        self.write(body, until)
+        self.write(bytes, until)
+    }
+
+    /// Sends so many bytes of a file. One that has become shorter ends the connection early, which the client notices.
+    fn copy(&self, mut file: &File, length: u64, until: Instant) -> io::Result<()> {
+        let mut piece = vec![0; PIECE];
+        let mut left = length;
+        while left > 0 {
+            let most = usize::try_from(left).unwrap_or(PIECE).min(PIECE);
+            let read = file.read(&mut piece[..most])?;
+            if read == 0 {
+                return Err(io::ErrorKind::UnexpectedEof.into());
+            }
+            self.write(&piece[..read], until)?;
+            left -= read as u64;
+        }
+        Ok(())
     }
 
     /// Reads the head of a request.
@@ -355,35 +451,42 @@ impl<S: Site> Client<S> {
             if !names(request.field("host")?.ok_or(Refusal::BadRequest)?, ours) {
                 return Err(Refusal::OtherHost);
             }
+            // A browser says for whose page it asks.
+            if request.field("sec-fetch-site")?.is_some_and(|site| site.eq_ignore_ascii_case("cross-site")) {
+                return Err(Refusal::Forbidden);
+            }
+            let path = self.secret.admits(request.path).ok_or(Refusal::Forbidden)?;
             let method = request.method.ok_or(Refusal::Method)?;
             let length = if method == Method::Post { Some(self.may_post(&request, ours)?) } else { None };
-            Ok((request, method, length))
+            Ok((request, path, method, length))
         });
-        let (request, method, length) = match asked {
+        let (request, path, method, length) = match asked {
             Ok(asked) => asked,
             Err(refused) => return plain(refused),
         };
         let Some(length) = length else {
-            return Ok(self.site.get(request.path, request.query).map_err(|r| (r, String::new())).map(|a| (method, a)));
+            return Ok(self.site.get(path, request.query).map_err(|r| (r, String::new())).map(|a| (method, a)));
         };
         self.waits(Some(self.limits.request));
         let body = self.body(&head[request.length..], length, Instant::now() + self.limits.request)?;
         self.waits(None);
         match body {
-            Ok(body) => Ok(self.site.post(request.path, &body).map(|answer| (method, answer))),
+            Ok(body) => Ok(self.site.post(path, &body).map(|answer| (method, answer))),
             Err(refused) => plain(refused),
         }
     }
 
     /// The length of a body that is taken.
     fn may_post(&self, request: &Request<'_>, ours: IpAddr) -> Result<usize, Refusal> {
-        let token = self.site.token().ok_or(Refusal::Method)?;
+        if !self.site.posts() {
+            return Err(Refusal::Method);
+        }
         // A browser says whose page it is.
         let foreign = request.field("origin")?.is_some_and(|origin| {
             let host = origin.strip_prefix("http://").or_else(|| origin.strip_prefix("https://"));
             !host.is_some_and(|host| names(host, ours))
         });
-        if foreign || !request.field("x-token")?.is_some_and(|shown| same(shown, token)) {
+        if foreign {
             return Err(Refusal::Forbidden);
         }
         let kind = request.field("content-type")?.unwrap_or_default();
@@ -538,7 +641,7 @@ fn names(host: &str, ours: IpAddr) -> bool {
     port && (name.eq_ignore_ascii_case("localhost") || address.is_some_and(ours))
 }
 
-fn head(status: &str, kind: &str, bytes: usize, gzip: bool) -> String {
+fn head(status: &str, kind: &str, bytes: u64, gzip: bool) -> String {
     let encoding = if gzip { "Content-Encoding: gzip\r\n" } else { "" };
     format!(
         "HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {bytes}\r\n{encoding}Cache-Control: no-store\r\n\
@@ -551,15 +654,16 @@ fn refusal(refusal: Refusal) -> Vec<u8> {
     let status = refusal.status();
     let text = match refusal {
         Refusal::OtherHost => format!("{status}: open it as localhost or by its address\n"),
+        Refusal::Forbidden => format!("{status}: open the whole address that the program has printed\n"),
         _ => format!("{status}\n"),
     };
-    (head(status, "text/plain", text.len(), false) + &text).into_bytes()
+    (head(status, "text/plain", text.len() as u64, false) + &text).into_bytes()
 }
 
 /// A refusal that says why, in a sentence.
 fn refusal_because(refusal: Refusal, why: &str) -> Vec<u8> {
     let text = format!("{why}\n");
-    (head(refusal.status(), "text/plain; charset=utf-8", text.len(), false) + &text).into_bytes()
+    (head(refusal.status(), "text/plain; charset=utf-8", text.len() as u64, false) + &text).into_bytes()
 }
 
 #[cfg(test)]

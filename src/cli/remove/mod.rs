@@ -21,9 +21,9 @@ use work::{Job, Places};
 
 /// Remove an object from photographs: point at it in the browser, and it is gone
 ///
-/// Does what prepare, doctor, train and export do, one after the other. Without --mask, --box, --strokes and --yes it opens a
-/// page with the photographs: click on the object, look at what was understood in the other photographs, press Remove. With
-/// any of them it needs no browser and asks nothing.
+/// Does what prepare, doctor, train and export do, one after the other. Without --mask, --box or another mark and without
+/// --yes it opens a page with the photographs: draw around the object, look at what was understood in the other photographs,
+/// press Remove. With any of them it needs no browser and asks nothing.
 ///
 /// PHOTOS is what prepare takes: a folder of photographs, alone or with a COLMAP model or a transforms.json. Everything goes
 /// into one folder: the masks that were clicked (objects/NAME.png), the scene (scene/), the run (run/), and the files for
@@ -39,6 +39,7 @@ use work::{Job, Places};
   gscream-vk remove scene.ply --cameras sparse/0 --mask IMG_0012=mask.png --yes
   gscream-vk remove photos --out garden --mask IMG_0012=mask.png
   gscream-vk remove photos --out garden --box IMG_0012=310,220,540,470 --yes
+  gscream-vk remove photos --out garden --click IMG_0012=430,340 --yes
   gscream-vk remove photos --out garden --yes      # with the masks in garden/objects")]
 pub(super) struct Args {
     /// Folder of photographs, or a splat (PLY, SPZ or GLB)

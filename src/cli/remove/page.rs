@@ -23,7 +23,7 @@ use crate::remove::{Session, Wish, objects};
 use crate::scene::doctor::{Report, Severity};
 use crate::scene::{self, Scene};
 use crate::view::live::Board;
-use crate::view::server;
+use crate::view::server::{self, Secret};
 
 /// How long the worker waits before it looks whether a signal has come.
 const PATIENCE: Duration = Duration::from_millis(200);
@@ -65,10 +65,11 @@ pub fn run(job: &Job<'_>, capture: &Capture) -> anyhow::Result<()> {
     let address = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), job.args.port);
     job.args.device.with_gpu(|gpu| {
         let listener = view::bind(address, "--port 0")?;
-        let url = format!("http://{}/", listener.local_addr().unwrap_or(address));
+        let secret = Secret::random();
+        let url = secret.url(listener.local_addr().unwrap_or(address));
         println!("{url} (Ctrl-C ends it; the same command goes on)");
         let site = session.clone();
-        std::thread::spawn(move || server::serve(&listener, &site));
+        std::thread::spawn(move || server::serve(&listener, &site, &secret));
         if !job.args.no_open
             && let Err(error) = open_browser(&url)
         {

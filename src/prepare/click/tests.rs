@@ -1,9 +1,11 @@
-//! Clicks on photographs with true masks: what one, two and three of them come to, in their view and in the others.
+//! Marks on photographs with true masks: what one to five of them come to, in their view and in the others, and what they
+//! keep to.
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use image::{GrayImage, Luma, RgbImage};
+use rand::RngExt as _;
 
 use super::{Cues, Mark, mask, next};
 use crate::gpu::testing;
@@ -29,6 +31,10 @@ fn middle(mask: &GrayImage) -> Option<([f64; 2], u32)> {
     (*far > 0).then_some((at, *far))
 }
 
+fn object(at: [f64; 2]) -> Mark {
+    Mark::Object { at, scale: 0 }
+}
+
 /// The next click of a user who knows the truth: in the middle of what is most wrong.
 fn wanted(found: &GrayImage, truth: &GrayImage) -> Option<Mark> {
     let wrong = |missing: bool| {
@@ -40,26 +46,77 @@ fn wanted(found: &GrayImage, truth: &GrayImage) -> Option<Mark> {
     let (missing, extra) = (middle(&wrong(true)), middle(&wrong(false)));
     match (missing, extra) {
         (Some((_, a)), Some((at, b))) if b > a => Some(Mark::Background { at }),
-        (Some((at, _)), _) => Some(Mark::Object { at }),
+        (Some((at, _)), _) => Some(object(at)),
         (None, Some((at, _))) => Some(Mark::Background { at }),
         (None, None) => None,
     }
 }
 
-/// Marks of so many clicks, and the masks after each.
-fn clicks(picture: &RgbImage, truth: &GrayImage, cues: &Cues<'_>, count: usize) -> Vec<(GrayImage, f64)> {
+/// The masks after each of so many clicks, each in the middle of what is most wrong, beginning with these marks; and the
+/// seconds of each.
+fn masks_of(
+    picture: &RgbImage,
+    truth: &GrayImage,
+    cues: &Cues<'_>,
+    begin: Option<Mark>,
+    count: usize,
+) -> Vec<(GrayImage, f64)> {
     let mut marks = vec![];
     let mut found = GrayImage::new(truth.width(), truth.height());
     let mut all = vec![];
+    let mut begin = begin;
     for _ in 0..count {
         let began = Instant::now();
-        if let Some(mark) = wanted(&found, truth) {
+        if let Some(mark) = begin.take().or_else(|| wanted(&found, truth)) {
             marks.push(mark);
             found = next(picture, &marks, &found, cues);
         }
         all.push((found.clone(), began.elapsed().as_secs_f64()));
     }
     all
+}
+
+/// Marks that a user may begin with.
+const TOOLS: [&str; 3] = ["clicks", "box", "lasso"];
+
+/// IoU after 1, 2, 3 and 5 marks that begin with a click, a box or a lasso.
+type Row = [[f64; 4]; 3];
+
+/// One row of the table, and the slowest cut in seconds.
+fn row(picture: &RgbImage, truth: &GrayImage, cues: &Cues<'_>) -> (Row, f64) {
+    let mut slowest = 0.0;
+    let of = |begin: Option<Mark>| {
+        let masks = masks_of(picture, truth, cues, begin, 5);
+        slowest = masks.iter().map(|(_, seconds)| *seconds).fold(slowest, f64::max);
+        [0, 1, 2, 4].map(|n| iou(&masks[n].0, truth))
+    };
+    ([None, Some(boxed(truth)), Some(lasso(truth))].map(of), slowest)
+}
+
+fn print(what: &str, row: &Row) {
+    for (tool, ious) in TOOLS.iter().zip(row) {
+        println!("{what}: {tool} {ious:.3?}");
+    }
+}
+
+/// A rough line around an object, of sixteen corners, wider than it by an eighth of its size.
+fn lasso(truth: &GrayImage) -> Mark {
+    let on = || truth.enumerate_pixels().filter(|p| p.2.0[0] != 0).map(|p| [f64::from(p.0), f64::from(p.1)]);
+    let count = on().count() as f64;
+    let center: [f64; 2] = std::array::from_fn(|k| on().map(|p| p[k]).sum::<f64>() / count);
+    let sides = [truth.width(), truth.height()].map(f64::from);
+    let corner = |i: u32| {
+        let (sin, cos) = (f64::from(i) * std::f64::consts::TAU / 16.0).sin_cos();
+        let along = |p: [f64; 2]| {
+            let [x, y] = [p[0] - center[0], p[1] - center[1]];
+            let far = x * cos + y * sin;
+            (far > 0.92 * x.hypot(y)).then_some(far)
+        };
+        let far = on().filter_map(along).fold(0.0, f64::max) + 0.125 * count.sqrt();
+        let at = [center[0] + far * cos, center[1] + far * sin];
+        std::array::from_fn(|k| (at[k] / sides[k]).clamp(0.0, 1.0))
+    };
+    Mark::Lasso { points: (0..16).map(corner).collect() }
 }
 
 /// A loose box: wider than the object by a tenth of its sides.
@@ -79,13 +136,12 @@ fn small(path: &Path) -> RgbImage {
     resample::photograph(&picture, size)
 }
 
-/// Figures of a capture, means over the views: after 1, 2 and 3 clicks and in a box, without the fit and with it; and carried to
-/// the other views after 1, 2 and 3 clicks.
+/// Figures of a capture, means over the views: without the fit and with it; and carried to the other views after 1, 2 and 3
+/// clicks.
+#[derive(Default)]
 struct Found {
-    alone: [f64; 3],
-    alone_box: f64,
-    fitted: [f64; 3],
-    fitted_box: f64,
+    alone: Row,
+    fitted: Row,
     carried: [f64; 3],
     slowest: f64,
 }
@@ -100,56 +156,41 @@ fn measure(request: &Request, truth: &Path, every: usize) -> Found {
     let truth =
         |name: &str, picture: [u32; 2]| resample::nearest(&scene::mask(&truths[name], 1).expect("a mask"), picture);
     let colors = masks::colors(&mut splats, &scene.train).expect("colours");
-    let mut found =
-        Found { alone: [0.0; 3], alone_box: 0.0, fitted: [0.0; 3], fitted_box: 0.0, carried: [0.0; 3], slowest: 0.0 };
+    let mut found = Found::default();
     let looked: Vec<usize> = (0..scene.train.len()).filter(|i| i % every == every / 2).collect();
+    let share = 1.0 / looked.len() as f64;
     for &i in &looked {
         let view = &scene.train[i];
         let picture = small(&files[&view.name]);
         let own = truth(&view.name, [picture.width(), picture.height()]);
         let depth = DepthMap::of(&mut splats, &view.camera).expect("a depth");
         let with = Cues { depth: Some(&depth), carried: None };
-        let share = 1.0 / looked.len() as f64;
-        let mut line = view.name.clone();
-        for (fitted, cues) in [(false, Cues::default()), (true, with)] {
-            let after = clicks(&picture, &own, &cues, 3);
-            let ious: [f64; 3] = std::array::from_fn(|n| iou(&after[n].0, &own));
-            let of_box = iou(&mask(&picture, &[boxed(&own)], &cues), &own);
-            line += &format!("  {ious:.3?} box {of_box:.3}");
-            let (sums, sum) = if fitted {
-                (&mut found.fitted, &mut found.fitted_box)
-            } else {
-                (&mut found.alone, &mut found.alone_box)
-            };
-            sums.iter_mut().zip(ious).for_each(|(sum, iou)| *sum += share * iou);
-            *sum += share * of_box;
-            found.slowest = after.iter().map(|(_, seconds)| *seconds).fold(found.slowest, f64::max);
-            if !fitted {
-                continue;
-            }
-            for (n, (given, _)) in after.iter().enumerate() {
-                let mut votes = Votes::new(&splats);
-                votes.add(&mut splats, &view.camera, &masks::parts(given, view.camera.size)).expect("votes");
-                let shares = votes.count(fit.positions(), &colors);
-                let others: Vec<usize> = looked.iter().copied().filter(|other| *other != i).collect();
-                for &other in &others {
-                    let other = &scene.train[other];
-                    let size = scene::dimensions(&files[&other.name]).expect("a photograph");
-                    let carried = shares.carry(&mut splats, &other.camera).expect("a mask");
-                    let made = masks::threshold(&carried.object, other.camera.size, size, masks::OBJECT);
-                    let made = masks::without_specks(&made, 0.02);
-                    found.carried[n] += share * iou(&made, &truth(&other.name, size)) / others.len() as f64;
-                }
+        for (sums, cues) in [(&mut found.alone, Cues::default()), (&mut found.fitted, with)] {
+            let (ious, slowest) = row(&picture, &own, &cues);
+            print(&format!("{}{}", view.name, if cues.depth.is_some() { " with the fit" } else { "" }), &ious);
+            let all = sums.iter_mut().flatten().zip(ious.iter().flatten());
+            all.for_each(|(sum, iou)| *sum += share * iou);
+            found.slowest = found.slowest.max(slowest);
+        }
+        for (n, (given, _)) in masks_of(&picture, &own, &with, None, 3).iter().enumerate() {
+            let mut votes = Votes::new(&splats);
+            votes.add(&mut splats, &view.camera, &masks::parts(given, view.camera.size)).expect("votes");
+            let shares = votes.count(fit.positions(), &colors);
+            let others: Vec<usize> = looked.iter().copied().filter(|other| *other != i).collect();
+            for &other in &others {
+                let other = &scene.train[other];
+                let size = scene::dimensions(&files[&other.name]).expect("a photograph");
+                let carried = shares.carry(&mut splats, &other.camera).expect("a mask");
+                let made = masks::threshold(&carried.object, other.camera.size, size, masks::OBJECT);
+                let made = masks::without_specks(&made, 0.02);
+                found.carried[n] += share * iou(&made, &truth(&other.name, size)) / others.len() as f64;
             }
         }
-        println!("{line}");
     }
-    let Found { alone, alone_box, fitted, fitted_box, carried, slowest } = &found;
-    println!(
-        "mean IoU after 1, 2, 3 clicks: colours alone {alone:.3?}, in a box {alone_box:.3}; with the fit {fitted:.3?}, in a \
-         box {fitted_box:.3}; carried to the others {carried:.3?}; slowest cut {slowest:.2} s, {} views",
-        looked.len()
-    );
+    println!("mean IoU of {} views after 1, 2, 3 and 5 marks", looked.len());
+    print("colours alone", &found.alone);
+    print("with the fit", &found.fitted);
+    println!("carried to the others after 1, 2, 3 clicks {:.3?}; slowest cut {:.2} s", found.carried, found.slowest);
     found
 }
 
@@ -167,7 +208,7 @@ fn clicks_on_the_built_in_scene_find_the_object() {
     let out = folder.path().join("scene");
     let request = Request { fit_steps: 250, fit_side: 112, ..Request::new(&photographs, &out) };
     let found = measure(&request, &source.join("masks"), 3);
-    assert!(found.alone[2] > 0.8 && found.fitted[2] > 0.85 && found.carried[2] > 0.75);
+    assert!(found.alone[0][2] > 0.8 && found.fitted[0][2] > 0.87 && found.carried[2] > 0.75);
 }
 
 /// Captures that `prepare --only poses --only fit` has been run on: `GSCREAM_CLICKS=PHOTOS:OUT:MASKS`.
@@ -179,4 +220,265 @@ fn clicks_on_a_capture() {
     let [photographs, out, truth] = &paths[..] else { panic!("PHOTOS:OUT:MASKS") };
     let every = std::env::var("GSCREAM_EVERY").ok().and_then(|n| n.parse().ok()).unwrap_or(12);
     measure(&Request::new(photographs, out), truth, every);
+}
+
+/// Marks by colours alone on every so many-th photograph of a capture with true masks: `GSCREAM_MARKS=IMAGES:MASKS`.
+#[test]
+#[ignore = "needs a capture"]
+fn marks_on_true_masks() {
+    let Ok(named) = std::env::var("GSCREAM_MARKS") else { return };
+    let (images, truth) = named.split_once(':').expect("IMAGES:MASKS");
+    let [images, truths] = [images, truth].map(|folder| scene::pictures(Path::new(folder)).expect("pictures"));
+    let every = std::env::var("GSCREAM_EVERY").ok().and_then(|n| n.parse().ok()).unwrap_or(7);
+    let views: Vec<&String> = truths.keys().skip(every / 2).step_by(every).collect();
+    let mut all = vec![];
+    for name in views {
+        let picture = small(&images[name]);
+        let own =
+            resample::nearest(&scene::mask(&truths[name], 1).expect("a mask"), [picture.width(), picture.height()]);
+        let (ious, seconds) = row(&picture, &own, &Cues::default());
+        print(&format!("{name}, {seconds:.2} s"), &ious);
+        all.push(ious);
+    }
+    let mean = |tool: usize, n: usize| all.iter().map(|ious| ious[tool][n]).sum::<f64>() / all.len() as f64;
+    print(&format!("mean of {} views", all.len()), &std::array::from_fn(|t| std::array::from_fn(|n| mean(t, n))));
+}
+
+// ---------------------------------------------------------------- a figure of several colours
+
+/// The colour of the figure at a place, in heights of the picture from its middle; nothing beside it.
+fn figure_at(x: f64, y: f64) -> Option<[f64; 3]> {
+    let [black, white, gray, yellow] =
+        [[34.0, 34.0, 38.0], [228.0, 226.0, 220.0], [128.0, 130.0, 134.0], [226.0, 178.0, 52.0]];
+    // From the front to the back: middle, half width and half height.
+    let parts = [
+        (-0.035, -0.235, 0.012, 0.012, black),
+        (0.035, -0.235, 0.012, 0.012, black),
+        (0.0, -0.19, 0.03, 0.017, yellow),
+        (-0.04, -0.225, 0.045, 0.05, white),
+        (0.04, -0.225, 0.045, 0.05, white),
+        (0.0, -0.11, 0.12, 0.025, yellow),
+        (0.0, 0.07, 0.11, 0.17, white),
+        (0.0, -0.22, 0.12, 0.12, black),
+        (0.0, 0.05, 0.17, 0.23, black),
+        (-0.2, 0.02, 0.06, 0.14, gray),
+        (0.2, 0.02, 0.06, 0.14, gray),
+        (-0.09, 0.29, 0.08, 0.04, yellow),
+        (0.09, 0.29, 0.08, 0.04, yellow),
+    ];
+    let inside =
+        |(cx, cy, rx, ry, _): &(f64, f64, f64, f64, [f64; 3])| ((x - cx) / rx).powi(2) + ((y - cy) / ry).powi(2) < 1.0;
+    parts.iter().find(|part| inside(part)).map(|part| part.4)
+}
+
+/// Where the figure of [`figure`] is in its picture: the place of [`figure_at`] in parts of the picture.
+fn in_figure(at: [f64; 2], size: [u32; 2], shift: f64) -> [f64; 2] {
+    let [w, h] = size.map(f64::from);
+    [0.5 + shift + at[0] * h / w, 0.5 + at[1]]
+}
+
+/// A figure of black, white, gray and yellow on a desk before a white wall, and its true mask.
+fn figure(size: [u32; 2], shift: f64) -> (RgbImage, GrayImage) {
+    let [w, h] = size.map(f64::from);
+    let place = |x: f64, y: f64| [(x - (0.5 + shift) * w) / h, (y - 0.5 * h) / h];
+    let color = |x: f64, y: f64| {
+        let [u, v] = place(x, y);
+        let behind = if v > 0.27 {
+            [150.0 - 20.0 * u, 118.0, 88.0]
+        } else {
+            [236.0 - 14.0 * u - 8.0 * v, 234.0 - 14.0 * u, 230.0 - 12.0 * u]
+        };
+        figure_at(u, v).map_or(behind, |own| own.map(|c| c * (1.0 - 0.12 * u)))
+    };
+    let mut rng = rand_pcg::Pcg64::new(7, 7);
+    let picture = RgbImage::from_fn(size[0], size[1], |x, y| {
+        // Nine samples a pixel, and noise of six levels either way.
+        let samples =
+            (0..9).map(|i| color(f64::from(x) + f64::from(i % 3) / 3.0, f64::from(y) + f64::from(i / 3) / 3.0));
+        let sum = samples.fold([0.0; 3], |sum, c| std::array::from_fn(|k| sum[k] + c[k]));
+        image::Rgb(sum.map(|sum| (sum / 9.0 + rng.random_range(-6.0..6.0)).clamp(0.0, 255.0) as u8))
+    });
+    let truth = GrayImage::from_fn(size[0], size[1], |x, y| {
+        let [u, v] = place(f64::from(x) + 0.5, f64::from(y) + 0.5);
+        Luma([if figure_at(u, v).is_some() { 255 } else { 0 }])
+    });
+    (picture, truth)
+}
+
+/// Sizes of the figure's picture, and how far it stands from the middle.
+const FIGURES: [([u32; 2], f64); 3] = [([640, 480], -0.08), ([480, 640], 0.0), ([960, 540], 0.08)];
+/// Its face, an eye, its beak, scarf, belly, body, an arm and a foot.
+const PARTS: [[f64; 2]; 8] =
+    [[0.06, -0.21], [0.035, -0.235], [0.0, -0.19], [0.05, -0.11], [0.0, 0.07], [0.14, 0.05], [-0.23, 0.02], [0.1, 0.3]];
+
+fn is_on(mask: &GrayImage, at: [f64; 2]) -> bool {
+    let [x, y] = [at[0] * f64::from(mask.width()), at[1] * f64::from(mask.height())];
+    mask.get_pixel(x as u32, y as u32).0[0] != 0
+}
+
+/// Whatever was clicked before, what is clicked is in the mask, or out of it.
+#[test]
+fn what_is_clicked_is_in_or_out() {
+    for (size, shift) in FIGURES.into_iter().take(2) {
+        let (picture, _) = figure(size, shift);
+        let mut marks = vec![];
+        let mut mask = GrayImage::new(size[0], size[1]);
+        // From the body on, as a user did whose click in the face changed nothing.
+        for part in PARTS.iter().rev() {
+            marks.push(object(in_figure(*part, size, shift)));
+            mask = next(&picture, &marks, &mask, &Cues::default());
+            for mark in &marks {
+                assert!(is_on(&mask, mark.click().unwrap().0), "{mark:?} after {} marks", marks.len());
+            }
+        }
+        for beside in [[0.3, -0.3], [0.0, -0.39], [0.0, 0.45]] {
+            let at = in_figure(beside, size, shift);
+            marks.push(Mark::Background { at });
+            mask = next(&picture, &marks, &mask, &Cues::default());
+            assert!(!is_on(&mask, at), "{beside:?}");
+        }
+        // Also what is of the object for certain, and of one colour with it.
+        let at = in_figure(PARTS[4], size, shift);
+        marks.push(Mark::Background { at });
+        let mask = next(&picture, &marks, &mask, &Cues::default());
+        let contrary = in_figure([PARTS[4][0] + 0.03, PARTS[4][1]], size, shift);
+        marks.push(object(contrary));
+        let mask = next(&picture, &marks, &mask, &Cues::default());
+        assert!(!is_on(&mask, at) && is_on(&mask, contrary));
+    }
+}
+
+/// A click on the object takes nothing away, one beside it adds nothing, and both leave alone what is far away.
+#[test]
+fn a_further_click_keeps_what_others_hold() {
+    for (size, shift) in FIGURES.into_iter().take(1) {
+        let (picture, truth) = figure(size, shift);
+        let body = object(in_figure(PARTS[5], size, shift));
+        for part in PARTS {
+            let at = in_figure(part, size, shift);
+            // The figure without what is about the part: a mask that a click there completes.
+            let near = |x: u32, y: u32, radius: f64| {
+                let [u, v] = [f64::from(x) / f64::from(size[0]), f64::from(y) / f64::from(size[1])];
+                let [w, h] = size.map(f64::from);
+                f64::hypot((u - at[0]) * w, (v - at[1]) * h) < radius * h
+            };
+            let region = 0.05;
+            for (adds, mark) in [(true, object(at)), (false, Mark::Background { at })] {
+                let before = GrayImage::from_fn(size[0], size[1], |x, y| {
+                    let on = truth.get_pixel(x, y).0[0] != 0;
+                    Luma([if on && !(adds && near(x, y, region)) { 255 } else { 0 }])
+                });
+                let after = next(&picture, &[body.clone(), mark], &before, &Cues::default());
+                for (x, y, is) in after.enumerate_pixels() {
+                    let was = before.get_pixel(x, y);
+                    assert!(is == was || (is.0[0] != 0) == adds, "{part:?} {adds}: {x} {y}");
+                    assert!(!adds || is == was || near(x, y, 2.0 * region), "{part:?}: {x} {y} is far away");
+                }
+            }
+        }
+    }
+}
+
+/// Steps go from a colour to the whole and back, never past the ends.
+#[test]
+fn steps_go_to_larger_and_smaller_segments() {
+    for (size, shift) in FIGURES {
+        let (picture, truth) = figure(size, shift);
+        let at = in_figure(PARTS[4], size, shift);
+        let of = |scale| mask(&picture, &[Mark::Object { at, scale }], &Cues::default());
+        let masks: Vec<GrayImage> = [-30, -2, -1, 1, 2, 3, 4, 5, 6, 29, 30].map(of).to_vec();
+        let area = |mask: &GrayImage| mask.as_raw().iter().filter(|v| **v != 0).count();
+        let areas: Vec<usize> = masks.iter().map(area).collect();
+        let best = masks.iter().map(|mask| iou(mask, &truth)).fold(0.0, f64::max);
+        println!("{size:?}: areas {areas:?}, best {best:.3}");
+        assert!(areas.is_sorted() && areas[0] > 0 && areas[9] == areas[10] && best > 0.95, "{areas:?} {best}");
+    }
+}
+
+#[test]
+fn a_lasso_is_as_good_as_a_box() {
+    for (size, shift) in FIGURES {
+        let (picture, truth) = figure(size, shift);
+        let (row, _) = row(&picture, &truth, &Cues::default());
+        print(&format!("{size:?}"), &row);
+        let [[.., clicks], [boxed, ..], [lasso, ..]] = row;
+        assert!(boxed.min(lasso) > 0.95 && clicks > 0.8, "{row:?}");
+    }
+}
+
+/// In a box around a figure and what stands beside it, a click on the latter takes that out and leaves the figure.
+#[test]
+fn a_click_takes_out_of_a_box_what_it_is_on() {
+    let (size, shift) = FIGURES[2];
+    let (mut picture, truth) = figure(size, shift);
+    for (x, y, pixel) in
+        picture.enumerate_pixels_mut().filter(|(x, y, _)| (280..360).contains(x) && (250..330).contains(y))
+    {
+        *pixel = image::Rgb([40, 90 + (x * 7 % 13) as u8, 150 + (y * 5 % 11) as u8]);
+    }
+    let bounds = [270.0 / 960.0, 0.1, 0.78, 0.9];
+    let marks = [Mark::Box { bounds }, Mark::Background { at: [320.0 / 960.0, 290.0 / 540.0] }];
+    let boxed = next(&picture, &marks[..1], &GrayImage::new(size[0], size[1]), &Cues::default());
+    assert!(is_on(&boxed, [320.0 / 960.0, 290.0 / 540.0]), "the case is too easy");
+    let clicked = next(&picture, &marks, &boxed, &Cues::default());
+    assert!(iou(&clicked, &truth) > 0.95, "{} of {}", iou(&clicked, &truth), iou(&boxed, &truth));
+}
+
+/// A second line adds what is in it; what lies beyond lines is in none of them.
+#[test]
+fn lines_enclose_what_they_mean() {
+    let around = |x: f64| {
+        let corner = |i: u32| {
+            let (sin, cos) = (f64::from(i) * std::f64::consts::TAU / 9.0).sin_cos();
+            [x + 0.14 * cos, 0.5 + 0.22 * sin]
+        };
+        Mark::Lasso { points: (0..9).map(corner).collect() }
+    };
+    let disc = |x: u32, y: u32, at: f64| f64::hypot(f64::from(x) - at, f64::from(y) - 60.0) < 16.0;
+    let picture = RgbImage::from_fn(160, 120, |x, y| {
+        let noise = ((x * 7 + y * 13) % 17) as u8;
+        image::Rgb(match (disc(x, y, 45.0), disc(x, y, 115.0)) {
+            (true, _) => [170 + noise, 60 + noise, 40],
+            (_, true) => [60, 150 + noise, 60 + noise],
+            _ => [60 + noise, 90 + noise, 120],
+        })
+    });
+    let of = |at: f64| GrayImage::from_fn(160, 120, |x, y| Luma([if disc(x, y, at) { 255 } else { 0 }]));
+    let marks = [around(45.0 / 160.0), around(115.0 / 160.0)];
+    let first = next(&picture, &marks[..1], &GrayImage::new(160, 120), &Cues::default());
+    assert!(iou(&first, &of(45.0)) > 0.9, "{}", iou(&first, &of(45.0)));
+    let both = next(&picture, &marks, &first, &Cues::default());
+    let second = GrayImage::from_fn(160, 120, |x, y| Luma([both.get_pixel(x, y).0[0] - first.get_pixel(x, y).0[0]]));
+    assert!(iou(&second, &of(115.0)) > 0.9, "{}", iou(&second, &of(115.0)));
+    // A brush means what it covers, whatever that looks like, and takes nothing else along.
+    let brush = |object| Mark::Brush { object, radius: 0.02, points: vec![[0.1, 0.9], [0.9, 0.9]] };
+    let painted = next(&picture, &[marks[0].clone(), brush(true)], &first, &Cues::default());
+    for (x, y, v) in painted.enumerate_pixels() {
+        let on = (f64::from(y) + 0.5 - 108.0).abs() <= 3.2 && (16..144).contains(&x);
+        let beyond = (f64::from(y) + 0.5 - 108.0).abs() > 3.2 || !(12..148).contains(&x);
+        let was = first.get_pixel(x, y).0[0];
+        assert!(!on || v.0[0] == 255);
+        assert!(!beyond || v.0[0] == was, "{x} {y}");
+    }
+    let marks = [marks[0].clone(), brush(true), brush(false)];
+    assert!(next(&picture, &marks, &painted, &Cues::default()) == first);
+}
+
+#[test]
+fn marks_that_make_no_sense_are_known() {
+    let sound = |text: &str| serde_json::from_str::<Mark>(text).is_ok_and(|mark| mark.is_sound());
+    assert!(sound(r#"{"kind":"object","at":[0.5,0.5]}"#) && sound(r#"{"kind":"object","at":[0.5,0.5],"scale":-2}"#));
+    assert!(sound(r#"{"kind":"lasso","points":[[0.1,0.1],[0.9,0.1],[0.5,0.9]]}"#));
+    assert!(sound(r#"{"kind":"brush","object":false,"radius":0.02,"points":[[0.1,0.1]]}"#));
+    for text in [
+        r#"{"kind":"object","at":[0.5,0.5],"scale":1000}"#,
+        r#"{"kind":"lasso","points":[[0.1,0.1],[0.9,0.1]]}"#,
+        r#"{"kind":"lasso","points":[[0.1,0.1],[0.9,0.1],[0.5,0.1]]}"#,
+        r#"{"kind":"lasso","points":[[0.1,0.1],[0.9,0.1],[0.5,1.9]]}"#,
+        r#"{"kind":"brush","object":false,"radius":0.02,"points":[]}"#,
+        r#"{"kind":"brush","object":false,"radius":0,"points":[[0.1,0.1]]}"#,
+        r#"{"kind":"brush","object":true,"radius":2,"points":[[0.1,0.1]]}"#,
+    ] {
+        assert!(!sound(text), "{text}");
+    }
 }
