@@ -4,6 +4,7 @@ use std::cmp::Ordering;
 use std::collections::{BTreeMap, HashSet};
 use std::num::NonZero;
 
+use glam::{DMat3, DQuat, DVec3};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rand::distr::{Distribution, Uniform};
 use rand_pcg::Pcg64;
@@ -125,8 +126,9 @@ pub fn from_points(points: &[Point], config: &super::Config, seed: u64) -> Resul
 /// Plain Gaussians at these points, at most `config.max_gaussians` of the densify settings: more points than that are
 /// thinned to one at the mean of each cell of the finest grid with as few occupied cells.
 ///
-/// They are round, seven tenths as wide as [`mean_distance_to_nearest`], of the points' colours from all sides, and of the
-/// opacity that the settings say. The order of the points does not matter.
+/// They are seven tenths as wide as [`mean_distance_to_nearest`], of the points' colours from all sides, and of the opacity
+/// that the settings say. Where the points around one lie on a surface ([`FLAT`]) it is a disc along it, a tenth as thick as
+/// the distance; elsewhere it is round. The order of the points does not matter.
 ///
 /// # Errors
 /// No points, or points that are not finite.
@@ -151,7 +153,16 @@ pub fn gaussians(points: &[Point], config: &super::Config, most: u32) -> Result<
     }
     let position: Vec<[f32; 3]> = points.iter().map(|(p, _)| p.map(|v| v as f32)).collect();
     let floor = median_nearest_distance(&position).map_or(1e-3, |d| (d * 0.01).max(1e-6));
-    let log_scale = mean_distance_to_nearest(&position, floor).into_iter().map(|d| [(0.7 * d).ln() as f32; 3]);
+    let normals = normals(&position);
+    let log_scale = mean_distance_to_nearest(&position, floor).into_iter().zip(&normals).map(|(distance, normal)| {
+        let [wide, thick] =
+            [WIDTH, if normal.is_some() { THICKNESS } else { WIDTH }].map(|v| (v * distance).ln() as f32);
+        [wide, wide, thick]
+    });
+    let rotation = normals.iter().map(|normal| {
+        let turn = normal.map_or(DQuat::IDENTITY, |normal| DQuat::from_rotation_arc(DVec3::Z, normal));
+        [turn.w, turn.x, turn.y, turn.z].map(|v| v as f32)
+    });
     let each = coefficients(config.degree);
     let harmonics = points.iter().flat_map(|(_, color)| {
         let first = color.map(|v| ((v / 255.0 - 0.5) / ZEROTH) as f32);
@@ -160,12 +171,58 @@ pub fn gaussians(points: &[Point], config: &super::Config, most: u32) -> Result<
     let opacity = if config.opacity > 0.0 { config.opacity } else { 0.1 };
     Ok(Cloud {
         log_scale: log_scale.collect(),
-        rotation: vec![[1.0, 0.0, 0.0, 0.0]; points.len()],
+        rotation: rotation.collect(),
         logit: vec![logit(opacity); points.len()],
         degree: config.degree,
         harmonics: harmonics.collect(),
         position,
     })
+}
+
+/// Standard deviation of a Gaussian at a point along the surface, and across it, in mean distances to the nearest points.
+const WIDTH: f64 = 0.7;
+const THICKNESS: f64 = 0.1;
+/// Points around one that tell the surface, itself included.
+const AROUND: usize = 12;
+/// They lie on a surface if they spread across it by at most this part of their whole spread (sums of squares).
+const FLAT: f64 = 0.15;
+
+/// The direction across which the points around each spread least, if they lie on a surface: the normal of Hoppe et al. 1992,
+/// either way round.
+fn normals(positions: &[[f32; 3]]) -> Vec<Option<DVec3>> {
+    use rayon::prelude::*;
+
+    let wide: Vec<[f64; 3]> = positions.iter().map(|p| p.map(f64::from)).collect();
+    // Four points are the fewest that need not lie on a plane.
+    let Some(asked) = NonZero::new(AROUND.min(positions.len())).filter(|asked| asked.get() >= 4) else {
+        return vec![None; positions.len()];
+    };
+    let tree: ImmutableKdTree<f64, 3> = ImmutableKdTree::new_from_slice(&wide);
+    let one = |position: &[f64; 3]| {
+        let found = tree.nearest_n::<SquaredEuclidean>(position, asked);
+        let around: Vec<DVec3> = found.iter().map(|near| DVec3::from(wide[near.item as usize])).collect();
+        let mean = around.iter().sum::<DVec3>() / around.len() as f64;
+        let spread = around.iter().fold(DMat3::ZERO, |sum, point| {
+            let off = *point - mean;
+            sum + DMat3::from_cols(off * off.x, off * off.y, off * off.z)
+        });
+        let whole = spread.x_axis.x + spread.y_axis.y + spread.z_axis.z;
+        least_axis(&spread, whole).filter(|axis| (spread * *axis).dot(*axis) <= FLAT * whole)
+    };
+    wide.par_iter().map(one).collect()
+}
+
+/// The eigenvector of the least eigenvalue of a symmetric matrix without negative ones, whose sum this is: inverse iteration.
+fn least_axis(matrix: &DMat3, sum: f64) -> Option<DVec3> {
+    let scaled = *matrix * (1.0 / sum);
+    // Without the small addition the inverse of an exact plane would not exist.
+    let inverse = (scaled + DMat3::IDENTITY * 1e-6).inverse();
+    // A start along none of the axes, which are often those of what is built.
+    let mut axis = DVec3::new(0.48, 0.6, 0.64);
+    for _ in 0..24 {
+        axis = (inverse * axis).try_normalize()?;
+    }
+    axis.is_finite().then_some(axis)
 }
 
 /// The means of these positions and colours in the cells of a grid that at most `most` are occupied of.
@@ -399,12 +456,10 @@ mod tests {
         assert_eq!(all.harmonics_of(7)[1..], [[0.0; 3]; 3]);
         assert!(all.logit.iter().all(|l| (crate::model::gaussians::sigmoid(*l) - 0.1).abs() < 1e-6));
         let spacing = mean_distance_to_nearest(&sorted, 1e-9);
-        assert!(
-            all.log_scale
-                .iter()
-                .zip(spacing)
-                .all(|(s, d)| s.iter().all(|s| (f64::from(*s).exp() - 0.7 * d).abs() < 1e-5))
-        );
+        let near = |log: f32, width: f64| (f64::from(log).exp() - width).abs() < 1e-5;
+        for ([x, y, z], d) in all.log_scale.iter().zip(spacing) {
+            assert!(near(*x, WIDTH * d) && near(*y, WIDTH * d) && (near(*z, WIDTH * d) || near(*z, THICKNESS * d)));
+        }
         let mut doubled: Vec<Point> = points.iter().rev().copied().collect();
         doubled.extend(&points);
         assert_eq!(made(&doubled, 1000), all, "neither order nor duplicates matter");
@@ -417,6 +472,36 @@ mod tests {
         let far = gaussians(&[colored([f32::NAN, 0.0, 0.0])], &config, 9);
         assert!(matches!(far, Err(Error::NotFinite { index: 0, .. })));
         assert_eq!(made(&points[..1], 9).len(), 1, "a single one has no neighbour to be measured by");
+    }
+
+    /// Points on a slanted plane become discs along it, also when it is one of the axes' planes; where points fill space, or are
+    /// too few, they are round.
+    #[test]
+    fn points_on_a_surface_become_discs_along_it() {
+        let black = |position: [f32; 3]| Point { position, color: [0; 3] };
+        let made = |points: &[Point]| gaussians(points, &crate::model::Config::default(), 1000).expect("points");
+        for normal in [DVec3::new(0.3, -0.5, 0.8).normalize(), DVec3::X, DVec3::NEG_Z] {
+            let (across, up) = normal.any_orthonormal_pair();
+            // A tenth of their distance off it.
+            let noise = random_points(400, 9);
+            let place = |i: usize| {
+                let (u, v) = ((i % 20) as f64, (i / 20) as f64);
+                (across * u + up * v + normal * (f64::from(noise[i][0]) * 0.025)).to_array().map(|v| v as f32)
+            };
+            let discs = made(&(0..400).map(|i| black(place(i))).collect::<Vec<_>>());
+            for (rotation, [x, _, z]) in discs.rotation.iter().zip(&discs.log_scale) {
+                let [w, x_, y_, z_] = rotation.map(f64::from);
+                let thin = DQuat::from_xyzw(x_, y_, z_, w) * DVec3::Z;
+                assert!(thin.dot(normal).abs() > 0.97, "{thin} for {normal}");
+                assert!((f64::from(x - z).exp() - WIDTH / THICKNESS).abs() < 1e-3);
+            }
+        }
+        let grid = |i: usize| [i % 6, i / 6 % 6, i / 36].map(|v| v as f32);
+        let filled = made(&(0..216).map(|i| black(grid(i))).collect::<Vec<_>>());
+        let inside = (0..216).filter(|i| filled.position[*i].iter().all(|v| (1.5..3.5).contains(v)));
+        assert!(inside.clone().count() == 8 && inside.into_iter().all(|i| filled.rotation[i] == [1.0, 0.0, 0.0, 0.0]));
+        let three = made(&[[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]].map(black));
+        assert!(three.log_scale.iter().all(|s| s[0] == s[2]));
     }
 
     #[test]
