@@ -209,6 +209,7 @@ fn a_model_that_cannot_be_read_is_one_sentence() {
         logit: vec![0.0; 2],
         degree: 0,
         harmonics: vec![[0.0; 3]; 2],
+        antialiased: false,
     };
     let bytes = ply::encode(&cloud);
     assert!(refused(&bytes).contains("vertex 1"));

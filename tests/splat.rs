@@ -32,6 +32,7 @@ fn cloud(n: usize, degree: u32) -> Cloud {
         logit: (0..n).map(|i| 4.0 * number(i, 9)).collect(),
         degree,
         harmonics: (0..n * coefficients(degree)).map(|i| three(i, 12)).collect(),
+        antialiased: false,
     }
 }
 
@@ -104,7 +105,7 @@ fn containers_say_the_same() {
         assert_eq!(read(own::encode(&whole), Container::Ply).position, whole.position);
         let glb = read(gltf::encode(&whole).expect("small"), Container::Glb);
         assert_eq!((&glb.position, &glb.harmonics), (&whole.position, &whole.harmonics));
-        let packed = read(spz::encode(&whole).expect("near"), Container::Spz);
+        let packed = read(spz::encode(&whole, spz::Version::Three).expect("near"), Container::Spz);
         let most = |a: &[[f32; 3]], b: &[[f32; 3]]| {
             a.as_flattened().iter().zip(b.as_flattened()).fold(0f32, |m, (a, b)| m.max((a - b).abs()))
         };
@@ -198,6 +199,109 @@ fn compress(cloud: &Cloud) -> Vec<u8> {
         }
     }
     bytes
+}
+
+/// A file that splat-transform 3.7.0 wrote of mip.ply, 24 Gaussians of degree 3 with numbers of everywhere.
+fn fixture(name: &str) -> Vec<u8> {
+    std::fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/splats").join(name))
+        .expect("a file of the repository")
+}
+
+fn assert_near(got: &[[f32; 3]], want: &[[f32; 3]], most: f32, what: &str) {
+    assert_eq!(got.len(), want.len(), "{what}");
+    let off = got.as_flattened().iter().zip(want.as_flattened()).fold(0f32, |m, (a, b)| m.max((a - b).abs()));
+    assert!(off <= most, "{what}: {off} of {most}");
+}
+
+/// Rounded as that program does it: to 12 fractional bits, to 16th parts of a natural logarithm, to 255 steps; harmonics to bytes
+/// first, then to five bits of degree 1 and four of the others.
+#[test]
+fn spz_of_its_own_program_is_what_it_was_made_of() {
+    let source = decode(fixture("mip.ply")).expect("a splat").cloud;
+    for name in ["mip-3.spz", "mip-4.spz"] {
+        let splat = decode(fixture(name)).expect(name);
+        let got = &splat.cloud;
+        assert_eq!((splat.container, got.degree, got.antialiased), (Container::Spz, 3, true), "{name}");
+        assert_near(&got.position, &source.position, 0.5 / 4096.0 + 1e-6, "positions");
+        assert_near(&got.log_scale, &source.log_scale, 0.5 / 16.0 + 1e-6, "scales");
+        for i in 0..source.len() {
+            let (a, b) = (got.harmonics_of(i), source.harmonics_of(i));
+            assert_near(&a[..1], &b[..1], 0.5 / 255.0 / 0.15 + 1e-6, "colours");
+            assert_near(&a[1..4], &b[1..4], (0.5 * 8.0 + 0.5) / 128.0 + 1e-6, "degree 1");
+            assert_near(&a[4..], &b[4..], (0.5 * 16.0 + 0.5) / 128.0 + 1e-6, "degrees 2 and 3");
+            assert!((sigmoid(got.logit[i]) - sigmoid(source.logit[i])).abs() <= 0.5 / 255.0 + 1e-4);
+            let dot: f32 = got.rotation[i].iter().zip(source.rotation[i]).map(|(a, b)| a * b).sum();
+            // The angle is at most 6e-3, as in the format's own tests.
+            assert!(dot.abs() >= 1.0 - 1e-5, "{dot}");
+        }
+        // Nothing of the tag is lost on the way into a file with rows.
+        assert!(decode(splat.spliced(&[true; 24], &Cloud::default())).expect("a splat").cloud.antialiased, "{name}");
+    }
+}
+
+/// Version 2 byte by byte, after the specification.
+#[test]
+fn spz_of_version_2_by_hand() {
+    let mut raw = b"NGSP".to_vec();
+    raw.extend([2, 0, 0, 0, 1, 0, 0, 0, 0, 8, 0, 0]);
+    // -1.5, 0 and 2 with 8 fractional bits.
+    raw.extend([0x80, 0xfe, 0xff, 0, 0, 0, 0, 2, 0]);
+    raw.extend([51, 0, 255, 128, 160, 0, 144]);
+    // x of 1, y and z of half a step, w of nothing.
+    raw.extend([255, 127, 127]);
+    let zip = |raw: &[u8]| {
+        let mut packed = flate2::write::GzEncoder::new(vec![], flate2::Compression::fast());
+        std::io::Write::write_all(&mut packed, raw).expect("memory");
+        packed.finish().expect("memory")
+    };
+    let cloud = decode(zip(&raw)).expect("a splat").cloud;
+    assert_eq!((cloud.position[0], cloud.log_scale[0]), ([-1.5, 0.0, 2.0], [0.0, -10.0, -1.0]));
+    assert!((sigmoid(cloud.logit[0]) - 0.2).abs() < 1e-6);
+    assert_near(&cloud.harmonics, &[[-0.5 / 0.15, 0.5 / 0.15, 0.5 / 255.0 / 0.15]], 1e-6, "colour");
+    let q = cloud.rotation[0];
+    assert!(q[0] == 0.0 && q[1] > 0.9999 && q[2].abs() < 0.004 && q[3].abs() < 0.004, "{q:?}");
+    let with = |at: usize, value: u8| {
+        let mut changed = raw.clone();
+        changed[at] = value;
+        decode(zip(&changed)).expect_err("refused")
+    };
+    assert_eq!(with(4, 1), "it is SPZ of version 1; versions 2, 3 and 4 are read");
+    assert_eq!(with(4, 5), "it is SPZ of version 5; versions 2, 3 and 4 are read");
+    assert_eq!(with(12, 4), "it is SPZ of degree 4; degrees 0 to 3 are read");
+    assert!(with(9, 255).contains("cut off") && with(11, 255).contains("Gaussians"));
+    // Version 4 cut off anywhere, or with a table that promises more.
+    let frames = fixture("mip-4.spz");
+    (0..frames.len()).for_each(|end| assert!(decode(frames[..end].to_vec()).is_err(), "{end}"));
+    for at in [8, 11, 15, 16, 19, 32, 39, 40, 47] {
+        let mut changed = frames.clone();
+        changed[at] ^= 0x80;
+        assert!(decode(changed).is_err(), "{at}");
+    }
+}
+
+/// What programs write for it, the last one of a header, and that it goes into what is written again.
+#[test]
+fn the_antialias_tag_of_a_ply_is_kept() {
+    let whole = Cloud { antialiased: true, ..cloud(5, 1) };
+    let tagged = own::encode(&whole);
+    assert!(decode(tagged.clone()).expect("a splat").cloud.antialiased);
+    let with = |comments: &str| {
+        let tag = tagged.windows(own::TAG.len()).position(|w| w == own::TAG.as_bytes()).expect("it is there");
+        decode([&tagged[..tag], comments.as_bytes(), &tagged[tag + own::TAG.len()..]].concat()).expect("a splat")
+    };
+    for (comments, is) in [
+        ("", false),
+        ("comment antialiased 1\n", true),
+        ("comment splatrendermode: MIP\r\n", true),
+        ("comment SplatRenderMode: default\n", false),
+        ("comment antialiased 1\ncomment SplatRenderMode: 2dgs\n", false),
+        ("comment mip\n", false),
+    ] {
+        let splat = with(comments);
+        assert_eq!(splat.cloud.antialiased, is, "{comments}");
+        let again = decode(splat.spliced(&[true, false, true, true, true], &cloud(2, 0))).expect("a splat");
+        assert_eq!((again.len(), again.cloud.antialiased), (6, is), "{comments}");
+    }
 }
 
 #[test]

@@ -33,7 +33,7 @@ pub(super) const STEM: &str = "scene";
 /// are read off from the training cameras and from cameras between them, refined against the anchors' own pictures, and
 /// pruned. What that costs is measured on views that took no part, printed, and written to export.json.
 ///
-/// scene.ply is the file of 3D Gaussian Splatting (62 floats), scene.spz Niantic's SPZ of version 3, scene.glb glTF with
+/// scene.ply is the file of 3D Gaussian Splatting (62 floats), scene.spz Niantic's SPZ (--spz-version), scene.glb glTF with
 /// KHR_gaussian_splatting. Up is -y in the first two and +y in the last.
 ///
 /// A model of plain Gaussians (model.form) is neither baked nor refined: it is written as it is.
@@ -52,6 +52,9 @@ pub(super) struct Args {
     /// Files to write
     #[arg(long, value_enum, value_delimiter = ',', default_value = "ply,spz,glb")]
     formats: Vec<Format>,
+    /// Version of scene.spz: 3, or 2 for older readers, with coarser rotations
+    #[arg(long, value_name = "2|3", default_value = "3", value_parser = spz_version)]
+    spz_version: spz::Version,
     /// Which way is up
     #[arg(long, value_enum, default_value_t = Up::Auto)]
     up: Up,
@@ -93,6 +96,14 @@ enum Format {
     Glb,
 }
 
+fn spz_version(text: &str) -> Result<spz::Version, String> {
+    match text {
+        "2" => Ok(spz::Version::Two),
+        "3" => Ok(spz::Version::Three),
+        _ => Err("versions 2 and 3 are written".to_owned()),
+    }
+}
+
 impl Format {
     fn extension(self) -> &'static str {
         match self {
@@ -106,10 +117,10 @@ impl Format {
         format!("{STEM}.{}", self.extension())
     }
 
-    fn encode(self, cloud: &Cloud) -> Result<Vec<u8>, export::Error> {
+    fn encode(self, cloud: &Cloud, version: spz::Version) -> Result<Vec<u8>, export::Error> {
         match self {
             Self::Ply => Ok(ply::encode(cloud)),
-            Self::Spz => spz::encode(cloud),
+            Self::Spz => spz::encode(cloud, version),
             Self::Glb => gltf::encode(cloud),
         }
         .map_err(export::Error::Format)
@@ -266,6 +277,7 @@ impl Args {
             model: run.to_owned(),
             out: Some(out.to_owned()),
             formats: Format::value_variants().to_vec(),
+            spz_version: spz::Version::default(),
             up: Up::Auto,
             degree,
             views,
@@ -352,7 +364,7 @@ pub(super) fn export(
         // All files are made before the first is written.
         let mut written = vec![];
         for format in &args.formats {
-            let bytes = format.encode(&made.cloud)?;
+            let bytes = format.encode(&made.cloud, args.spz_version)?;
             let background = settings.train.background.map(|channel| channel as f32);
             let read_back = format.decode(&bytes)?;
             let times = low_pass::measured(made.larger);

@@ -182,6 +182,7 @@ mod tests {
             logit: (0..n).map(|i| if i % 4 == 0 { -9.0 } else { logit(0.1 + 0.02 * i as f64) }).collect(),
             degree: 1,
             harmonics: (0..4 * n).map(|i| [i as f32; 3]).collect(),
+            antialiased: false,
         }
     }
 

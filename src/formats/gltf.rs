@@ -177,6 +177,7 @@ pub fn decode(bytes: &[u8]) -> Result<Cloud, String> {
         logit: of("OPACITY")?.iter().map(|o| logit(f64::from(*o))).collect(),
         degree,
         harmonics,
+        antialiased: false,
     };
     if [cloud.log_scale.len(), cloud.rotation.len(), cloud.logit.len()] != [n; 3] {
         return Err(broken("its attributes are not of the same number of Gaussians"));

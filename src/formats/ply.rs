@@ -1,4 +1,4 @@
-//! The PLY file of 3D Gaussian Splatting: 62 float32 per Gaussian, binary little endian, no comment lines.
+//! The PLY file of 3D Gaussian Splatting: 62 float32 per Gaussian, binary little endian, no comment lines but [`TAG`].
 //!
 //! `x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3`: normals 0, `f_rest` fifteen coefficients of red,
 //! then green, then blue, those beyond the cloud's degree 0; opacity as logit, scales as natural logarithms, the unit
@@ -9,6 +9,8 @@ use crate::model::gaussians::Cloud;
 
 /// Floats of a Gaussian.
 pub const FLOATS: usize = 62;
+/// The line of Gaussians that were trained with antialiasing, as Brush and splat-transform write it.
+pub const TAG: &str = "comment SplatRenderMode: mip\n";
 /// Coefficients per channel behind the first, of degree 3.
 const REST: usize = 15;
 
@@ -26,14 +28,15 @@ pub fn properties() -> Vec<String> {
         .collect()
 }
 
-fn header(count: usize) -> String {
+fn header(count: usize, antialiased: bool) -> String {
+    let tag = if antialiased { TAG } else { "" };
     let properties: String = properties().iter().map(|name| format!("property float {name}\n")).collect();
-    format!("ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n")
+    format!("ply\nformat binary_little_endian 1.0\n{tag}element vertex {count}\n{properties}end_header\n")
 }
 
 /// The file's bytes.
 pub fn encode(cloud: &Cloud) -> Vec<u8> {
-    let mut bytes = header(cloud.len()).into_bytes();
+    let mut bytes = header(cloud.len(), cloud.antialiased).into_bytes();
     bytes.reserve_exact(cloud.len() * FLOATS * 4);
     for i in 0..cloud.len() {
         let harmonics = cloud.harmonics_of(i);
@@ -72,7 +75,8 @@ pub fn decode(bytes: &[u8]) -> Result<Cloud, String> {
     let head = std::str::from_utf8(head).map_err(|_| broken("the header is not text"))?;
     let count = head.lines().find_map(|line| line.strip_prefix("element vertex ")?.parse().ok());
     let count: usize = count.ok_or_else(|| broken("it does not say how many Gaussians it holds"))?;
-    if head != header(count) {
+    let antialiased = head.contains(TAG);
+    if head != header(count, antialiased) {
         return Err(broken("its header is another"));
     }
     if count.checked_mul(FLOATS * 4) != Some(body.len()) {
@@ -84,7 +88,7 @@ pub fn decode(bytes: &[u8]) -> Result<Cloud, String> {
     let highest = |row: &[f32; FLOATS]| (0..REST).rev().find(|k| (0..3).any(|c| row[9 + c * REST + k] != 0.0));
     let last = rows.iter().filter_map(highest).max().map_or(0, |k| k + 1);
     let degree = (0..3).find(|d| coefficients(*d) > last).unwrap_or(3);
-    let mut cloud = Cloud { degree, ..Cloud::default() };
+    let mut cloud = Cloud { degree, antialiased, ..Cloud::default() };
     for row in rows {
         cloud.position.push([row[0], row[1], row[2]]);
         cloud.harmonics.push([row[6], row[7], row[8]]);

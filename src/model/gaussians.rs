@@ -25,6 +25,9 @@ pub struct Cloud {
     pub degree: u32,
     /// \[gaussian, coefficient\] rgb, `(degree + 1)^2` coefficients: see [`crate::math::harmonics`].
     pub harmonics: Vec<[f32; 3]>,
+    /// Whether the opacities were trained for antialiasing (Mip-Splatting), where a Gaussian that is smaller than a pixel is
+    /// fainter. Files keep it; pictures here are drawn without.
+    pub antialiased: bool,
 }
 
 impl Cloud {
@@ -227,6 +230,7 @@ impl Static {
             logit: read(&self.logit)?,
             degree: self.degree,
             harmonics,
+            antialiased: false,
         })
     }
 }

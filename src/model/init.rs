@@ -176,6 +176,7 @@ pub fn gaussians(points: &[Point], config: &super::Config, most: u32) -> Result<
         degree: config.degree,
         harmonics: harmonics.collect(),
         position,
+        antialiased: false,
     })
 }
 

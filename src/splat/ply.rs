@@ -302,17 +302,33 @@ fn body_of(bytes: &[u8]) -> usize {
     find(END).or_else(|| find(b"end_header\r\n")).unwrap_or(0)
 }
 
+/// Whether the header's comments say that the Gaussians were trained with antialiasing: `SplatRenderMode: mip` of Brush and
+/// splat-transform, `antialiased 1` of Postshot. The last one holds.
+fn antialiased(bytes: &[u8]) -> bool {
+    let text = String::from_utf8_lossy(&bytes[..body_of(&bytes[..bytes.len().min(HEADER)])]).to_lowercase();
+    let said =
+        text.lines().filter_map(
+            |line| match line.strip_prefix("comment ")?.split_whitespace().collect::<Vec<_>>()[..] {
+                ["splatrendermode:", mode] => Some(mode == "mip"),
+                ["antialiased", flag] => Some(flag == "1"),
+                _ => None,
+            },
+        );
+    said.last().unwrap_or(false)
+}
+
 /// The Gaussians of a file of either form, and its rows where they can be kept byte by byte.
 ///
 /// # Errors
 /// Files of other things, or that are cut off: what is wrong, in words that follow the file's name.
 pub fn read(bytes: Vec<u8>) -> Result<(Cloud, Option<Rows>), String> {
     let elements = elements(&bytes)?;
+    let antialiased = antialiased(&bytes);
     let element = |name: &str| elements.iter().find(|element| element.name == name);
     let vertex = element("vertex").ok_or("it has no element vertex")?;
     if vertex.find("packed_position").is_some() {
         let chunks = element("chunk").ok_or("it has packed Gaussians and no element chunk")?;
-        return Ok((unpacked(&bytes, chunks, vertex, element("sh"))?, None));
+        return Ok((Cloud { antialiased, ..unpacked(&bytes, chunks, vertex, element("sh"))? }, None));
     }
     if vertex.find("f_dc_0").is_none() && vertex.find("f_anchor_feat_0").is_some() {
         return Err("it holds anchors, which are no splat; `gscream-vk export` makes one of their run".into());
@@ -321,7 +337,7 @@ pub fn read(bytes: Vec<u8>) -> Result<(Cloud, Option<Rows>), String> {
         return Err("it is a point cloud without Gaussians (no f_dc_0)".into());
     }
     let columns = Columns::of(vertex)?;
-    let mut cloud = Cloud { degree: columns.degree, ..Cloud::default() };
+    let mut cloud = Cloud { degree: columns.degree, antialiased, ..Cloud::default() };
     (0..vertex.count).for_each(|i| columns.append(vertex.row(&bytes, i), &mut cloud));
     let vertex = vertex.clone();
     Ok((cloud, Some(Rows { bytes, vertex, columns })))

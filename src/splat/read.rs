@@ -39,6 +39,10 @@ const MOST_LOGIT: f32 = 20.0;
 /// Natural logarithms of standard deviations that are drawn, scene units; files have minus infinity for flat Gaussians.
 const LOG_SCALES: [f32; 2] = [-30.0, 20.0];
 
+/// What is said of a splat whose [`Cloud::antialiased`] is set.
+pub const ANTIALIASED: &str = "this splat was trained with antialiasing and is drawn without: Gaussians smaller than a pixel \
+                               look heavier than its own program shows them";
+
 /// Whether the file begins as one of a splat, whatever its name.
 pub fn is_splat(path: &Path) -> bool {
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
@@ -70,7 +74,7 @@ fn decoded(bytes: Vec<u8>) -> Result<Splat, String> {
             (if rows.is_some() { Container::Ply } else { Container::CompressedPly }, cloud, rows)
         }
         Some(b"glTF") => (Container::Glb, gltf::decode(&bytes)?, None),
-        Some([0x1f, 0x8b, ..]) => (Container::Spz, spz::decode(&bytes)?, None),
+        Some([0x1f, 0x8b, ..] | b"NGSP") => (Container::Spz, spz::decode(&bytes)?, None),
         _ => return Err("it is none of PLY, SPZ and GLB; splats come in these".into()),
     };
     if cloud.is_empty() {

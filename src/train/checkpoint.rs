@@ -169,6 +169,7 @@ impl Model {
             logit: self.float("logit").to_vec(),
             degree: self.degree().unwrap_or(0),
             harmonics: triples("harmonics"),
+            antialiased: false,
         }
     }
 

@@ -181,7 +181,11 @@ fn exports() {
     Loader::of_bytes("splat.ply (compressed)", vec![seeds::compressed_splat()]).run(whole);
     Loader::of_text("splat.ply (compressed, header)", vec![seeds::compressed_splat()]).run(whole);
     Loader::of_text("cameras.json", vec![seeds::cameras_json()]).run(of_file("cameras.json", splat::cameras::read));
-    let packed: Vec<_> = clouds.iter().map(|cloud| spz::encode(cloud).expect("it fits")).collect();
+    let versions = [spz::Version::Two, spz::Version::Three];
+    let encode = |cloud| versions.map(|version| spz::encode(cloud, version).expect("it fits"));
+    let packed: Vec<_> = clouds.iter().flat_map(encode).collect();
+    let frames = vec![seeds::read(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/splats/mip-4.spz"))];
+    Loader::of_bytes("splat.spz (version 4)", frames).run(whole);
     Loader::of_bytes("scene.spz", packed.clone()).run(|bytes| told(spz::decode(bytes)));
     let raw: Vec<_> = packed.iter().map(|bytes| seeds::gunzip(bytes)).collect();
     // Seeds are given as they are, so that what is read is packed here.

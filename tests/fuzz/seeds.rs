@@ -146,6 +146,7 @@ pub fn cloud(degree: u32) -> Cloud {
         logit: vec![0.5; n],
         degree,
         harmonics: vec![[0.25, -0.5, 0.125]; n * coefficients(degree)],
+        antialiased: false,
     }
 }
 

@@ -68,6 +68,9 @@ pub fn open(args: &Args, places: &Places) -> anyhow::Result<Source> {
         bail!("{}: what is made would be written over it: choose another --out", path.display());
     }
     let splat = read::read(path)?;
+    if splat.cloud.antialiased {
+        eprintln!("warning: {}", read::ANTIALIASED);
+    }
     let from = args.cameras.clone().or_else(|| cameras::beside(path)).ok_or_else(|| {
         Error::Request(format!(
             "{}: there is no cameras.json beside it; name one, or the folder of a COLMAP model, with --cameras",
@@ -170,7 +173,7 @@ impl Job<'_> {
             (root.join(FIGURES), serde_json::to_vec_pretty(&cameras)?),
             (root.join(format!("{STEM}.glb")), gltf::encode(&joined).map_err(export::Error::Format)?),
         ];
-        match spz::encode(&joined) {
+        match spz::encode(&joined, spz::Version::default()) {
             Ok(bytes) => files.push((root.join(format!("{STEM}.spz")), bytes)),
             Err(error) => eprintln!("splat: {STEM}.spz is left out: {error}"),
         }
