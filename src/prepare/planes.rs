@@ -116,14 +116,17 @@ fn planes(mut points: Vec<([f64; 2], f64)>, rng: &mut Pcg64) -> Vec<Plane> {
     found
 }
 
-/// Finds the surfaces around a hole and continues them in it. The same seed finds the same.
-pub fn surfaces<F: Fn(usize, f64) -> f64>(hole: &Hole<'_, F>, seed: u64) -> Surfaces {
-    let [w, h] = hole.size;
-    let known = |i: usize| !hole.unknown[i] && hole.disparity[i] > 0.0 && hole.disparity[i].is_finite();
-    let all: Vec<usize> = (0..w * h).filter(|i| known(*i) && hole.rays[*i].is_some()).collect();
+/// The largest planes around a hole, the largest first, by what [`Hole`] says of its pixels. The same seed finds the same.
+pub fn around(disparity: &[f32], rays: &[Option<[f64; 2]>], unknown: &[bool], seed: u64) -> Vec<Plane> {
+    let known = |i: usize| !unknown[i] && disparity[i] > 0.0 && disparity[i].is_finite();
+    let all: Vec<usize> = (0..rays.len()).filter(|i| known(*i) && rays[*i].is_some()).collect();
     let every = all.len().div_ceil(SAMPLES).max(1);
-    let points = all.iter().step_by(every).filter_map(|i| Some((hole.rays[*i]?, f64::from(hole.disparity[*i]))));
-    let planes = planes(points.collect(), &mut Pcg64::new(seed.into(), 41));
+    let points = all.iter().step_by(every).filter_map(|i| Some((rays[*i]?, f64::from(disparity[*i]))));
+    planes(points.collect(), &mut Pcg64::new(seed.into(), 41))
+}
+
+/// Continues these planes, and what is beside them, in a hole.
+pub fn surfaces<F: Fn(usize, f64) -> f64>(hole: &Hole<'_, F>, planes: Vec<Plane>) -> Surfaces {
     let label = labels(hole, &planes);
     let disparity = continued(hole, &planes, &label);
     Surfaces { label, disparity, planes }
@@ -382,7 +385,7 @@ mod tests {
             outline: &outline,
             against: |_, _| 0.0,
         };
-        let found = surfaces(&hole, 5);
+        let found = surfaces(&hole, around(hole.disparity, hole.rays, hole.unknown, 5));
         assert_eq!(found.planes.len(), 2, "planes");
         let wrong = (0..truth.len()).filter(|i| unknown[*i] && (found.disparity[*i] / truth[*i] - 1.0).abs() > 0.01);
         let border = |i: usize| {
@@ -404,7 +407,7 @@ mod tests {
         let against = |i: usize, d: f64| if d > 0.4 && i % SIZE[0] >= 45 { 1.0 } else { 0.0 };
         let outline = outline(&unknown);
         let hole = Hole { size: SIZE, disparity: &truth, rays: &rays, unknown: &unknown, outline: &outline, against };
-        let found = surfaces(&hole, 5);
+        let found = surfaces(&hole, around(hole.disparity, hole.rays, hole.unknown, 5));
         for i in (0..truth.len()).filter(|i| unknown[*i] && (40..50).contains(&(i / SIZE[0]))) {
             let expected = if i % SIZE[0] < 45 { 0.5 } else { 0.25 };
             let near = (44..47).contains(&(i % SIZE[0]));
@@ -430,7 +433,7 @@ mod tests {
             outline: &outline,
             against: |_, _| 0.0,
         };
-        let found = surfaces(&hole, 5);
+        let found = surfaces(&hole, around(hole.disparity, hole.rays, hole.unknown, 5));
         let ends = (40..80).find(|x| (found.disparity[45 * SIZE[0] + x] - 0.25).abs() < 0.01);
         assert!(ends.is_some_and(|x| (42..70).contains(&x)), "{ends:?}");
     }
@@ -449,7 +452,7 @@ mod tests {
             outline: &outline,
             against: |_, _| 0.0,
         };
-        let found = surfaces(&hole, 0);
+        let found = surfaces(&hole, around(hole.disparity, hole.rays, hole.unknown, 0));
         assert!(found.planes.is_empty());
         assert!(found.disparity.iter().all(|d| d.is_nan()));
     }

@@ -12,7 +12,7 @@ use super::texture::{self, Texture};
 use crate::prepare::planes::{Plane, membrane};
 
 /// Longer side of a chart at most, pixels.
-const CHART: f64 = 640.0;
+const CHART: f64 = 960.0;
 /// Least margin of a chart around what is to be filled, pixels.
 const MARGIN: f64 = 48.0;
 /// A chart ends where the plane is this many times as far as in the middle of what is to be filled.

@@ -11,6 +11,7 @@ mod color;
 mod gradient;
 mod guess;
 mod shade;
+mod support;
 mod surface;
 mod texture;
 

@@ -9,6 +9,7 @@ use glam::{DMat3, DVec3};
 use image::GrayImage;
 use rayon::prelude::*;
 
+use super::support::Support;
 use crate::multiview::DepthGrid;
 use crate::prepare::planes;
 use crate::scene::Camera;
@@ -27,6 +28,8 @@ const HULL: f64 = 0.8;
 const HULL_VIEWS: usize = 3;
 /// Part of what speaks against a surface that all other views have hidden behind something else; 1 is a proof.
 const BURIED: f64 = 0.1;
+/// The same of a surface behind what the object stands on: likely, and no proof.
+const BELOW: f64 = 0.5;
 /// Relative difference to a plane up to which a measured inverse depth is taken to lie on it.
 const FLAT: f32 = 0.015;
 /// Least width of a hole's surroundings, sites.
@@ -459,18 +462,36 @@ impl Sights {
             let outline: Vec<bool> = sites.iter().map(|site| ring(*site) || edge(*site)).collect();
             let open: Vec<bool> = sites.iter().map(|site| unknown[*site] || ring(*site)).collect();
             let known: Vec<f32> = sites.iter().map(|site| disparity[*site]).collect();
+            let size = window.size;
+            let planes = planes::around(&known, &rays, &open, seed);
+            // The margin around the object shows what is behind it.
+            let deep = |site: usize| own.around(site).all(|near| own.hole[near]);
+            let object: Vec<DVec3> = (0..own.hole.len())
+                .filter(|site| own.grid.confirmed[*site] && deep(*site))
+                .map(|site| {
+                    let ([x, y], z) = (own.ray(site), own.grid.depth[site]);
+                    DVec3::new(x, y, 1.0) * z
+                })
+                .collect();
+            let supports: Vec<Support> = planes.iter().filter_map(|plane| Support::new(*plane, &object)).collect();
+            log::debug!("surface: {} planes, the object stands on {}", planes.len(), supports.len());
+            let under = |site: &usize| {
+                let depths = supports.iter().filter_map(|support| support.under(own.ray(*site)));
+                depths.reduce(f64::min).filter(|_| own.hole[*site])
+            };
+            let under: Vec<Option<f64>> = sites.iter().map(under).collect();
             let against = |cell: usize, d: f64| {
                 let site = sites[cell];
                 let object = own.hole[site] && own.grid.confirmed[site];
                 if d.is_nan() || d <= 0.0 || object && 1.0 / d < (1.0 - APART) * own.grid.depth[site] {
                     return 1.0;
                 }
-                self.against(of, own.point(site, 1.0 / d))
+                let hidden = under[cell].is_some_and(|z| 1.0 / d > (1.0 + SAME) * z);
+                self.against(of, own.point(site, 1.0 / d)).max(if hidden { BELOW } else { 0.0 })
             };
-            let size = window.size;
             let hole =
                 planes::Hole { size, disparity: &known, rays: &rays, unknown: &open, outline: &outline, against };
-            let found = planes::surfaces(&hole, seed);
+            let found = planes::surfaces(&hole, planes);
             surface.fill(found.planes.len() as u8);
             for (cell, &site) in sites.iter().enumerate() {
                 surface[site] = found.label[cell];

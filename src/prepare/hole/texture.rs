@@ -40,9 +40,9 @@ const SHORTEST: f64 = 0.06;
 const DIFFERENT: f32 = 0.6;
 /// Sum of the differences of the channels from which on a copy shows something else than what is known there.
 const ANOTHER: f32 = 0.3;
-/// Sum of the differences of the channels up to which surroundings are of one material in another light, which costs nothing:
-/// copies take the light of their place.
-const LIGHT: f32 = 0.15;
+/// Mean difference of the channels up to which surroundings are of one material in another light, which costs nothing: copies
+/// take the light of their place.
+const LIGHT: f32 = 0.05;
 /// Cost of a copy whose surroundings differ in one channel by the whole range from what goes on into the hole, at its border;
 /// it falls by a factor e every `FADES` of the hole's half width.
 const UNLIKE: f64 = 6.0;
@@ -307,9 +307,13 @@ impl Texture {
         let deepest = (0..w * h).filter(|i| self.hole[*i]).map(|i| inwards[i]).max().unwrap_or(1);
         let fades = FADES * f64::from(deepest);
         move |pixel, from| {
-            let apart: f32 = (0..3).map(|c| (around[from][c] - expected[pixel][c]).abs()).sum();
+            let off: [f32; 3] = std::array::from_fn(|c| around[from][c] - expected[pixel][c]);
+            let light = off.iter().sum::<f32>() / 3.0;
+            // Light is alike in all channels; the rest is another colour.
+            let color: f32 = off.iter().map(|off| (off - light).abs()).sum();
+            let apart = color + 3.0 * (light.abs() - LIGHT).max(0.0);
             let weight = UNLIKE * (-f64::from(inwards[pixel]) / fades).exp();
-            if apart.is_finite() { weight * f64::from((apart - LIGHT).max(0.0)) } else { 0.0 }
+            if apart.is_finite() { weight * f64::from(apart) } else { 0.0 }
         }
     }
 }
