@@ -127,7 +127,7 @@ pub fn from_points(points: &[Point], config: &super::Config, seed: u64) -> Resul
 /// thinned to one at the mean of each cell of the finest grid with as few occupied cells.
 ///
 /// They are seven tenths as wide as [`mean_distance_to_nearest`], of the points' colours from all sides, and of the opacity
-/// that the settings say. Where the points around one lie on a surface ([`FLAT`]) it is a disc along it, a tenth as thick as
+/// that the settings say. Where the points around one lie on a surface (by their spread) it is a disc along it, a tenth as thick as
 /// the distance; elsewhere it is round. The order of the points does not matter.
 ///
 /// # Errors

@@ -9,7 +9,7 @@
 //! A cut at a small size finds the object, a second one around it draws its border. A further click changes the mask
 //! around it, the farther it is from the outline the farther, and leaves the rest as it is; so does the first one in a
 //! view to which other views' masks were carried. What it may not change is in [`next`]. Who wants a larger or smaller
-//! part than a click takes by itself goes along the segments of several scales about it ([`tree`]).
+//! part than a click takes by itself goes along the segments of several scales about it (`tree`).
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;

@@ -306,7 +306,7 @@ fn body_of(bytes: &[u8]) -> usize {
 /// splat-transform, `antialiased 1` of Postshot. The last one holds.
 fn antialiased(bytes: &[u8]) -> bool {
     let text = String::from_utf8_lossy(&bytes[..body_of(&bytes[..bytes.len().min(HEADER)])]).to_lowercase();
-    let said =
+    let mut said =
         text.lines().filter_map(
             |line| match line.strip_prefix("comment ")?.split_whitespace().collect::<Vec<_>>()[..] {
                 ["splatrendermode:", mode] => Some(mode == "mip"),
@@ -314,7 +314,7 @@ fn antialiased(bytes: &[u8]) -> bool {
                 _ => None,
             },
         );
-    said.last().unwrap_or(false)
+    said.next_back().unwrap_or(false)
 }
 
 /// The Gaussians of a file of either form, and its rows where they can be kept byte by byte.
