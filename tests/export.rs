@@ -15,7 +15,7 @@ use base64::prelude::BASE64_STANDARD;
 use gscream_vk::evaluate::psnr;
 use gscream_vk::export::draw::Drawer;
 use gscream_vk::export::{self, Cloud, low_pass, sigmoid};
-use gscream_vk::formats::{gltf, ply, spz};
+use gscream_vk::formats::{gltf, ply, sog, splat, spz};
 use gscream_vk::gpu::testing;
 use gscream_vk::math::harmonics::{HALF_TURN_ABOUT_X, coefficients};
 use gscream_vk::model::gaussians::Static;
@@ -147,6 +147,28 @@ fn splat_transform_reads_the_ply_and_the_spz() {
     }
 }
 
+/// It writes no `.splat` and orders a SOG itself, so that ours are compared with what we read of them.
+#[test]
+fn splat_transform_reads_the_sog_and_the_splat() {
+    if !installed("@playcanvas/splat-transform") {
+        return;
+    }
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let same = Within(2e-6, 1e-5, 2e-3, 1.1e-4, 1e-5, 1e-5);
+    for degree in [0, 1, 2, 3] {
+        let path = folder.path().join(format!("degree{degree}.sog"));
+        let bytes = sog::encode(&cloud(60, degree)).expect("it fits");
+        fs::write(&path, &bytes).expect("writable");
+        assert_alike(&by_splat_transform(&path, degree), &sog::decode(&bytes).expect("ours"), &same);
+    }
+    let path = folder.path().join("scene.splat");
+    let bytes = splat::encode(&cloud(60, 0));
+    fs::write(&path, &bytes).expect("writable");
+    // It takes 255 steps of a rotation for 256: up to a step in each of four components, and twice that.
+    let turned = Within(2e-6, 1e-5, 2.0 * 2.0 / 128.0, 1.1e-4, 1e-4, 0.0);
+    assert_alike(&by_splat_transform(&path, 0), &splat::decode(&bytes).expect("ours"), &turned);
+}
+
 #[test]
 fn three_reads_the_glb() {
     if !installed("three") {
@@ -260,7 +282,7 @@ fn a_run_becomes_files_of_the_same_scene() {
         assert!(psnr > 30.0, "{file}");
     }
     // Of pictures no larger than the training's: pruning and packing cost little beside the refinement itself.
-    succeeds(folder, "export run --views 12 --steps 200 --screen 80 --out narrow");
+    succeeds(folder, "export run --views 12 --steps 200 --screen 80 --formats ply,spz,glb,splat --sog --out narrow");
     for file in json(&folder.join("narrow/export.json"))["files"].as_array().expect("files") {
         let psnr = file["anchors"]["full"]["psnr"].as_f64().expect("a figure");
         assert!(psnr > loss("refined") - 0.5, "{file}");
@@ -274,7 +296,11 @@ fn a_run_becomes_files_of_the_same_scene() {
     // The scene's own axes on request, and the same Gaussians: the same bytes for the same seed.
     succeeds(folder, "export run --views 12 --steps 200 --formats ply --out again");
     assert!(fs::read(folder.join("again/scene.ply")).expect("a file") == read("scene.ply"), "not the same bytes");
-    succeeds(folder, "export run --views 2 --steps 0 --up keep --degree 1 --formats ply --out kept");
+    let kept = "export run --views 2 --steps 0 --up keep --degree 1 --formats ply,spz --sog --spz-version 2 --out kept";
+    assert!(succeeds(folder, kept).ends_with("wrote scene.ply, scene.spz, scene.sog, export.json in kept\n"));
+    let packed = spz::decode(&fs::read(folder.join("kept/scene.spz")).expect("a file")).expect("our own file");
+    let bundled = sog::decode(&fs::read(folder.join("kept/scene.sog")).expect("a file")).expect("our own file");
+    assert_eq!((packed.len(), packed.degree), (bundled.len(), bundled.degree));
     assert_eq!(json(&folder.join("kept/export.json"))["rotation"][0], serde_json::json!([1.0, 0.0, 0.0]));
 }
 

@@ -239,6 +239,156 @@ fn spz_of_its_own_program_is_what_it_was_made_of() {
     }
 }
 
+/// What that program reads of its own file, mip-sog.ply, in the same order: the lists and the palette are its choice.
+#[test]
+fn sog_of_its_own_program_is_what_that_reads() {
+    let source = decode(fixture("mip-sog.ply")).expect("a splat").cloud;
+    let splat = decode(fixture("mip.sog")).expect("a splat");
+    let got = &splat.cloud;
+    assert_eq!((splat.container, got.len(), got.degree, got.antialiased), (Container::Sog, 24, 3, true));
+    // Float32's rounding; half a step of an opacity at the ends, which that program cuts off at a millionth.
+    assert_near(&got.position, &source.position, 1e-5, "positions");
+    assert_near(&got.log_scale, &source.log_scale, 1e-6, "scales");
+    assert_near(&got.harmonics, &source.harmonics, 1e-6, "harmonics");
+    for i in 0..24 {
+        assert!((sigmoid(got.logit[i]) - sigmoid(source.logit[i])).abs() <= 1.1e-4);
+        let dot: f32 = got.rotation[i].iter().zip(source.rotation[i]).map(|(a, b)| a * b).sum();
+        assert!((dot - 1.0).abs() < 1e-5, "{dot}");
+    }
+    let named = |from: &str, to: &str| {
+        // The text is stored as it is; its checksum then is another's, and the file is refused before it is read.
+        let mut bytes = fixture("mip.sog");
+        let at = bytes.windows(from.len()).position(|w| w == from.as_bytes()).expect("it is there");
+        bytes[at..at + to.len()].copy_from_slice(to.as_bytes());
+        decode(bytes).expect_err("refused")
+    };
+    assert!(named("\"count\":24", "\"count\":99").contains("meta.json"));
+}
+
+/// Rows without any first word are told by the file's name.
+#[test]
+fn dot_splat_is_read_by_its_name() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("scene.SPLAT");
+    let whole = cloud(20, 2);
+    std::fs::write(&path, gscream_vk::formats::splat::encode(&whole)).expect("a file");
+    let splat = gscream_vk::splat::read::read(&path).expect("a splat");
+    assert_eq!((splat.container, &splat.cloud.position), (Container::Splat, &whole.position));
+    std::fs::write(&path, [0; 33]).expect("a file");
+    let error = gscream_vk::splat::read::read(&path).expect_err("33 bytes").to_string();
+    assert!(error.contains("32 for each Gaussian") && error.contains("scene.SPLAT"), "{error}");
+    std::fs::write(&path, []).expect("a file");
+    assert!(gscream_vk::splat::read::read(&path).is_err());
+}
+
+/// What is done to a glTF file's document.
+type Change<'a> = &'a dyn Fn(&mut serde_json::Value);
+
+/// A GLB as another program may write it: positions between other bytes, rotations and opacities as integers, and the mesh below
+/// two nodes, which move, turn and scale it.
+fn foreign_glb(change: impl Fn(&mut serde_json::Value)) -> Vec<u8> {
+    let mut bin: Vec<u8> = vec![];
+    for position in [[1f32, 2.0, 3.0], [-4.0, 0.5, 0.25]] {
+        bin.extend(7f32.to_le_bytes());
+        position.iter().for_each(|v| bin.extend(v.to_le_bytes()));
+    }
+    // x y z w: half a turn about y, and none, of 32,767 steps.
+    [0, 32767, 0, 0, 0, 0, 0, 32767i16].iter().for_each(|v| bin.extend(v.to_le_bytes()));
+    // Scale and colour of both: 0.5 in x, 1 in y and z.
+    [0.5f32, 1.0, 1.0, 0.5, 1.0, 1.0].iter().for_each(|v| bin.extend(v.to_le_bytes()));
+    // Opacity in steps of 255, 4 bytes apart.
+    bin.extend([51, 0, 0, 0, 204, 0, 0, 0]);
+    let name = |name: &str| format!("{}:{name}", gltf::EXTENSION);
+    let accessor = |view: u32, kind: u32, shape: &str| serde_json::json!({ "bufferView": view, "componentType": kind, "count": 2, "type": shape });
+    let mut document = serde_json::json!({
+        "asset": { "version": "2.0" },
+        "nodes": [
+            { "mesh": 1, "scale": [2, 2, 2] },
+            { "children": [0], "translation": [1, 2, 3], "rotation": [0, 0, 1, 0] },
+        ],
+        "meshes": [{ "primitives": [{ "attributes": { "POSITION": 0 } }] }, { "primitives": [{
+            "mode": 0,
+            "attributes": { "POSITION": 0, (name("ROTATION")): 1, (name("SCALE")): 2,
+                            (name("SH_DEGREE_0_COEF_0")): 2, (name("OPACITY")): 3 },
+            "extensions": { (gltf::EXTENSION): { "kernel": "ellipse", "colorSpace": "srgb_rec709_display" } },
+        }] }],
+        "buffers": [{ "byteLength": bin.len() }],
+        "bufferViews": [
+            { "buffer": 0, "byteLength": 32, "byteStride": 16 },
+            { "buffer": 0, "byteOffset": 32, "byteLength": 16 },
+            { "buffer": 0, "byteOffset": 48, "byteLength": 24 },
+            { "buffer": 0, "byteOffset": 72, "byteLength": 8, "byteStride": 4 },
+        ],
+        "accessors": [accessor(0, 5126, "VEC3"), accessor(1, 5122, "VEC4"), accessor(2, 5126, "VEC3"),
+                      accessor(3, 5121, "SCALAR")],
+    });
+    document["accessors"][0]["byteOffset"] = 4.into();
+    document["accessors"][1]["normalized"] = true.into();
+    document["accessors"][3]["normalized"] = true.into();
+    change(&mut document);
+    let mut text = document.to_string().into_bytes();
+    text.resize(text.len().next_multiple_of(4), b' ');
+    let mut bytes = b"glTF".to_vec();
+    for word in [2, 28 + text.len() + bin.len(), text.len()] {
+        bytes.extend((word as u32).to_le_bytes());
+    }
+    bytes.extend(b"JSON");
+    bytes.extend(text);
+    bytes.extend((bin.len() as u32).to_le_bytes());
+    bytes.extend(b"BIN\0");
+    bytes.extend(bin);
+    bytes
+}
+
+#[test]
+fn a_glb_of_another_program_is_where_its_nodes_have_it() {
+    let splat = decode(foreign_glb(|_| ())).expect("a splat");
+    let cloud = &splat.cloud;
+    // Twice as large, half a turn about z, moved by (1, 2, 3), and half a turn about x into the cloud's axes.
+    let want = [[1.0 - 2.0, -(2.0 - 4.0), -(3.0 + 6.0)], [1.0 + 8.0, -(2.0 - 1.0), -(3.0 + 0.5)]];
+    assert_near(&cloud.position, &want, 1e-5, "positions");
+    assert_near(&cloud.log_scale, &[[0.0, 2f32.ln(), 2f32.ln()]; 2], 1e-5, "scales");
+    assert_near(&cloud.harmonics, &[[0.5, 1.0, 1.0]; 2], 0.0, "colours");
+    assert!((sigmoid(cloud.logit[0]) - 0.2).abs() < 1e-6 && (sigmoid(cloud.logit[1]) - 0.8).abs() < 1e-6);
+    // Half turns: y then z is x, and x once more is none; z then x is y.
+    for (q, axis) in [(cloud.rotation[0], 0), (cloud.rotation[1], 2)] {
+        assert!((q[axis].abs() - 1.0).abs() < 1e-5, "{q:?}");
+    }
+    let changes: [(&str, Change); 12] = [
+        ("not within the file", &|d| d["accessors"][0]["count"] = 3.into()),
+        ("not within the file", &|d| d["accessors"][0]["count"] = u64::MAX.into()),
+        ("not within the file", &|d| d["bufferViews"][0]["byteStride"] = 8.into()),
+        ("not within the file", &|d| d["bufferViews"][1]["byteOffset"] = 72.into()),
+        ("not within the file", &|d| d["accessors"][2]["sparse"] = serde_json::json!({ "count": 1 })),
+        ("of another type", &|d| d["accessors"][1]["type"] = "VEC3".into()),
+        ("stretches", &|d| d["nodes"][0]["scale"][0] = 3.into()),
+        ("stretches", &|d| d["nodes"][0]["scale"] = serde_json::json!([-2, 2, 2])),
+        ("in a circle", &|d| d["nodes"][0]["children"] = serde_json::json!([1])),
+        ("lin_rec709_display", &|d| {
+            d["meshes"][1]["primitives"][0]["extensions"][gltf::EXTENSION]["colorSpace"] = "lin_rec709_display".into();
+        }),
+        ("none of its meshes", &|d| d["meshes"][1]["primitives"][0]["extensions"] = serde_json::json!({})),
+        ("2 splats", &|d| d["meshes"][0] = d["meshes"][1].clone()),
+    ];
+    for (what, change) in changes {
+        let error = decode(foreign_glb(change)).expect_err(what);
+        assert!(error.contains(what), "{what}: {error}");
+    }
+}
+
+/// splat-transform turns a PLY half around z where this program takes x: both are up in glTF, and a half turn about y apart.
+#[test]
+fn glb_of_splat_transform_is_what_it_was_made_of() {
+    let mut source = decode(fixture("mip.ply")).expect("a splat").cloud;
+    source.turn(glam::DMat3::from_diagonal(glam::DVec3::new(-1.0, 1.0, -1.0)));
+    let splat = decode(fixture("mip.glb")).expect("a splat");
+    assert_eq!((splat.container, splat.cloud.degree), (Container::Glb, 3));
+    // Float32 throughout, and the turn's own rounding.
+    assert_near(&splat.cloud.position, &source.position, 1e-5, "positions");
+    assert_near(&splat.cloud.log_scale, &source.log_scale, 1e-5, "scales");
+    assert_near(&splat.cloud.harmonics, &source.harmonics, 1e-5, "harmonics");
+}
+
 /// Version 2 byte by byte, after the specification.
 #[test]
 fn spz_of_version_2_by_hand() {
@@ -313,7 +463,7 @@ fn what_is_no_splat_is_refused_in_one_sentence() {
         [&text[..at], to.as_bytes(), &text[at + from.len()..]].concat()
     };
     for (bytes, what) in [
-        (vec![], "none of PLY, SPZ and GLB"),
+        (vec![], "none of PLY, SPZ, SOG and GLB"),
         (b"ply\n".to_vec(), "header does not end"),
         (whole[..whole.len() - 1].to_vec(), "cut off"),
         (renamed("binary_little_endian", "ascii"), "save it as binary_little_endian"),

@@ -14,7 +14,7 @@ use super::shared::{self, DeviceArgs};
 use crate::config::{Settings, Source};
 use crate::export::{self, Cloud, Export, Observer, Options, low_pass, measure, up};
 use crate::folder::{self, Lock};
-use crate::formats::{gltf, ply, spz};
+use crate::formats::{gltf, ply, sog, splat, spz};
 use crate::gpu::Gpu;
 use crate::model::stored::Stored;
 use crate::render::widen;
@@ -27,14 +27,15 @@ pub(super) const FIGURES: &str = "export.json";
 /// Stem of the exported files.
 pub(super) const STEM: &str = "scene";
 
-/// Write a trained model as static Gaussians, for viewers: PLY, SPZ and glTF
+/// Write a trained model as static Gaussians, for viewers: PLY, SPZ, glTF and SOG
 ///
 /// An anchor's Gaussians depend on the direction and the distance they are seen from; a file holds one value each. They
 /// are read off from the training cameras and from cameras between them, refined against the anchors' own pictures, and
 /// pruned. What that costs is measured on views that took no part, printed, and written to export.json.
 ///
 /// scene.ply is the file of 3D Gaussian Splatting (62 floats), scene.spz Niantic's SPZ (--spz-version), scene.glb glTF with
-/// KHR_gaussian_splatting. Up is -y in the first two and +y in the last.
+/// KHR_gaussian_splatting, scene.sog PlayCanvas' SOG of version 2, scene.splat rows of 32 bytes. Up is +y in glTF and -y in
+/// the others.
 ///
 /// A model of plain Gaussians (model.form) is neither baked nor refined: it is written as it is.
 #[derive(Debug, clap::Args)]
@@ -52,6 +53,9 @@ pub(super) struct Args {
     /// Files to write
     #[arg(long, value_enum, value_delimiter = ',', default_value = "ply,spz,glb")]
     formats: Vec<Format>,
+    /// Write scene.sog as well
+    #[arg(long)]
+    sog: bool,
     /// Version of scene.spz: 3, or 2 for older readers, with coarser rotations
     #[arg(long, value_name = "2|3", default_value = "3", value_parser = spz_version)]
     spz_version: spz::Version,
@@ -94,6 +98,10 @@ enum Format {
     Spz,
     /// Binary glTF
     Glb,
+    /// PlayCanvas' own, a zip of pictures
+    Sog,
+    /// antimatter15's, 32 bytes a Gaussian, of degree 0
+    Splat,
 }
 
 fn spz_version(text: &str) -> Result<spz::Version, String> {
@@ -105,11 +113,16 @@ fn spz_version(text: &str) -> Result<spz::Version, String> {
 }
 
 impl Format {
+    /// Those that are written unless others are asked for.
+    const USUAL: [Self; 3] = [Self::Ply, Self::Spz, Self::Glb];
+
     fn extension(self) -> &'static str {
         match self {
             Self::Ply => "ply",
             Self::Spz => "spz",
             Self::Glb => "glb",
+            Self::Sog => "sog",
+            Self::Splat => "splat",
         }
     }
 
@@ -122,6 +135,8 @@ impl Format {
             Self::Ply => Ok(ply::encode(cloud)),
             Self::Spz => spz::encode(cloud, version),
             Self::Glb => gltf::encode(cloud),
+            Self::Sog => sog::encode(cloud),
+            Self::Splat => Ok(splat::encode(cloud)),
         }
         .map_err(export::Error::Format)
     }
@@ -131,6 +146,8 @@ impl Format {
             Self::Ply => ply::decode(bytes),
             Self::Spz => spz::decode(bytes),
             Self::Glb => gltf::decode(bytes),
+            Self::Sog => sog::decode(bytes),
+            Self::Splat => splat::decode(bytes),
         }
         .map_err(export::Error::Format)
     }
@@ -270,13 +287,23 @@ impl Drop for Bars {
 }
 
 impl Args {
+    /// The formats that are asked for.
+    fn formats(&self) -> Vec<Format> {
+        let mut formats = self.formats.clone();
+        if self.sog && !formats.contains(&Format::Sog) {
+            formats.push(Format::Sog);
+        }
+        formats
+    }
+
     /// The export of a run into a folder: all formats, with so many steps and cameras between the training's.
     pub fn of_run(run: &Path, out: &Path, steps: u32, views: u32) -> Self {
         let Options { degree, screen, .. } = Options::default();
         Self {
             model: run.to_owned(),
             out: Some(out.to_owned()),
-            formats: Format::value_variants().to_vec(),
+            formats: Format::USUAL.to_vec(),
+            sog: false,
             spz_version: spz::Version::default(),
             up: Up::Auto,
             degree,
@@ -291,9 +318,9 @@ impl Args {
     }
 }
 
-/// Names of the files that an export writes in all formats.
+/// Names of the files that an export writes unless other formats are asked for.
 pub(super) fn files() -> impl Iterator<Item = String> {
-    Format::value_variants().iter().map(|format| format.file()).chain([FIGURES.to_owned()])
+    Format::USUAL.iter().map(|format| format.file()).chain([FIGURES.to_owned()])
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
@@ -342,8 +369,7 @@ pub(super) fn export(
         format!("{}: a model alone does not know its cameras; name the scene with --scene", args.model.display())
     })?;
     let scene = shared::load_scene_of_model(scene, &mut settings)?;
-    let all: Vec<String> = files().collect();
-    folder::sweep(folder, |name| all.iter().any(|own| own == name));
+    folder::sweep(folder, |name| name == FIGURES || Format::value_variants().iter().any(|own| own.file() == name));
     on_gpu(Box::new(|gpu| {
         let began = Instant::now();
         let options = Options {
@@ -363,7 +389,7 @@ pub(super) fn export(
         let mut made = made?;
         // All files are made before the first is written.
         let mut written = vec![];
-        for format in &args.formats {
+        for format in &args.formats() {
             let bytes = format.encode(&made.cloud, args.spz_version)?;
             let background = settings.train.background.map(|channel| channel as f32);
             let read_back = format.decode(&bytes)?;
@@ -380,7 +406,7 @@ pub(super) fn export(
             figures.files.iter().zip(&contents).map(|(file, bytes)| (folder.join(&file.name), bytes.as_slice()));
         let named: Vec<_> = named.chain([(folder.join(FIGURES), text.as_bytes())]).collect();
         export::write(&named)?;
-        report(&made, &figures, &args.formats);
+        report(&made, &figures, &args.formats());
         let names: Vec<&str> = figures.files.iter().map(|file| file.name.as_str()).collect();
         println!("wrote {}, {FIGURES} in {}", names.join(", "), folder.display());
         Ok(())

@@ -166,7 +166,7 @@ fn page(facts: &Facts<'_>, test: &[Pair], train: &[Pair]) -> anyhow::Result<Stri
 pub(super) fn steps(folder: &Path) -> [(String, &'static str); 3] {
     let command = |words: &[&str]| next::command(words, folder);
     [
-        (command(&["export"]), "writes it for viewers: PLY, SPZ and glTF"),
+        (command(&["export"]), "writes it for viewers: PLY, SPZ, glTF and others"),
         (command(&["view"]), "shows the export in the browser"),
         (command(&["render", "--views", "spiral"]), "draws a path through the scene"),
     ]

@@ -58,7 +58,7 @@ pub(super) struct Args {
     scene: Option<PathBuf>,
     #[command(flatten)]
     settings: SettingsArgs,
-    /// Go on from the plain Gaussians of this PLY, SPZ or GLB, of whatever program, instead of the scene's points
+    /// Go on from the plain Gaussians of this splat (PLY, SPZ, SOG, .splat or GLB), of whatever program, instead of the scene's points
     ///
     /// It must stand in the scene's own place, axes and units. [same as --set model.from=FILE with model.form=gaussians and
     /// the file's model.degree]

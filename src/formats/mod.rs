@@ -3,6 +3,8 @@
 
 pub mod gltf;
 pub mod ply;
+pub mod sog;
+pub mod splat;
 pub mod spz;
 
 #[cfg(test)]
@@ -116,6 +118,91 @@ mod tests {
             assert_eq!(&bytes[..2], &[0x1f, 0x8b], "gzip");
             assert!(spz::decode(&bytes[..bytes.len() / 2]).is_err(), "cut off");
         }
+    }
+
+    /// The largest distance within a part of a list that goes evenly from the least to the most value in 127 steps.
+    fn step(values: &[f32]) -> f32 {
+        let (low, high) = values.iter().fold((f32::MAX, f32::MIN), |(low, high), v| (low.min(*v), high.max(*v)));
+        (high - low) / 127.0
+    }
+
+    /// For each of some Gaussians the nearest of others, which stand in another order.
+    fn nearest(to: &Cloud, of: &Cloud) -> Vec<usize> {
+        let square = |a: [f32; 3], b: [f32; 3]| (0..3).map(|c| (a[c] - b[c]).powi(2)).sum::<f32>();
+        let one = |p: &[f32; 3]| {
+            let closer = |a: &usize, b: &usize| square(of.position[*a], *p).total_cmp(&square(of.position[*b], *p));
+            (0..of.len()).min_by(closer).expect("it is not empty")
+        };
+        to.position.iter().map(one).collect()
+    }
+
+    #[test]
+    fn a_sog_keeps_what_its_bytes_keep() {
+        for degree in 0..=3 {
+            let cloud = Cloud { antialiased: degree == 2, ..cloud(67, degree) };
+            let bytes = sog::encode(&cloud).expect("it is small");
+            let back = sog::decode(&bytes).expect("our own file");
+            assert_eq!((back.len(), back.degree, back.antialiased), (cloud.len(), degree, cloud.antialiased));
+            let order = nearest(&cloud, &back);
+            assert_eq!(order.iter().collect::<std::collections::HashSet<_>>().len(), cloud.len());
+            let each = coefficients(degree);
+            let firsts: Vec<f32> = cloud.harmonics.iter().step_by(each).flatten().copied().collect();
+            let higher: Vec<f32> =
+                (0..cloud.len()).flat_map(|i| cloud.harmonics_of(i)[1..].as_flattened().to_vec()).collect();
+            // Half a step of a list, and float32's rounding.
+            let half = |values: &[f32]| 0.5 * step(values) + 1e-6;
+            let (scales, firsts) = (half(cloud.log_scale.as_flattened()), half(&firsts));
+            let higher = if degree == 0 { 0.0 } else { half(&higher) };
+            for (i, j) in order.into_iter().enumerate() {
+                for c in 0..3 {
+                    let v = cloud.position[i][c];
+                    // Half of 65,535 steps of ln(1 + |v|), of which all are within 6 units, and the slope at v.
+                    let most = 0.5 * 2.0 * 7f32.ln() / 65535.0 * (1.001 + v.abs()) + 1e-6;
+                    assert!((back.position[j][c] - v).abs() <= most, "{v}");
+                }
+                assert!(distance(&[back.log_scale[j]], &[cloud.log_scale[i]]) <= scales);
+                let (a, b) = (back.harmonics_of(j), cloud.harmonics_of(i));
+                assert!(distance(&a[..1], &b[..1]) <= firsts);
+                assert!(distance(&a[1..], &b[1..]) <= higher);
+                assert!((sigmoid(back.logit[j]) - sigmoid(cloud.logit[i])).abs() <= 0.5 / 255.0 + 1.1e-4);
+                // Three components of half of 255 steps of sqrt 2 each, e; the largest, at least 1/2, is off by 3 e, the
+                // quaternion by sqrt 12 e, and the rotation by twice that.
+                assert!(angle(back.rotation[j], cloud.rotation[i]) < 2.0 * 12f64.sqrt() * 2.78e-3 + 1e-3);
+            }
+            (0..bytes.len()).step_by(7).for_each(|end| assert!(sog::decode(&bytes[..end]).is_err(), "{end}"));
+        }
+    }
+
+    /// Positions in one plane, or one alone, have no step to divide by.
+    #[test]
+    fn a_sog_of_one_place_is_there() {
+        let mut cloud = cloud(5, 1);
+        cloud.position.iter_mut().for_each(|p| *p = [0.5, -3.0, p[2]]);
+        cloud.retain(&[true, false, true, false, false]);
+        let back = sog::decode(&sog::encode(&cloud).expect("two")).expect("our own file");
+        assert!(back.position.iter().all(|p| (p[0] - 0.5).abs() < 1e-6 && (p[1] + 3.0).abs() < 1e-6));
+        assert!(sog::encode(&Cloud::default()).is_err());
+        cloud.logit[0] = f32::NAN;
+        assert!(sog::encode(&cloud).is_err());
+    }
+
+    #[test]
+    fn a_splat_keeps_what_its_bytes_keep() {
+        let cloud = cloud(31, 2);
+        let bytes = splat::encode(&cloud);
+        assert_eq!(bytes.len(), 32 * cloud.len());
+        let back = splat::decode(&bytes).expect("our own file");
+        assert_eq!((&back.position, back.degree), (&cloud.position, 0));
+        assert!(distance(&back.log_scale, &cloud.log_scale) < 1e-5);
+        for i in 0..cloud.len() {
+            // Half of 255 steps of a displayed colour.
+            let own = cloud.harmonics_of(i)[0].map(|v| v.clamp(-0.5 / 0.2821, 0.5 / 0.2821));
+            assert!(distance(&[back.harmonics[i]], &[own]) <= 0.5 / 255.0 / 0.282 + 1e-4);
+            assert!((sigmoid(back.logit[i]) - sigmoid(cloud.logit[i])).abs() <= 0.5 / 255.0 + 1.1e-4);
+            // Four components of half a step of 1/128, a whole one where 1 is cut off; twice that for the rotation.
+            assert!(angle(back.rotation[i], cloud.rotation[i]) < 2.0 * 2.0 / 128.0);
+        }
+        assert!(splat::decode(&bytes[1..]).is_err());
     }
 
     #[test]

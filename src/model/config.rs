@@ -31,7 +31,8 @@ impl Form {
 pub struct Config {
     /// Anchors, or plain Gaussians.
     pub form: Form,
-    /// PLY, SPZ or GLB file of the plain Gaussians that training begins with, in place of the scene's points; "": those.
+    /// PLY, SPZ, SOG, .splat or GLB file of the plain Gaussians that training begins with, in place of the scene's points; "":
+    /// those.
     pub from: String,
     /// So many of the first plain Gaussians stay as they are: the others alone are learnt.
     pub frozen: u32,

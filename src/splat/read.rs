@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::Error;
 use super::ply::{self, Rows};
-use crate::formats::{gltf, spz};
+use crate::formats::{gltf, sog, splat as dotsplat, spz};
 use crate::math::harmonics::coefficients;
 use crate::model::gaussians::Cloud;
 use crate::sentence::one_line;
@@ -18,8 +18,19 @@ pub enum Container {
     CompressedPly,
     /// SPZ.
     Spz,
+    /// SOG, bundled.
+    Sog,
+    /// antimatter15's rows of 32 bytes.
+    Splat,
     /// glTF with `KHR_gaussian_splatting`.
     Glb,
+}
+
+/// Extensions of files of splats.
+const EXTENSIONS: [&str; 5] = ["ply", "spz", "sog", "splat", "glb"];
+
+fn extension(path: &Path) -> String {
+    path.extension().map_or_else(String::new, |extension| extension.to_string_lossy().to_lowercase())
 }
 
 /// A splat.
@@ -43,10 +54,9 @@ const LOG_SCALES: [f32; 2] = [-30.0, 20.0];
 pub const ANTIALIASED: &str = "this splat was trained with antialiasing and is drawn without: Gaussians smaller than a pixel \
                                look heavier than its own program shows them";
 
-/// Whether the file begins as one of a splat, whatever its name.
+/// Whether the file has a splat's name.
 pub fn is_splat(path: &Path) -> bool {
-    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
-    path.is_file() && extension.is_some_and(|e| ["ply", "spz", "glb"].contains(&e.as_str()))
+    path.is_file() && EXTENSIONS.contains(&extension(path).as_str())
 }
 
 /// Reads a splat.
@@ -55,7 +65,9 @@ pub fn is_splat(path: &Path) -> bool {
 /// A file that cannot be read, is not of a splat, is cut off, or holds no Gaussian that can be drawn.
 pub fn read(path: &Path) -> Result<Splat, Error> {
     let bytes = std::fs::read(path).map_err(|source| Error::Io { path: path.to_owned(), source })?;
-    decode(bytes).map_err(|what| Error::File { path: path.to_owned(), what })
+    // Rows of 32 bytes have no first words to know them by.
+    let splat = if extension(path) == "splat" { rows(&bytes) } else { decode(bytes) };
+    splat.map_err(|what| Error::File { path: path.to_owned(), what })
 }
 
 /// The same from a file's bytes.
@@ -75,8 +87,17 @@ fn decoded(bytes: Vec<u8>) -> Result<Splat, String> {
         }
         Some(b"glTF") => (Container::Glb, gltf::decode(&bytes)?, None),
         Some([0x1f, 0x8b, ..] | b"NGSP") => (Container::Spz, spz::decode(&bytes)?, None),
-        _ => return Err("it is none of PLY, SPZ and GLB; splats come in these".into()),
+        Some(b"PK\x03\x04") => (Container::Sog, sog::decode(&bytes)?, None),
+        _ => return Err("it is none of PLY, SPZ, SOG and GLB; splats come in these, and in files called .splat".into()),
     };
+    whole(container, cloud, rows)
+}
+
+fn rows(bytes: &[u8]) -> Result<Splat, String> {
+    whole(Container::Splat, dotsplat::decode(bytes)?, None)
+}
+
+fn whole(container: Container, cloud: Cloud, rows: Option<Rows>) -> Result<Splat, String> {
     if cloud.is_empty() {
         return Err("it holds no Gaussian".into());
     }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use gscream_vk::config::{Settings, Source};
 use gscream_vk::evaluate::network::Weights;
-use gscream_vk::formats::{gltf, ply, spz};
+use gscream_vk::formats::{self, gltf, ply, sog, spz};
 use gscream_vk::gpu::testing;
 use gscream_vk::model::{files, init};
 use gscream_vk::prepare::graph_cut::Strokes;
@@ -172,6 +172,8 @@ fn exports() {
     Loader::of_bytes("scene.ply", clouds.iter().map(ply::encode).collect()).run(|bytes| told(ply::decode(bytes)));
     let glb = clouds.iter().map(|cloud| gltf::encode(cloud).expect("it fits")).collect();
     Loader::of_bytes("scene.glb", glb).run(|bytes| told(gltf::decode(bytes)));
+    let other = vec![seeds::read(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/splats/mip.glb"))];
+    Loader::of_text("splat.glb", other).run(|bytes| told(gltf::decode(bytes)));
     // Of other programs: what they wrote is spliced, too.
     let whole = |bytes: &[u8]| {
         told(splat::read::decode(bytes.to_vec()).map(|splat| splat.spliced(&vec![true; splat.len()], &clouds[0])))
@@ -186,6 +188,13 @@ fn exports() {
     let packed: Vec<_> = clouds.iter().flat_map(encode).collect();
     let frames = vec![seeds::read(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/splats/mip-4.spz"))];
     Loader::of_bytes("splat.spz (version 4)", frames).run(whole);
+    // Checksums of the archive's files stop most changes, so that texts and pictures are packed again as they are.
+    let bundled: Vec<_> = clouds.iter().map(|cloud| sog::encode(cloud).expect("it fits")).collect();
+    Loader::of_bytes("scene.sog", bundled.clone()).run(whole);
+    let crc = |bytes| seeds::with_zip_checksums(bytes);
+    Loader::of_bytes("scene.sog (checked)", bundled).finished(&crc).run(whole);
+    let rows = clouds.iter().map(formats::splat::encode).collect();
+    Loader::of_bytes("scene.splat", rows).run(|bytes| told(formats::splat::decode(bytes)));
     Loader::of_bytes("scene.spz", packed.clone()).run(|bytes| told(spz::decode(bytes)));
     let raw: Vec<_> = packed.iter().map(|bytes| seeds::gunzip(bytes)).collect();
     // Seeds are given as they are, so that what is read is packed here.

@@ -137,6 +137,37 @@ pub fn with_checksums(mut bytes: Vec<u8>) -> Vec<u8> {
     bytes
 }
 
+/// A zip of stored files whose checksums are those of what they hold, as far as its records reach.
+pub fn with_zip_checksums(mut bytes: Vec<u8>) -> Vec<u8> {
+    let number = |bytes: &[u8], at: usize| -> Option<usize> {
+        let four = <[u8; 4]>::try_from(bytes.get(at..at + 4)?).ok()?;
+        Some(u32::from_le_bytes(four) as usize)
+    };
+    let length = |bytes: &[u8], at: usize| Some(usize::from(*bytes.get(at)?) + 256 * usize::from(*bytes.get(at + 1)?));
+    let mut at = 0;
+    while bytes.get(at..at + 4) == Some(b"PK\x03\x04".as_slice()) {
+        let (Some(size), Some(name), Some(extra)) =
+            (number(&bytes, at + 18), length(&bytes, at + 26), length(&bytes, at + 28))
+        else {
+            break;
+        };
+        let first = at + 30 + name + extra;
+        let Some(held) = bytes.get(first..first + size) else { break };
+        let mut crc = flate2::Crc::new();
+        crc.update(held);
+        let sum = crc.sum().to_le_bytes();
+        bytes[at + 14..at + 18].copy_from_slice(&sum);
+        // The directory at the end has it again, where it says that the file begins here.
+        let own = (first..bytes.len().saturating_sub(46))
+            .find(|entry| bytes[*entry..].starts_with(b"PK\x01\x02") && number(&bytes, entry + 42) == Some(at));
+        if let Some(entry) = own {
+            bytes[entry + 16..entry + 20].copy_from_slice(&sum);
+        }
+        at = first + size;
+    }
+    bytes
+}
+
 pub fn cloud(degree: u32) -> Cloud {
     let n = 3;
     Cloud {

@@ -29,8 +29,8 @@ use work::{Job, Places};
 /// into one folder: the masks that were clicked (objects/NAME.png), the scene (scene/), the run (run/), and the files for
 /// viewers. The same command again goes on where it was cut off, and makes again only what has changed.
 ///
-/// A splat of any program (PLY of 3D Gaussian Splatting, SuperSplat's compressed PLY, SPZ, or GLB with
-/// KHR_gaussian_splatting) stands for photographs as well: it is drawn from --cameras, the object's Gaussians are taken out,
+/// A splat of any program (PLY of 3D Gaussian Splatting, SuperSplat's compressed PLY, SPZ, SOG, .splat, or
+/// GLB with KHR_gaussian_splatting) stands for photographs as well: it is drawn from --cameras, the object's Gaussians are taken out,
 /// new ones are trained in the hole, and every other Gaussian stays as it is.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
@@ -42,7 +42,7 @@ use work::{Job, Places};
   gscream-vk remove photos --out garden --click IMG_0012=430,340 --yes
   gscream-vk remove photos --out garden --yes      # with the masks in garden/objects")]
 pub(super) struct Args {
-    /// Folder of photographs, or a splat (PLY, SPZ or GLB)
+    /// Folder of photographs, or a splat (PLY, SPZ, SOG, .splat or GLB)
     #[arg(value_name = "PHOTOS")]
     photographs: PathBuf,
     /// Folder for all that is made [default: PHOTOS-removed, here]
