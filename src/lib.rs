@@ -57,6 +57,7 @@ pub mod primitives;
 pub mod remove;
 pub mod render;
 pub mod scene;
+pub mod segments;
 mod sentence;
 pub mod signal;
 #[cfg(test)]

@@ -113,7 +113,7 @@ fn spz_version(text: &str) -> Result<spz::Version, String> {
 }
 
 impl Format {
-    /// Those that are written unless others are asked for.
+    /// The formats that are written unless others are asked for.
     const USUAL: [Self; 3] = [Self::Ply, Self::Spz, Self::Glb];
 
     fn extension(self) -> &'static str {

@@ -28,13 +28,13 @@ use crate::model::gaussians::{Cloud, NORM_EPSILON, logit, sigmoid};
 
 /// The version that is read and written.
 const VERSION: u32 = 2;
-/// What `model` says of Gaussians that were trained with antialiasing.
+/// The word for `model` of Gaussians that were trained with antialiasing.
 const ANTIALIASED: &str = "antialiased";
 /// Entries of a list.
 const ENTRIES: usize = 256;
 /// Steps of a position.
 const STEPS: f64 = 65535.0;
-/// What a rotation's fourth byte begins at.
+/// The fourth byte of a rotation whose first component is the largest; one more for each next.
 const LARGEST: u8 = 252;
 /// Entries of the palette at most, and in a row of its picture.
 const PALETTE: usize = 1 << 16;

@@ -106,7 +106,7 @@ fn unpack_rotation(mut word: u32) -> [f32; 4] {
     [w, x, y, z]
 }
 
-/// The same in three bytes: x y z of the one of q and -q that has a positive w.
+/// A quaternion w x y z in 24 bits: x y z of the one of q and -q that has a positive w.
 fn pack_small_rotation(rotation: [f32; 4]) -> [u8; 3] {
     let [x, y, z, w] = unit(rotation);
     let sign = if w < 0.0 { -1.0 } else { 1.0 };
@@ -172,7 +172,7 @@ pub fn beyond_range(cloud: &Cloud) -> usize {
     cloud.log_scale.as_flattened().iter().filter(cut).count()
 }
 
-/// What the header says, and is within the format.
+/// The header of a file, within the format's limits.
 struct Header {
     version: u32,
     count: usize,

@@ -205,42 +205,7 @@ fn segments(colors: &[[u8; 3]], sites: Sites) -> Vec<usize> {
         }
     }
     edges.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let mut forest: Vec<usize> = (0..sites.len()).collect();
-    let (mut sizes, mut within) = (vec![1_usize; sites.len()], vec![0.0_f32; sites.len()]);
-    fn root(forest: &mut [usize], mut at: usize) -> usize {
-        while forest[at] != at {
-            forest[at] = forest[forest[at]];
-            at = forest[at];
-        }
-        at
-    }
-    for few in [false, true] {
-        for (weight, a, b) in &edges {
-            let (a, b) = (root(&mut forest, *a), root(&mut forest, *b));
-            if a == b {
-                continue;
-            }
-            let allowed = |at: usize| within[at] + SEGMENT / sizes[at] as f32;
-            let join = if few { sizes[a].min(sizes[b]) < FEWEST } else { *weight <= allowed(a).min(allowed(b)) };
-            if join {
-                forest[b] = a;
-                sizes[a] += sizes[b];
-                within[a] = weight.max(within[a]).max(within[b]);
-            }
-        }
-    }
-    let mut numbers = vec![usize::MAX; sites.len()];
-    let mut next = 0;
-    (0..sites.len())
-        .map(|site| {
-            let root = root(&mut forest, site);
-            if numbers[root] == usize::MAX {
-                numbers[root] = next;
-                next += 1;
-            }
-            numbers[root]
-        })
-        .collect()
+    crate::segments::segments(sites.len(), &edges, SEGMENT, FEWEST).0
 }
 
 #[cfg(test)]

@@ -8,6 +8,7 @@ pub mod hole;
 pub mod lens;
 pub mod masks;
 pub mod network;
+mod object;
 pub mod outline;
 pub mod planes;
 pub mod poses;
@@ -24,14 +25,15 @@ use image::GrayImage;
 use rayon::prelude::*;
 
 use crate::gpu::{self, Gpu};
-use crate::scene::{self, PriorKind, Scene, resample};
+use crate::scene::{self, PriorKind, Scene};
 use crate::sentence::one_line;
 use crate::signal::Signal;
 use crate::train::checkpoint::Fingerprint;
 
-use click::{Cues, Mark};
 use fit::Fit;
 use network::Inpainting;
+pub use object::Evidence;
+use object::{Given, USERS, corrected, given, no_such_view};
 use poses::Capture;
 use record::{Batch, Folder, Inputs};
 use splats::Splats;
@@ -140,56 +142,6 @@ impl Step {
             Self::Shadow => "shadow",
             Self::Depth => "depth",
             Self::Reference => "reference",
-        }
-    }
-}
-
-/// How the user says what the object is in a view.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Evidence {
-    /// A mask, not 0 on the object.
-    Mask(PathBuf),
-    /// A box around it: x0, y0 and one past x1, y1, in pixels of the photograph.
-    Box([u32; 4]),
-    /// A picture of strokes: white or green on the object, black or red beside it, transparent or grey elsewhere.
-    Strokes(PathBuf),
-    /// A rough line around it, which closes itself: x and y of its corners, in pixels of the photograph.
-    Lasso(Vec<[u32; 2]>),
-    /// A pixel of it.
-    Click([u32; 2]),
-    /// A pixel that is none of it.
-    Not([u32; 2]),
-}
-
-impl Evidence {
-    /// The option that says so.
-    fn option(&self) -> &'static str {
-        match self {
-            Self::Mask(_) => "--mask",
-            Self::Box(_) => "--box",
-            Self::Strokes(_) => "--strokes",
-            Self::Lasso(_) => "--lasso",
-            Self::Click(_) => "--click",
-            Self::Not(_) => "--not",
-        }
-    }
-
-    /// A mark of the page in a photograph of this size, which counts together with the others of its view; nothing for what
-    /// is a mask by itself.
-    fn mark(&self, size: [u32; 2], beside_marks: bool) -> Option<Mark> {
-        // The middle of a pixel.
-        let at =
-            |[x, y]: [u32; 2]| [(f64::from(x) + 0.5) / f64::from(size[0]), (f64::from(y) + 0.5) / f64::from(size[1])];
-        match self {
-            Self::Box([x0, y0, x1, y1]) if beside_marks => {
-                let corner = |x: u32, y: u32| [f64::from(x) / f64::from(size[0]), f64::from(y) / f64::from(size[1])];
-                let [[x0, y0], [x1, y1]] = [corner(*x0, *y0), corner(*x1, *y1)];
-                Some(Mark::Box { bounds: [x0, y0, x1, y1] })
-            }
-            Self::Lasso(points) => Some(Mark::Lasso { points: points.iter().map(|point| at(*point)).collect() }),
-            Self::Click(point) => Some(Mark::Object { at: at(*point), scale: 0 }),
-            Self::Not(point) => Some(Mark::Background { at: at(*point) }),
-            Self::Mask(_) | Self::Strokes(_) | Self::Box(_) => None,
         }
     }
 }
@@ -384,209 +336,6 @@ fn has_room(name: &str, path: &Path) -> Result<(), Error> {
         "its name has {own} bytes without extension, and what is named after it leaves room for at most {most}; rename it"
     );
     Err(Error::File { path: path.to_owned(), what })
-}
-
-/// A mask that was given or derived from a box, as large as the photograph, and what it was made from.
-struct Given {
-    mask: GrayImage,
-    from: String,
-}
-
-fn no_such_view<'a>(name: &str, option: &str, views: impl Iterator<Item = &'a str>) -> Error {
-    let names: Vec<&str> = views.collect();
-    let near = names.iter().max_by(|a, b| strsim::jaro(a, name).total_cmp(&strsim::jaro(b, name)));
-    let hint = near.map_or_else(String::new, |near| format!(" (did you mean {near}?)"));
-    Error::Request(format!("{option} {name}: no photograph has this name{hint}"))
-}
-
-/// Whether a box has an inside and lies within a picture of this size.
-fn is_box([x0, y0, x1, y1]: [u32; 4], size: [u32; 2]) -> bool {
-    x0 < x1 && y0 < y1 && x1 <= size[0] && y1 <= size[1]
-}
-
-/// The masks that the user named.
-fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>, Error> {
-    let mut all = BTreeMap::new();
-    for (name, (path, inverted)) in &capture.masks {
-        // Masks of no photograph are not this scene's.
-        let Some(photograph) = capture.photographs.get(name) else { continue };
-        let size = picture_size(photograph)?;
-        let mut mask = read_mask(path, size)?;
-        if *inverted {
-            mask.iter_mut().for_each(|v| *v = 255 - *v);
-        }
-        // Of those that came with the photographs an empty one is a view without the object.
-        let mask = capture.mask(name, checked(path, mask, size, true)?);
-        all.insert(name.clone(), Given { mask, from: format!("{}", path.display()) });
-    }
-    let on = |stem: &str, kind: &dyn Fn(&Evidence) -> bool| {
-        request
-            .object
-            .iter()
-            .find(|(name, evidence)| scene::stem(name) == stem && kind(evidence))
-            .map(|(_, evidence)| evidence)
-    };
-    for (name, evidence) in &request.object {
-        let stem = scene::stem(name).to_owned();
-        let option = evidence.option();
-        let Some(photograph) = capture.photographs.get(&stem) else {
-            return Err(no_such_view(name, option, capture.photographs.keys().map(String::as_str)));
-        };
-        let size = picture_size(photograph)?;
-        let is_mark = |other: &Evidence| matches!(other, Evidence::Lasso(_) | Evidence::Click(_) | Evidence::Not(_));
-        let marked = on(&stem, &is_mark).is_some();
-        if all.contains_key(&stem) && marked && evidence.mark(size, true).is_some() {
-            // They were taken together.
-            continue;
-        }
-        let given = match evidence {
-            Evidence::Lasso(_) | Evidence::Click(_) | Evidence::Not(_) => of_marks(request, &stem, photograph, size)?,
-            Evidence::Box(_) if marked => of_marks(request, &stem, photograph, size)?,
-            Evidence::Mask(path) => {
-                let mask = checked(path, read_mask(path, size)?, size, false)?;
-                Given { mask, from: format!("--mask {}", path.display()) }
-            }
-            Evidence::Box(bounds) => {
-                let [x0, y0, x1, y1] = *bounds;
-                if !is_box(*bounds, size) {
-                    return Err(Error::Request(format!(
-                        "--box {name}={x0},{y0},{x1},{y1}: not a box within the photograph, which is {}x{}; give x0,y0,x1,y1 \
-                         with x0 < x1 and y0 < y1",
-                        size[0], size[1]
-                    )));
-                }
-                if on(&stem, &|other| matches!(other, Evidence::Strokes(_))).is_some() {
-                    // It bounds what the strokes reach.
-                    continue;
-                }
-                let picture = scene::photograph(photograph, 1)?;
-                let mask = graph_cut::from_box(&picture, *bounds).ok_or_else(|| {
-                    Error::Request(format!(
-                        "--box {name}={x0},{y0},{x1},{y1}: nothing in the box differs from what is around it; draw it closer, \
-                         or give a mask"
-                    ))
-                })?;
-                Given { mask, from: format!("--box {x0},{y0},{x1},{y1} and a graph cut") }
-            }
-            Evidence::Strokes(path) => {
-                let picture = scene::photograph(photograph, 1)?;
-                let strokes = graph_cut::Strokes::read(path, size)?;
-                let bounds = on(&stem, &|other| matches!(other, Evidence::Box(_)));
-                let (mask, within) = match bounds {
-                    Some(Evidence::Box(bounds)) if is_box(*bounds, size) => {
-                        let [x0, y0, x1, y1] = bounds;
-                        let mask = graph_cut::from_strokes_in_box(&picture, &strokes, *bounds);
-                        (mask, format!(" within --box {x0},{y0},{x1},{y1}"))
-                    }
-                    _ => (graph_cut::from_strokes(&picture, &strokes), String::new()),
-                };
-                if mask.as_raw().iter().all(|v| *v == 0) {
-                    return Err(Error::Request(format!(
-                        "--strokes {name}: no stroke on the object lies within the box; draw one there"
-                    )));
-                }
-                Given { mask, from: format!("--strokes {}{within}", path.display()) }
-            }
-        };
-        let mask = capture.mask(&stem, given.mask);
-        if mask.as_raw().iter().all(|v| *v == 0) {
-            return Err(Error::Request(format!(
-                "{option} {name}: the object lies where the photograph's lens sees more than a pinhole does; mask a view that \
-                 has it nearer to the middle"
-            )));
-        }
-        all.insert(stem, Given { mask, ..given });
-    }
-    Ok(all)
-}
-
-/// The mask of all marks in one view: boxes and lassos first, then the clicks on the object, then those beside it.
-fn of_marks(request: &Request, stem: &str, photograph: &Path, size: [u32; 2]) -> Result<Given, Error> {
-    let rank = |evidence: &Evidence| match evidence {
-        Evidence::Box(_) | Evidence::Lasso(_) => 0,
-        Evidence::Not(_) => 2,
-        _ => 1,
-    };
-    let mut own: Vec<&Evidence> =
-        request.object.iter().filter(|(name, _)| scene::stem(name) == stem).map(|(_, evidence)| evidence).collect();
-    own.sort_by_key(|evidence| rank(evidence));
-    let mut marks = vec![];
-    for evidence in own {
-        let Some(mark) = evidence.mark(size, true) else {
-            let (option, clicks) = (evidence.option(), "--lasso, --click and --not");
-            return Err(Error::Request(format!(
-                "{option} {stem}: does not go with {clicks} of the same view; give one of them"
-            )));
-        };
-        if !mark.is_sound() {
-            return Err(Error::Request(format!(
-                "{} {stem}: not within the photograph, which is {}x{}, or with nothing in it",
-                evidence.option(),
-                size[0],
-                size[1]
-            )));
-        }
-        marks.push(mark);
-    }
-    let picture = resample::photograph(&scene::photograph(photograph, 1)?, click::working(size));
-    let mask = click::mask(&picture, &marks, &Cues::default());
-    if mask.as_raw().iter().all(|v| *v == 0) {
-        return Err(Error::Request(format!(
-            "--not {stem}: says nothing without a --click, --lasso or --box in the same view; say where the object is"
-        )));
-    }
-    let own = [mask.width(), mask.height()];
-    let mask = masks::threshold(&masks::parts(&mask, own), own, size, 0.5);
-    Ok(Given { mask, from: format!("{} marks", marks.len()) })
-}
-
-/// Masks in the scene's folder that are not the program's own: the user has put or corrected them there.
-fn corrected(
-    folder: &Folder,
-    capture: &Capture,
-    given: &BTreeMap<String, Given>,
-) -> Result<BTreeMap<String, Given>, Error> {
-    let masks = folder.root().join("masks");
-    let mut all = BTreeMap::new();
-    if !masks.is_dir() {
-        return Ok(all);
-    }
-    for (name, path) in scene::pictures(&masks)? {
-        let Some(photograph) = capture.photographs.get(&name) else { continue };
-        let below = path.strip_prefix(folder.root()).ok().and_then(record::key);
-        let relative = below.expect("the files of masks/ lie below the scene");
-        if !given.contains_key(&name) && folder.is_users(&relative)? {
-            let size = picture_size(photograph)?;
-            let mask = checked(&path, read_mask(&path, size)?, size, true)?;
-            all.insert(name, Given { mask, from: USERS.into() });
-        }
-    }
-    Ok(all)
-}
-
-/// A mask of a photograph of this size, as large as its file has it: its proportions are looked at before it is decoded.
-fn read_mask(path: &Path, size: [u32; 2]) -> Result<GrayImage, Error> {
-    let found = picture_size(path)?;
-    let ratio = |s: [u32; 2]| f64::from(s[0]) / f64::from(s[1]);
-    if found != size && (ratio(found) / ratio(size) - 1.0).abs() > 0.01 {
-        return Err(scene::Error::MaskSize { path: path.to_owned(), size: found, picture: size }.into());
-    }
-    Ok(scene::mask(path, 1)?)
-}
-
-/// A mask as large as its photograph that is neither full nor, unless that is allowed, empty.
-fn checked(path: &Path, mask: GrayImage, size: [u32; 2], may_be_empty: bool) -> Result<GrayImage, Error> {
-    let found = [mask.width(), mask.height()];
-    let refuse = |what: String| Err(Error::File { path: path.to_owned(), what });
-    let mask = if found == size { mask } else { resample::nearest(&mask, size) };
-    let object = mask.as_raw().iter().filter(|v| **v != 0).count();
-    if object == mask.as_raw().len() {
-        return refuse("the mask covers the whole picture; the object must be the part that is not black".into());
-    }
-    if object == 0 && !may_be_empty {
-        return refuse("the mask is empty; paint the object in any colour but black".into());
-    }
-    Ok(mask)
 }
 
 /// A preparation under way.
@@ -981,8 +730,6 @@ const THIN: f64 = 0.3;
 /// Folders of depth priors.
 const PRIORS: [&str; 2] = ["depth", "disparity"];
 
-/// What the masks of the user's own are made from.
-const USERS: &str = "the user's own";
 /// The first names of a list.
 fn abridged(names: &[&str]) -> String {
     match names {

@@ -294,17 +294,20 @@ fn continued<F>(hole: &Hole<'_, F>, planes: &[Plane], label: &[u8]) -> Vec<f32> 
     out
 }
 
+/// The pixels to the left and right of one, above and below it.
+pub fn neighbours(i: usize, [w, h]: [usize; 2]) -> impl Iterator<Item = usize> {
+    let (x, y) = (i % w, i / w);
+    [(x > 0).then(|| i - 1), (x + 1 < w).then(|| i + 1), (y > 0).then(|| i - w), (y + 1 < h).then(|| i + w)]
+        .into_iter()
+        .flatten()
+}
+
 /// Fills what is not a number with a membrane over what is: values spread inwards, then settle to the mean of their
 /// neighbours. Only pixels for which `wanted` says so are filled.
 pub fn membrane(values: &mut [f32], size: [usize; 2], wanted: impl Fn(usize) -> bool) {
     let [w, h] = size;
     let missing: Vec<usize> = (0..w * h).filter(|i| !values[*i].is_finite() && wanted(*i)).collect();
-    let neighbours = |i: usize| {
-        let (x, y) = (i % w, i / w);
-        [(x > 0).then(|| i - 1), (x + 1 < w).then(|| i + 1), (y > 0).then(|| i - w), (y + 1 < h).then(|| i + w)]
-            .into_iter()
-            .flatten()
-    };
+    let neighbours = |i: usize| neighbours(i, size);
     let mut left = missing.clone();
     while !left.is_empty() {
         let mut ring = vec![];

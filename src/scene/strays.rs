@@ -10,6 +10,7 @@ use super::bounds::Bounds;
 use super::colmap::{Image, Model, Tracks};
 use super::note::{Note, Notes};
 use super::{Point, Poses, layout};
+use crate::segments::root;
 use crate::statistics::median;
 
 /// Two photographs hang together by this many points at least, the least that COLMAP takes for a match ...
@@ -30,15 +31,6 @@ struct Linked {
     loose: Vec<bool>,
     /// Photographs in each well supported part of the model, the largest first.
     parts: Vec<usize>,
-}
-
-/// The root of the tree that an image is in.
-fn root(parents: &mut [usize], mut at: usize) -> usize {
-    while parents[at] != at {
-        parents[at] = parents[parents[at]];
-        at = parents[at];
-    }
-    at
 }
 
 /// Which photographs hang together. Nothing is said of models without tracks.

@@ -9,11 +9,12 @@
 use std::collections::{BTreeMap, BinaryHeap};
 
 use super::Pixels;
+use crate::segments::segments;
 
 /// Bins of a histogram of one channel.
 const BINS: usize = 8;
 /// The threshold of the first segments, in levels times pixels: larger ones bear more contrast within.
-const COARSENESS: f64 = 60.0;
+const COARSENESS: f32 = 60.0;
 /// Pixels of a first segment at least.
 const LEAST: usize = 12;
 /// An edge of so many levels is certainly one.
@@ -49,14 +50,6 @@ pub(super) struct Tree {
     leaf: Vec<usize>,
 }
 
-fn root(parent: &mut [usize], mut i: usize) -> usize {
-    while parent[i] != i {
-        parent[i] = parent[parent[i]];
-        i = parent[i];
-    }
-    i
-}
-
 /// Pairs by their likeness.
 #[derive(PartialEq)]
 struct Pair(f64, usize, usize);
@@ -77,32 +70,11 @@ impl Tree {
     pub fn of(pixels: &Pixels) -> Self {
         let [w, h] = pixels.size;
         let count = w * h;
-        let mut edges: Vec<(f64, usize, usize, f64)> =
+        let mut pairs: Vec<(f64, usize, usize, f64)> =
             pixels.pairs().map(|(i, _, j, length)| (pixels.apart(i, j).0.sqrt(), i, j, length)).collect();
-        let pairs = edges.clone();
-        edges.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
-        let mut parent: Vec<usize> = (0..count).collect();
-        let mut size = vec![1usize; count];
-        let mut within = vec![0.0f64; count];
-        for pass in 0..2 {
-            for &(weight, i, j, _) in &edges {
-                let (a, b) = (root(&mut parent, i), root(&mut parent, j));
-                let limit = |r: usize| within[r] + COARSENESS / size[r] as f64;
-                let joins = if pass == 0 { weight <= limit(a).min(limit(b)) } else { size[a].min(size[b]) < LEAST };
-                if a != b && joins {
-                    parent[b] = a;
-                    size[a] += size[b];
-                    within[a] = within[a].max(within[b]).max(weight);
-                }
-            }
-        }
-        let mut number = BTreeMap::new();
-        let leaf: Vec<usize> = (0..count)
-            .map(|i| {
-                let next = number.len();
-                *number.entry(root(&mut parent, i)).or_insert(next)
-            })
-            .collect();
+        pairs.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
+        let edges: Vec<_> = pairs.iter().map(|(weight, i, j, _)| (*weight as f32, *i, *j)).collect();
+        let (leaf, first) = segments(count, &edges, COARSENESS, LEAST);
         let mut segments = vec![
             Segment {
                 parent: None,
@@ -112,7 +84,7 @@ impl Tree {
                 colors: vec![0.0; 3 * BINS],
                 bounds: [w, h, 0, 0]
             };
-            number.len()
+            first
         ];
         for i in 0..count {
             let (x, y) = (i % w, i / w);

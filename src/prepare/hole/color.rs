@@ -11,7 +11,7 @@ use rayon::prelude::*;
 
 use super::gradient::{self, Equation};
 use super::surface::{SAME, Sight, Sights, Window};
-use crate::prepare::planes;
+use crate::prepare::planes::{self, neighbours};
 use crate::scene::{Camera, resample};
 
 /// Sources that a view's hole is taken from at most.
@@ -186,14 +186,8 @@ pub fn repaint(
     filling: &mut Filling,
 ) {
     let (own, sight) = (&photographs[of], &sights.0[of]);
-    let [w, h] = own.camera.size.map(|n| n as usize);
+    let size @ [w, h] = own.camera.size.map(|n| n as usize);
     let painted: Vec<usize> = (0..filled.len()).filter(|view| *view != of && filled[*view].is_some()).collect();
-    let near = |i: usize| {
-        let (x, y) = (i % w, i / w);
-        let near =
-            [(x > 0).then(|| i - 1), (x + 1 < w).then(|| i + 1), (y > 0).then(|| i - w), (y + 1 < h).then(|| i + w)];
-        near.into_iter().flatten()
-    };
     // Beside its hole another view is a photograph, which has been asked.
     let repainted = |i: usize, beside: bool| -> Option<[f32; 3]> {
         let (_, point) = shown(own, sight, i)?;
@@ -212,14 +206,14 @@ pub fn repaint(
     let told: Vec<Option<[f32; 3]>> = (0..w * h)
         .into_par_iter()
         .map(|i| {
-            let edge = || near(i).any(|j| filling.guessed[j]);
+            let edge = || neighbours(i, size).any(|j| filling.guessed[j]);
             if filling.guessed[i] || edge() { repainted(i, !filling.guessed[i]) } else { None }
         })
         .collect();
     let inside: Vec<usize> = (0..w * h).filter(|i| filling.guessed[*i] && told[*i].is_some()).collect();
     let equation = |i: usize| {
         let mut equation = Equation::new(i);
-        for (j, there) in near(i).filter_map(|j| Some((j, told[j]?))) {
+        for (j, there) in neighbours(i, size).filter_map(|j| Some((j, told[j]?))) {
             let goes_on = filling.guessed[j] || alike(filling.rgb[j], there);
             if let Some(here) = told[i].filter(|_| goes_on) {
                 equation.add(j, std::array::from_fn(|c| here[c] - there[c]));
@@ -243,7 +237,7 @@ fn alike(one: [f32; 3], other: [f32; 3]) -> bool {
 /// What photographs tell of the colours of a view's hole.
 pub fn gather(sights: &Sights, photographs: &[Photograph<'_>], of: usize) -> Filling {
     let (own, sight) = (&photographs[of], &sights.0[of]);
-    let [w, h] = own.camera.size.map(|n| n as usize);
+    let size @ [w, h] = own.camera.size.map(|n| n as usize);
     let sources = sources(sights, of);
     let photographed = |i: usize| -> Vec<Shown> {
         let mut found: Vec<Shown> = vec![];
@@ -278,10 +272,7 @@ pub fn gather(sights: &Sights, photographs: &[Photograph<'_>], of: usize) -> Fil
     let goes_on = |i: usize| !colors[i].is_empty() && alike(filling.rgb[i], mixed[i]);
     let equation = |i: usize| {
         let mut equation = Equation::new(i);
-        let (x, y) = (i % w, i / w);
-        let near =
-            [(x > 0).then(|| i - 1), (x + 1 < w).then(|| i + 1), (y > 0).then(|| i - w), (y + 1 < h).then(|| i + w)];
-        for j in near.into_iter().flatten().filter(|j| if hole(*j) { !colors[*j].is_empty() } else { goes_on(*j) }) {
+        for j in neighbours(i, size).filter(|j| if hole(*j) { !colors[*j].is_empty() } else { goes_on(*j) }) {
             equation.add(j, difference(&colors[i], &colors[j]));
         }
         equation

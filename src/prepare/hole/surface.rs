@@ -149,6 +149,22 @@ impl Sight {
         self.planes.iter().map(plane).collect()
     }
 
+    /// The planes, of these of the view, that the object stands on.
+    fn supports(&self, planes: &[planes::Plane]) -> Vec<Support> {
+        // The margin around the object shows what is behind it.
+        let deep = |site: usize| self.around(site).all(|near| self.hole[near]);
+        let sites = (0..self.hole.len()).filter(|site| self.grid.confirmed[*site] && deep(*site));
+        let object: Vec<DVec3> = sites
+            .map(|site| {
+                let [x, y] = self.ray(site);
+                DVec3::new(x, y, 1.0) * self.grid.depth[site]
+            })
+            .collect();
+        let supports: Vec<Support> = planes.iter().filter_map(|plane| Support::new(*plane, &object)).collect();
+        log::debug!("surface: {} planes, the object stands on {}", planes.len(), supports.len());
+        supports
+    }
+
     /// Normalised coordinates of a site's centre.
     pub fn ray(&self, site: usize) -> [f64; 2] {
         self.grid.ray([site as u32 % self.grid.columns, site as u32 / self.grid.columns])
@@ -464,17 +480,7 @@ impl Sights {
             let known: Vec<f32> = sites.iter().map(|site| disparity[*site]).collect();
             let size = window.size;
             let planes = planes::around(&known, &rays, &open, seed);
-            // The margin around the object shows what is behind it.
-            let deep = |site: usize| own.around(site).all(|near| own.hole[near]);
-            let object: Vec<DVec3> = (0..own.hole.len())
-                .filter(|site| own.grid.confirmed[*site] && deep(*site))
-                .map(|site| {
-                    let ([x, y], z) = (own.ray(site), own.grid.depth[site]);
-                    DVec3::new(x, y, 1.0) * z
-                })
-                .collect();
-            let supports: Vec<Support> = planes.iter().filter_map(|plane| Support::new(*plane, &object)).collect();
-            log::debug!("surface: {} planes, the object stands on {}", planes.len(), supports.len());
+            let supports = own.supports(&planes);
             let under = |site: &usize| {
                 let depths = supports.iter().filter_map(|support| support.under(own.ray(*site)));
                 depths.reduce(f64::min).filter(|_| own.hole[*site])

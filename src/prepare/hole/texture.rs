@@ -43,8 +43,8 @@ const ANOTHER: f32 = 0.3;
 /// Mean difference of the channels up to which surroundings are of one material in another light, which costs nothing: copies
 /// take the light of their place.
 const LIGHT: f32 = 0.05;
-/// Cost of a copy whose surroundings differ in one channel by the whole range from what goes on into the hole, at its border;
-/// it falls by a factor e every `FADES` of the hole's half width.
+/// Cost of a copy at the hole's border for each unit, summed over the channels, by which the colours of its surroundings differ
+/// from those that go on into the hole; it falls by a factor e every `FADES` of the hole's half width.
 const UNLIKE: f64 = 6.0;
 const FADES: f64 = 0.6;
 /// Half the width of the squares over which surroundings are averaged, pixels.

@@ -13,6 +13,7 @@ use super::Ground;
 use super::border::{Amounts, amounts};
 use super::mixture::{Color, Mixture, brightened, channels, color};
 use crate::prepare::graph_cut::Grid;
+use crate::prepare::planes::neighbours;
 
 /// Directions of the light around the object, and how far a place one high is moved.
 const AROUND: usize = 24;
@@ -369,14 +370,7 @@ fn attached(mask: &[bool], other: &[bool], side: usize) -> Cells {
         let (mut piece, mut at) = (vec![start], 0);
         while let Some(&i) = piece.get(at) {
             at += 1;
-            let (x, y) = (i % side, i / side);
-            let next = [
-                (x > 0).then(|| i - 1),
-                (x + 1 < side).then(|| i + 1),
-                i.checked_sub(side),
-                (y + 1 < side).then(|| i + side),
-            ];
-            for j in next.into_iter().flatten() {
+            for j in neighbours(i, [side; 2]) {
                 if mask[j] && !done[j] {
                     done[j] = true;
                     piece.push(j);
