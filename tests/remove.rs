@@ -55,8 +55,12 @@ fn one_command_removes_an_object_and_is_not_repeated() {
         assert!(output.status.success(), "{err}");
         (out, err)
     };
-    let (said, _) = run(&command);
+    // A photograph without a camera, which everybody who reads the scene has something to say about.
+    let copied = fs::copy(&names(&folder.join("photos/images"))[0], folder.join("photos/images/strayed.png"));
+    copied.expect("writable");
+    let (said, notes) = run(&command);
     assert!(said.contains("photos-removed: the object is gone"), "{said}");
+    assert_eq!(notes.lines().filter(|line| line.contains("strayed")).count(), 1, "{notes}");
     let out = folder.join("photos-removed");
     for file in ["scene.ply", "scene.spz", "scene.glb", "export.json", "run/run.json", "scene/prepare.json"] {
         assert!(out.join(file).is_file(), "{file}");
@@ -67,6 +71,19 @@ fn one_command_removes_an_object_and_is_not_repeated() {
     assert_eq!(fs::metadata(out.join("scene.ply")).and_then(|file| file.modified()).expect("a file"), made);
     let (_, said) = run(&format!("{command} --seed 5"));
     assert!(said.contains("trained again"), "{said}");
+    // With a limit the plan is said first; the least is named where it is too little; a moment is enough for what is left.
+    let within = |minutes: &str| {
+        let settings = "--preset demo --fit-steps 150 --export-steps 10 --set train.eval_interval=0 --seed 6";
+        format!("remove photos --mask {name}={} --yes {settings} --minutes {minutes}", mask.display())
+    };
+    let output = program(folder, &within("0.01")).output().expect("it starts");
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.code() == Some(1) && said.contains("error: --minutes 0.01: about "), "{said}");
+    assert!(said.contains("min are the least") && !said.contains("plan:"), "{said}");
+    let (_, said) = run(&within("0.5"));
+    let at = |what: &str| said.find(what).unwrap_or_else(|| panic!("no {what}: {said}"));
+    assert!(at("plan: of 0.5 min") < at("masks: nothing has changed"), "{said}");
+    assert!(at("min have gone, and 0.") < at("are kept for the files"), "{said}");
     // What it made can be looked at, with a photograph.
     let (said, notes) = run("view photos-removed --html page.html");
     assert!(said.contains("page.html") && !notes.contains("without a photograph"), "{notes}");

@@ -6,8 +6,9 @@ use anyhow::{Context as _, bail};
 use super::{next, pictures};
 use crate::prepare::hole::PROVENANCE;
 use crate::prepare::record;
-use crate::scene::doctor::{self, Report, Severity};
+use crate::scene::doctor::{self, Finding, Report, Severity};
 use crate::scene::{Scene, sheet};
+use crate::work;
 
 /// Look over a scene before training: masks, names, sizes, poses, depth, reference, exposure
 ///
@@ -75,11 +76,22 @@ pub(super) fn examined(folder: &Path, masks: Option<&Path>) -> anyhow::Result<(R
 
 /// The findings as lines, the worst first.
 pub(super) fn text(report: &Report) -> String {
+    text_of(report, |_| true)
+}
+
+/// As [`text`], without the notes of the scene in `folder` that were said already.
+pub(super) fn new_text(report: &Report, folder: &Path) -> String {
+    text_of(report, |finding| {
+        let new = work::is_new(folder, &finding.text());
+        new || finding.severity == Severity::Problem
+    })
+}
+
+fn text_of(report: &Report, is_said: impl Fn(&Finding) -> bool) -> String {
     let mut text = String::new();
-    for finding in &report.findings {
+    for finding in report.findings.iter().filter(|finding| is_said(finding)) {
         let kind = if finding.severity == Severity::Problem { "problem" } else { "note" };
-        let view = finding.view.as_ref().map_or_else(String::new, |view| format!("{view}: "));
-        text += &format!("{kind:<8} {:<10} {view}{}\n", finding.check, finding.message);
+        text += &format!("{kind:<8} {:<10} {}\n", finding.check, finding.text());
     }
     if let Some([mean, least]) = report.iou {
         let views = report.views.iter().filter(|view| view.iou.is_some()).count();

@@ -5,7 +5,7 @@
 //! [`CHECKS`]th of the time. The corrections are part of the settings ([`crate::train::Config::corrections`]), so that the
 //! run can be repeated to the byte.
 
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use anyhow::ensure;
 
@@ -32,6 +32,15 @@ const BY_ANCHORS: f64 = 0.7;
 const DRAWN: f64 = 0.6;
 /// Seconds for what is written at the end.
 const WRITTEN: f64 = 1.0;
+
+/// What is to be done behind the training within the same time.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Reserve {
+    /// Time in training steps on pictures of the full size.
+    pub steps: f64,
+    /// Seconds besides.
+    pub seconds: f64,
+}
 
 /// The time that a training has, and where it is in it. All times are seconds since the program began.
 #[derive(Clone, Debug)]
@@ -119,7 +128,7 @@ fn growth(first: u32, last: &Progress, settings: &Settings) -> (f64, f64) {
 
 /// The settings for a training that ends about `minutes` after `began`, and the clock that corrects them: their schedule
 /// fitted to as many steps as this device takes in that time. Where the settings have smaller pictures first, these keep
-/// their share of the steps.
+/// their share of the steps. `reserve` of the time is left.
 ///
 /// # Errors
 /// When the device has no room; when the time is over before training begins.
@@ -129,6 +138,7 @@ pub(super) fn fitted(
     settings: &Settings,
     minutes: f64,
     began: Instant,
+    reserve: Reserve,
 ) -> anyhow::Result<(Settings, Clock)> {
     let coarse = f64::from(settings.train.coarse.until) / f64::from(settings.train.iterations);
     let mut probe = settings.clone();
@@ -150,19 +160,30 @@ pub(super) fn fitted(
     let mean = step_time([first, full], coarse);
     // All views are drawn for what they show of the hole, and the test views once more for their figures.
     let drawn = if scene.test.is_empty() { 0 } else { scene.train.len() + 2 * scene.test.len() };
-    let after = DRAWN * drawn as f64 * full * GROWTH + WRITTEN;
-    let left = Duration::from_secs_f64(60.0 * minutes).saturating_sub(began.elapsed()).as_secs_f64() - after;
-    let steps = (left.max(0.0) / mean) as u32;
+    let kept = reserve.steps * full * GROWTH + reserve.seconds;
+    let after = DRAWN * drawn as f64 * full * GROWTH + WRITTEN + kept;
+    let gone = began.elapsed().as_secs_f64();
+    let steps = ((60.0 * minutes - gone - after).max(0.0) / mean) as u32;
     ensure!(
         steps >= FEWEST,
-        "--minutes {minutes}: {left:.0} s are left for training and a step takes about {mean:.2} s, which is too \
-         few steps: give more time, or --downscale the pictures",
+        "--minutes {minutes}: {} are the least here, of which {:.1} have gone before training: give more time, or \
+         --downscale the pictures",
+        least(gone + after + f64::from(FEWEST) * mean),
+        gone / 60.0,
     );
+    let files = if kept > 0.0 { format!(", and {:.1} are kept for the files", kept / 60.0) } else { String::new() };
     eprintln!(
-        "minutes: {steps} steps of about {:.0} ms fit into what is left of {minutes} min; corrected while they run",
+        "minutes: {:.1} min have gone{files}: {steps} steps of about {:.0} ms fit into what is left of {minutes} min; corrected \
+         while they run",
+        gone / 60.0,
         1e3 * mean
     );
-    Ok((settings.rescheduled(steps), Clock::new(began, 60.0 * minutes, full / first, drawn)))
+    Ok((settings.rescheduled(steps), Clock::new(began, 60.0 * minutes - kept, full / first, drawn)))
+}
+
+/// Seconds as minutes that are enough for them, in tenths.
+pub(super) fn least(seconds: f64) -> f64 {
+    (seconds / 6.0).ceil() / 10.0
 }
 
 /// The time of a step over the whole run, from those measured before anchors grew: of small pictures, which have the share

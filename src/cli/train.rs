@@ -187,7 +187,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         let Ready { scene, settings } = if goes_on { loaded.as_read() } else { loaded.ready(gpu)? };
         let (settings, clock) = match args.minutes {
             Some(time) => {
-                let (settings, clock) = minutes::fitted(gpu, &scene, &settings, time, began)?;
+                let (settings, clock) =
+                    minutes::fitted(gpu, &scene, &settings, time, began, minutes::Reserve::default())?;
                 (settings, Some(clock))
             }
             None => (settings, None),
@@ -237,8 +238,7 @@ fn begun_from(path: &Path) -> anyhow::Result<Vec<String>> {
 /// Says again what is wrong with the scene, now that the lines of the start have scrolled away.
 fn warn(looked: &doctor::Report) {
     for finding in looked.findings.iter().filter(|finding| finding.severity == Severity::Problem) {
-        let view = finding.view.as_ref().map_or_else(String::new, |view| format!("{view}: "));
-        eprintln!("warning: {view}{}", finding.message);
+        eprintln!("warning: {}", finding.text());
     }
 }
 

@@ -201,12 +201,17 @@ pub struct Folder {
 /// The lines that the steps of `prepare` left about a scene: where its reference comes from, among others. Empty for a
 /// scene that `prepare` did not make.
 pub fn notes(scene: &Path) -> Vec<String> {
-    if !scene.join(RECORD).is_file() {
-        return vec![];
-    }
-    let Ok(folder) = Folder::open(scene) else { return vec![] };
-    let steps = Step::ALL.iter().filter_map(|step| folder.record().steps.get(step.name()));
+    let steps = ended(scene);
+    let steps = Step::ALL.iter().filter_map(|step| steps.get(step.name()));
     steps.flat_map(|step| step.notes.clone()).collect()
+}
+
+/// The steps of `prepare` that have ended in a scene, by name; none where it did not make the scene.
+pub fn ended(scene: &Path) -> BTreeMap<String, StepRecord> {
+    if !scene.join(RECORD).is_file() {
+        return BTreeMap::new();
+    }
+    Folder::open(scene).map_or_else(|_| BTreeMap::new(), |folder| folder.record.steps)
 }
 
 impl Folder {

@@ -36,6 +36,13 @@ pub struct Finding {
     pub message: String,
 }
 
+impl Finding {
+    /// The sentence, behind the name of the view that it is about.
+    pub fn text(&self) -> String {
+        self.view.as_ref().map_or_else(|| self.message.clone(), |view| format!("{view}: {}", self.message))
+    }
+}
+
 /// Figures of one train view.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct ViewFigures {
@@ -95,10 +102,9 @@ impl Report {
         match self.findings.iter().find(|f| f.severity == Severity::Problem) {
             None => "nothing wrong was found".into(),
             Some(first) => {
-                let view = first.view.as_ref().map_or_else(String::new, |view| format!("{view}: "));
                 let more = self.problems() - 1;
                 let more = if more == 0 { String::new() } else { format!(" (and {more} more: gscream-vk doctor)") };
-                format!("{view}{}{more}", first.message)
+                format!("{}{more}", first.text())
             }
         }
     }

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 
+use super::said::is_new;
 use crate::config::Settings;
 use crate::gpu::Gpu;
 use crate::multiview;
@@ -15,23 +16,23 @@ pub const SYNTHETIC: &str = "synthetic";
 /// Views that are never gone below.
 const FEWEST_VIEWS: usize = 3;
 
-/// Reads a scene, conditions it and prints its notes to stderr. Its lengths are in [`Scene::unit`]s. `synthetic` writes
+/// Reads a scene, conditions it and prints what is new of its notes to stderr. Its lengths are in [`Scene::unit`]s. `synthetic` writes
 /// the built-in scene of seed `train.seed` into a temporary folder and reads it like any other.
 ///
 /// # Errors
 /// A scene that cannot be read, a temporary folder that cannot be written.
-pub fn load_scene(scene: &Path, settings: &Settings) -> anyhow::Result<Scene> {
-    let mut scene = if scene == Path::new(SYNTHETIC) {
+pub fn load_scene(path: &Path, settings: &Settings) -> anyhow::Result<Scene> {
+    let mut scene = if path == Path::new(SYNTHETIC) {
         let folder = tempfile::tempdir().context("no temporary folder for the synthetic scene can be made")?;
         let options = synthetic::Options { seed: settings.train.seed, ..Default::default() };
         let scene = folder.path().join(SYNTHETIC);
         synthetic::write(&scene, &options)?;
         scene::load(&scene, &settings.scene)?
     } else {
-        scene::load(scene, &settings.scene)?
+        scene::load(path, &settings.scene)?
     };
     scene::condition(&mut scene, &settings.scene);
-    for note in &scene.notes {
+    for note in scene.notes.iter().filter(|note| is_new(path, note)) {
         eprintln!("scene: {note}");
     }
     Ok(scene)

@@ -2,9 +2,11 @@
 
 mod page;
 mod splat;
+mod time;
 mod work;
 
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 use anyhow::Context as _;
 
@@ -17,6 +19,7 @@ use crate::folder::Lock;
 use crate::prepare::poses;
 use crate::remove::objects;
 use crate::splat::read;
+use time::{Time, Work};
 use work::{Job, Places};
 
 /// Remove an object from photographs: point at it in the browser, and it is gone
@@ -70,7 +73,10 @@ pub(super) struct Args {
     reference: Option<String>,
     #[command(flatten)]
     shadow: ShadowArgs,
-    /// Train for about so many minutes: see train
+    /// Be done after about so many minutes, from Remove (or the command with --yes) to the files: training has what the rest leaves
+    ///
+    /// The plan is said first. What cannot be done in that time is refused as soon as that is known, with the least time that it
+    /// takes; what was made until then stays. The same command again has the whole time for what is left.
     #[arg(long, value_name = "N", conflicts_with = "iterations", value_parser = train::positive)]
     minutes: Option<f64>,
     /// Steps of the fit that masks, depth and reference are made with
@@ -86,6 +92,16 @@ pub(super) struct Args {
 }
 
 impl Args {
+    /// What there is to do for so many photographs.
+    fn work(&self, views: usize) -> Work {
+        Work {
+            views,
+            fit: f64::from(self.fit_steps) / 600.0,
+            files: f64::from(self.export_steps) / f64::from(export::Options::default().steps),
+            splat: read::is_splat(&self.photographs),
+        }
+    }
+
     fn places(&self) -> Places {
         Places::new(self.out.clone().unwrap_or_else(|| default_folder(&self.photographs)))
     }
@@ -101,6 +117,7 @@ fn default_folder(photographs: &Path) -> PathBuf {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
+    let began = Instant::now();
     // A mistake in the settings is said before anything is made.
     args.settings.resolve()?;
     let places = args.places();
@@ -111,11 +128,12 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let found = if is_splat { None } else { Some(poses::find(&args.photographs)?) };
     let _lock = Lock::take(&places.root)?;
     let splat = if is_splat { Some(splat::open(args, &places)?) } else { None };
-    let job = Job { args, places, splat };
     let capture = match found {
         Some(capture) => capture,
-        None => poses::find(job.photographs())?,
+        None => poses::find(splat.as_ref().map_or(&args.photographs, |splat| &splat.views))?,
     };
+    let time = Time::new(args.minutes, args.work(capture.photographs.len()));
+    let job = Job { args, places, splat, time };
     if args.object.evidence().is_empty() && !args.yes {
         return page::run(&job, &capture);
     }
@@ -128,7 +146,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     object.extend(work::evidence(kept));
     args.device.with_gpu(|gpu| {
         signals::listen()?;
-        job.work(gpu, object, args.yes, &work::Nobody)
+        job.work(gpu, object, args.yes, &work::Nobody, began)
     })?;
     job.say();
     Ok(())

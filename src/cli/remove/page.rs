@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use image::GrayImage;
@@ -20,7 +20,7 @@ use crate::prepare::masks::{self, Shares, Votes};
 use crate::prepare::poses::Capture;
 use crate::prepare::splats::Splats;
 use crate::remove::{Session, Wish, objects};
-use crate::scene::doctor::{Report, Severity};
+use crate::scene::doctor::{Finding, Report, Severity};
 use crate::scene::{self, Scene};
 use crate::view::live::Board;
 use crate::view::server::{self, Secret};
@@ -43,11 +43,7 @@ impl Audience for Visitors<'_> {
     }
     fn examined(&self, report: &Report) {
         let problems = report.findings.iter().filter(|finding| finding.severity == Severity::Problem);
-        let said = problems.map(|finding| {
-            let view = finding.view.as_ref().map_or_else(String::new, |view| format!("{view}: "));
-            format!("{view}{}", finding.message)
-        });
-        self.0.found(said.collect());
+        self.0.found(problems.map(Finding::text).collect());
     }
     fn stop(&self) -> Stop {
         self.0.stopping()
@@ -146,9 +142,10 @@ fn attend(job: &Job<'_>, gpu: &Gpu, session: &Arc<Session>, capture: &Capture) -
 }
 
 fn remove(job: &Job<'_>, gpu: &Gpu, session: &Session, capture: &Capture, despite: bool) -> anyhow::Result<()> {
+    let began = Instant::now();
     session.begin("masks", 0);
     let masks = objects::all(&job.places.objects, capture.photographs.iter())?;
-    job.work(gpu, work::evidence(masks).collect(), despite, &Visitors(session))?;
+    job.work(gpu, work::evidence(masks).collect(), despite, &Visitors(session), began)?;
     session.begin("page", 0);
     let page = view::page_of(&job.places.root).context("the object is gone, but it cannot be shown")?;
     session.done(page.resources(), job.places.files());

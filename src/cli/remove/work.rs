@@ -9,6 +9,7 @@ use anyhow::{Context as _, bail};
 use serde::{Deserialize, Serialize};
 
 use super::Args;
+use super::time::Time;
 use crate::atomic;
 use crate::cli::folders::{self, MODEL, Record as RunRecord};
 use crate::cli::prepare::Bars;
@@ -78,6 +79,8 @@ pub struct Job<'a> {
     pub splat: Option<Source>,
     /// Where to.
     pub places: Places,
+    /// How long it may take.
+    pub time: Time,
 }
 
 /// Hears how far the work is, and may end it.
@@ -136,23 +139,25 @@ pub fn evidence(masks: Vec<(String, PathBuf)>) -> impl Iterator<Item = (String, 
     masks.into_iter().map(|(name, path)| (format!("{name}.png"), Evidence::Mask(path)))
 }
 
-/// Bars on the terminal, and an audience.
+/// Bars on the terminal, an audience, and a clock.
 struct Watched<'a, B> {
     bars: B,
     audience: &'a dyn Audience,
+    job: &'a Job<'a>,
     stop: Stop,
     done: u64,
 }
 
 impl<'a, B: Default> Watched<'a, B> {
-    fn new(audience: &'a dyn Audience) -> Self {
-        Self { bars: B::default(), audience, stop: audience.stop(), done: 0 }
+    fn new(audience: &'a dyn Audience, job: &'a Job<'_>) -> Self {
+        Self { bars: B::default(), audience, job, stop: audience.stop(), done: 0 }
     }
 }
 
 impl Watch for Watched<'_, Bars> {
     fn begin(&mut self, step: Step, units: u64) {
         self.audience.begin(step.name(), units);
+        self.job.time.begin(step.name());
         self.bars.begin(step, units);
     }
     fn at(&mut self, unit: u64) {
@@ -160,9 +165,20 @@ impl Watch for Watched<'_, Bars> {
         self.bars.at(unit);
     }
     fn end(&mut self) {
+        self.job.time.end();
         self.bars.end();
     }
+    fn go_on(&mut self) -> Result<(), prepare::Error> {
+        match (self.interrupted(), self.job.time.in_vain()) {
+            (Some(signal), _) => Err(prepare::Error::Interrupted { signal }),
+            (None, Some(why)) => Err(prepare::Error::Request(why)),
+            (None, None) => Ok(()),
+        }
+    }
     fn say(&mut self, line: &str) {
+        // What a step found out is not said again by those that read the scene.
+        let note = line.split_once(": ").map_or(line, |(_, note)| note);
+        work::is_new(&self.job.places.scene, note);
         self.bars.say(line);
     }
     fn interrupted(&mut self) -> Option<Signal> {
@@ -219,10 +235,10 @@ impl Job<'_> {
         gpu: &Gpu,
         audience: &dyn Audience,
     ) -> Result<(crate::scene::Scene, prepare::fit::Fit), prepare::Error> {
-        prepare::fitted(gpu, &self.request(vec![]), &mut Watched::<Bars>::new(audience))
+        prepare::fitted(gpu, &self.request(vec![]), &mut Watched::<Bars>::new(audience, self))
     }
 
-    /// Everything. With `despite` also where doctor finds problems.
+    /// Everything, in the time since `began`. With `despite` also where doctor finds problems.
     ///
     /// # Errors
     /// Errors of the parts; problems that doctor finds; an end that somebody wished.
@@ -232,11 +248,13 @@ impl Job<'_> {
         object: Vec<(String, Evidence)>,
         despite: bool,
         audience: &dyn Audience,
+        began: Instant,
     ) -> anyhow::Result<()> {
         let Places { root, scene, run, .. } = &self.places;
-        prepare::prepare(gpu, &self.request(object), &mut Watched::<Bars>::new(audience))?;
+        self.time.start(began, scene)?;
+        prepare::prepare(gpu, &self.request(object), &mut Watched::<Bars>::new(audience, self))?;
         let (report, _) = findings::examined(scene, None)?;
-        eprint!("{}", findings::text(&report));
+        eprint!("{}", findings::new_text(&report, scene));
         audience.examined(&report);
         match report.problems() {
             0 => {}
@@ -263,7 +281,7 @@ impl Job<'_> {
             return Ok(());
         }
         let args = export::Args::of_run(run, root, self.args.export_steps, Options::default().views);
-        export::export(&args, root, &mut Watched::<export::Bars>::new(audience), |work| work(gpu))?;
+        export::export(&args, root, &mut Watched::<export::Bars>::new(audience, self), |work| work(gpu))?;
         record.export = inputs;
         record.write(root)
     }
@@ -277,7 +295,7 @@ impl Job<'_> {
     ) -> anyhow::Result<()> {
         let Args { device, minutes, .. } = self.args;
         let Places { root, scene: folder, run, .. } = &self.places;
-        let began = Instant::now();
+        let began = self.time.began();
         let given = SceneArgs { scene: folder.clone(), settings: settings.clone() };
         let name = given.name();
         let lock = train::held(run, false)?;
@@ -313,7 +331,8 @@ impl Job<'_> {
         };
         let (settings, clock) = match minutes {
             Some(time) if !begun => {
-                let (settings, clock) = minutes::fitted(gpu, &scene, &settings, *time, began)?;
+                let (settings, clock) =
+                    minutes::fitted(gpu, &scene, &settings, *time, began, self.time.files(settings.model.form))?;
                 (settings, Some(clock))
             }
             _ => (settings, None),
