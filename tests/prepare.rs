@@ -735,10 +735,19 @@ fn the_doctor_passes_clean_captures() {
     }
 }
 
+/// Writes a program for a shell into `bin/`.
+#[cfg(unix)]
+fn write_program(folder: &Path, name: &str, script: &str) {
+    use std::os::unix::fs::PermissionsExt as _;
+    let program = folder.join("bin").join(name);
+    fs::create_dir_all(folder.join("bin")).expect("a writable folder");
+    fs::write(&program, script).expect("a writable folder");
+    fs::set_permissions(&program, fs::Permissions::from_mode(0o755)).expect("our own file");
+}
+
 /// A program called `colmap` whose mapper leaves the models in `$MODELS`, as it does where it cannot join them.
 #[cfg(unix)]
 fn mapper(folder: &Path, models: &[(&str, u64)]) {
-    use std::os::unix::fs::PermissionsExt as _;
     for (name, images) in models {
         let model = folder.join("models").join(name);
         fs::create_dir_all(&model).expect("a writable folder");
@@ -753,10 +762,7 @@ fn mapper(folder: &Path, models: &[(&str, u64)]) {
         }
     }
     let script = "#!/bin/sh\n[ \"$1\" = mapper ] || exit 0\nwhile [ \"$1\" != --output_path ]; do shift; done\ncp -r \"$MODELS\"/* \"$2\"\n";
-    let program = folder.join("bin/colmap");
-    fs::create_dir_all(folder.join("bin")).expect("a writable folder");
-    fs::write(&program, script).expect("a writable folder");
-    fs::set_permissions(&program, fs::Permissions::from_mode(0o755)).expect("our own file");
+    write_program(folder, "colmap", script);
 }
 
 #[cfg(unix)]
@@ -777,5 +783,137 @@ fn of_colmaps_models_the_largest_is_taken() {
     for file in ["cameras.bin", "images.bin", "points3D.bin"] {
         let taken = fs::read(folder.join("scene/sparse/0").join(file)).expect("a model");
         assert!(taken == fs::read(folder.join("models/1").join(file)).expect("a model"), "{file} of another model");
+    }
+}
+
+/// The files of a folder, in the order of their names.
+#[cfg(unix)]
+fn pictures(folder: &Path) -> Vec<PathBuf> {
+    let mut all: Vec<PathBuf> = fs::read_dir(folder).expect("a folder").flatten().map(|entry| entry.path()).collect();
+    all.sort();
+    all
+}
+
+/// Frames of a clip that goes past a wall, of which every fifth is sharp: `frame_0001.jpg` and so on in `all/`.
+#[cfg(unix)]
+fn frames(folder: &Path, count: u32) {
+    fs::create_dir_all(folder.join("all")).expect("a writable folder");
+    for number in 0..count {
+        let wall = RgbImage::from_fn(96, 64, |x, y| {
+            let bricks = (x + 3 * number) / 5 + y / 4 * 7;
+            Rgb([(bricks * 53 % 200 + 40) as u8, (bricks * 91 % 180 + 30) as u8, 90])
+        });
+        let frame = if number % 5 == 2 { wall } else { image::imageops::blur(&wall, 2.0) };
+        frame.save(folder.join(format!("all/frame_{:04}.jpg", number + 1))).expect("a writable folder");
+    }
+}
+
+/// `prepare clip.mp4 --only poses` with the programs in `bin/`, or those of the system as well.
+#[cfg(unix)]
+fn prepare_clip(folder: &Path, more: &str, system: bool) -> (Option<i32>, String) {
+    let system = if system { std::env::var("PATH").unwrap_or_default() } else { "/usr/bin:/bin".into() };
+    let mut program = cargo_bin_cmd!("gscream-vk");
+    program.current_dir(folder).env("PATH", format!("{}:{system}", folder.join("bin").display()));
+    program.env("MODELS", folder.join("models")).env("FRAMES", folder.join("all"));
+    program.env("XDG_CACHE_HOME", env!("CARGO_TARGET_TMPDIR"));
+    program.args(format!("prepare clip.mp4 --out scene --only poses {more}").split_whitespace());
+    let output = program.output().expect("it starts");
+    (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+}
+
+/// As `ffmpeg` as far as it is asked: all frames, or those that the filter `select` names.
+#[cfg(unix)]
+const FFMPEG: &str = r#"#!/bin/sh
+while [ "$1" != -i ]; do shift; done
+grep -q CLIP "$2" || { echo "$2: Invalid data found when processing input" >&2; exit 1; }
+for last; do :; done
+to=${last%/*}
+echo asked >> "$FRAMES.log"
+case $* in
+*select=*) i=0; for n in $(echo "$*" | grep -o 'eq(n,[0-9]*)' | tr -dc '0-9\n'); do
+    i=$((i + 1)); cp "$(printf "$FRAMES/frame_%04d.jpg" $((n + 1)))" "$(printf "$to/frame_%04d.jpg" $i)"; done ;;
+*) cp "$FRAMES"/*.jpg "$to" ;;
+esac
+"#;
+
+#[cfg(unix)]
+#[test]
+fn the_sharpest_frames_of_a_video_are_its_photographs() {
+    let folder = capture();
+    let folder = folder.path();
+    mapper(folder, &[("0", 8)]);
+    write_program(folder, "ffmpeg", FFMPEG);
+    frames(folder, 40);
+    fs::write(folder.join("clip.mp4"), "CLIP").expect("writable");
+    let (code, says) = prepare_clip(folder, "--frames 8", false);
+    assert_eq!(code, Some(0), "{says}");
+    let taken = pictures(&folder.join("scene/images"));
+    assert_eq!(taken.len(), 8, "{taken:?}");
+    for (piece, path) in taken.iter().enumerate() {
+        assert!(path.ends_with(format!("frame_{:04}.jpg", piece + 1)), "{taken:?}");
+        let sharp = fs::read(folder.join(format!("all/frame_{:04}.jpg", 5 * piece + 3))).expect("a frame");
+        assert!(fs::read(path).expect("a frame") == sharp, "piece {piece} has another frame");
+    }
+    // Nobody is asked again; another number is another choice, and fewer photographs are left.
+    let asked = || fs::read_to_string(folder.join("all.log")).expect("it was asked").lines().count();
+    assert_eq!(asked(), 2);
+    assert_eq!(prepare_clip(folder, "--frames 8", false).0, Some(0));
+    assert_eq!(asked(), 2);
+    let (code, says) = prepare_clip(folder, "--frames 4", false);
+    assert_eq!((code, pictures(&folder.join("scene/images")).len()), (Some(0), 4), "{says}");
+}
+
+#[cfg(unix)]
+#[test]
+fn what_is_no_video_is_said_in_a_sentence() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let folder = folder.path();
+    frames(folder, 2);
+    fs::write(folder.join("clip.mp4"), "a letter").expect("writable");
+    let says = |more: &str| {
+        let (code, says) = prepare_clip(folder, more, false);
+        assert!(code == Some(1) && says.matches("error: ").count() == 1, "{says}");
+        assert!(!folder.join("scene/images").exists());
+        says
+    };
+    // The system of these tests may have one of its own.
+    if !["/usr/bin/ffmpeg", "/bin/ffmpeg"].iter().any(|path| Path::new(path).exists()) {
+        assert!(says("").contains("clip.mp4: is no folder, and the program ffmpeg is not installed"));
+    }
+    write_program(folder, "ffmpeg", FFMPEG);
+    let no_video = "clip.mp4: ffmpeg finds no video in it (";
+    assert!(says("").contains(no_video) && says("").contains("Invalid data found when processing input)"));
+    fs::write(folder.join("clip.mp4"), "CLIP").expect("writable");
+    assert!(says("").contains("its 2 frames are too few"));
+}
+
+/// By the real program: a clip of frames that are shown a fifteenth of a second each.
+#[cfg(unix)]
+#[test]
+fn ffmpeg_takes_the_frames_that_were_chosen() {
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    if !std::env::split_paths(&path).any(|folder| folder.join("ffmpeg").is_file()) {
+        return skip(Lack::Ffmpeg, "ffmpeg is not installed: Debian's package `ffmpeg`");
+    }
+    let folder = capture();
+    let folder = folder.path();
+    mapper(folder, &[("0", 8)]);
+    frames(folder, 40);
+    let clip = "-v error -framerate 15 -i all/frame_%04d.jpg -c:v mjpeg -q:v 2 -f matroska clip.mp4";
+    let made = std::process::Command::new("ffmpeg").args(clip.split_whitespace()).current_dir(folder).status();
+    assert!(made.expect("ffmpeg starts").success());
+    let (code, says) = prepare_clip(folder, "--frames 8", true);
+    assert_eq!(code, Some(0), "{says}");
+    let taken = pictures(&folder.join("scene/images"));
+    assert_eq!(taken.len(), 8, "{says}");
+    let read = |path: &Path| image::open(path).expect("a frame").into_rgb8();
+    for (piece, path) in taken.iter().enumerate() {
+        let off = |number: usize| {
+            let frame = read(&folder.join(format!("all/frame_{number:04}.jpg")));
+            let pairs = frame.as_raw().iter().zip(read(path).into_raw());
+            pairs.map(|(a, b)| f64::from(a.abs_diff(b))).sum::<f64>() / frame.as_raw().len() as f64
+        };
+        let (own, next) = (off(5 * piece + 3), off(5 * piece + 4));
+        assert!(own < 4.0 && own < 0.5 * next, "piece {piece}: {own} from the sharpest frame, {next} from the next");
     }
 }

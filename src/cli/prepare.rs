@@ -1,19 +1,21 @@
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::shared::DeviceArgs;
 use super::{next, signals};
+use crate::folder::Lock;
 use crate::prepare::click::MOST_POINTS;
 use crate::prepare::shadow::Answer;
-use crate::prepare::{self, Evidence, Request, Step, Watch};
+use crate::prepare::{self, Evidence, Request, Step, Watch, video};
 use crate::signal::Signal;
 
 /// Make a scene of photographs and one mask: cameras, masks for all views, depth, a reference view without the object
 ///
 /// PHOTOS is a folder of photographs, alone or with what is known of their cameras: a COLMAP model in sparse/ (photographs
 /// in images/), or nerfstudio's transforms.json. For photographs alone the program colmap is asked, where it is installed.
+/// Of a video the sharpest frames of even spacing are the photographs; the program ffmpeg takes them.
 /// The scene gets the plain layout, which `train` takes.
 ///
 /// The steps are poses, fit, masks, shadow, depth and reference. A step whose inputs have not changed is skipped, a file that was
@@ -23,16 +25,19 @@ use crate::signal::Signal;
 #[command(after_help = "Examples:
   gscream-vk prepare photos --out scene --mask IMG_0012=box.png
   gscream-vk prepare photos --out scene --box IMG_0012=310,220,540,470
+  gscream-vk prepare clip.mp4 --out scene --box frame_0001=310,220,540,470
   gscream-vk prepare photos --out scene --click IMG_0012=430,340 --not IMG_0012=520,460
   gscream-vk prepare photos --out scene --mask IMG_0012=a.png --mask IMG_0040=b.png --reference IMG_0025
   gscream-vk prepare photos --out scene --only masks --mask IMG_0012=better.png")]
 pub(super) struct Args {
-    /// Folder of photographs
+    /// Folder of photographs, or a video
     #[arg(value_name = "PHOTOS")]
     photographs: PathBuf,
     /// Folder of the scene; may be PHOTOS itself
     #[arg(long, value_name = "SCENE")]
     out: PathBuf,
+    #[command(flatten)]
+    video: VideoArgs,
     #[command(flatten)]
     object: ObjectArgs,
     /// View to become the reference [default: the one whose hole is seen best by others]
@@ -98,6 +103,25 @@ pub(super) struct ObjectArgs {
     /// Pixel that is not of the object, where another mark of the view takes too much; may be given many times
     #[arg(long, value_name = "NAME=x,y", value_parser = not)]
     not: Vec<(String, Evidence)>,
+}
+
+/// How photographs are taken out of a video.
+#[derive(Debug, Clone, Copy, clap::Args)]
+pub(super) struct VideoArgs {
+    /// Frames of a video at most, the sharpest of pieces of one length
+    #[arg(long, value_name = "N", default_value_t = 120, value_parser = clap::value_parser!(u32).range(3..=1000))]
+    frames: u32,
+}
+
+impl VideoArgs {
+    /// The folder of the photographs: `given`, or that of its frames below `out`, where it is a video.
+    pub fn photographs(self, given: &Path, out: &Path) -> anyhow::Result<PathBuf> {
+        if !video::is_video(given) {
+            return Ok(given.to_owned());
+        }
+        signals::listen()?;
+        Ok(video::frames(given, self.frames, out, &mut Bars::default())?)
+    }
 }
 
 /// What happens to the object's shadow.
@@ -195,6 +219,12 @@ fn step(text: &str) -> Result<Step, String> {
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let began = Instant::now();
+    let photographs = if video::is_video(&args.photographs) {
+        let _lock = Lock::take(&args.out)?;
+        args.video.photographs(&args.photographs, &args.out.join(MADE))?
+    } else {
+        args.photographs.clone()
+    };
     let request = Request {
         object: args.object.evidence(),
         reference: args.reference.clone(),
@@ -206,7 +236,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         fit_steps: args.fit_steps,
         fit_side: args.fit_side,
         seed: args.seed.into(),
-        ..Request::new(&args.photographs, &args.out)
+        ..Request::new(photographs, &args.out)
     };
     args.device.with_gpu(|gpu| {
         signals::listen()?;
@@ -219,6 +249,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     ]);
     Ok(())
 }
+
+/// Where a scene has what `prepare` made for itself.
+const MADE: &str = "prepare";
 
 /// A bar for each step.
 #[derive(Default)]

@@ -16,6 +16,7 @@ mod program;
 pub mod record;
 pub mod shadow;
 pub mod splats;
+pub mod video;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -90,6 +91,16 @@ pub enum Error {
     NoPoses {
         /// The photographs.
         folder: PathBuf,
+    },
+    /// A video, and no ffmpeg.
+    #[error(
+        "{}: is no folder, and the program ffmpeg is not installed to take photographs out of a video with; install it (Debian: \
+         apt install ffmpeg), or give a folder of photographs",
+        video.display()
+    )]
+    NoFrames {
+        /// The video.
+        video: PathBuf,
     },
     /// The `colmap` program gave up.
     #[error("colmap {command} failed: {what}")]

@@ -16,7 +16,7 @@ use rand_pcg::Pcg64;
 use serde::Deserialize;
 
 use super::lens::{self, Pinhole};
-use super::program::{self, Halt};
+use super::program;
 use super::record::{self, Batch, Inputs};
 use super::{Error, Watch};
 use crate::scene::{self, Camera, colmap, undistort};
@@ -439,7 +439,7 @@ impl Capture {
         // Newer versions have renamed the options: what a version has is in its help.
         let without_gpu = |command: &str, names: [&'static str; 2], watch: &mut dyn Watch| -> Result<Vec<_>, Error> {
             ask_colmap(&[command.into(), "--help".into()], &words, watch)?;
-            let text = said(&words)?;
+            let text = program::said(&words)?;
             let known = names.into_iter().find(|name| text.contains(&name[2..]));
             Ok(known.into_iter().flat_map(|name| [OsString::from(name), "0".into()]).collect())
         };
@@ -448,9 +448,7 @@ impl Capture {
             if ask_colmap(&arguments, &words, watch)?.is_some_and(|status| status.success()) {
                 return Ok(());
             }
-            let text = said(&words)?;
-            let last = text.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("it said nothing").trim();
-            Err(Error::Colmap { command: command.to_owned(), what: last.to_owned() })
+            Err(Error::Colmap { command: command.to_owned(), what: program::last_said(&words)? })
         };
         let option = |name: &str, value: &std::ffi::OsStr| [OsString::from(name), value.to_owned()];
         let (database, models) = (option("--database_path", database.as_ref()), models);
@@ -504,21 +502,10 @@ fn picture_extension(path: &Path) -> String {
     if jpeg { "jpg".into() } else { "png".into() }
 }
 
-/// Runs the program `colmap`; nothing where it is not installed. What it says goes into the file `words`.
+/// Runs the program `colmap`: see [`program::ask`].
 fn ask_colmap(arguments: &[OsString], words: &Path, watch: &mut dyn Watch) -> Result<Option<ExitStatus>, Error> {
     let mut command = Command::new("colmap");
-    command.args(arguments).env("QT_QPA_PLATFORM", "offscreen");
-    match program::run(&mut command, words, || watch.interrupted()) {
-        Ok(status) => Ok(Some(status)),
-        Err(Halt::Io(_, error)) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
-        Err(Halt::Io(path, source)) => Err(Error::Io { path, source }),
-        Err(Halt::Interrupted(signal)) => Err(Error::Interrupted { signal }),
-    }
-}
-
-fn said(words: &Path) -> Result<String, Error> {
-    let bytes = std::fs::read(words).map_err(|source| Error::Io { path: words.to_owned(), source })?;
-    Ok(String::from_utf8_lossy(&bytes).into_owned())
+    program::ask(command.args(arguments).env("QT_QPA_PLATFORM", "offscreen"), words, watch)
 }
 
 fn from_transforms(folder: &Path, file: &Path) -> Result<Capture, Error> {

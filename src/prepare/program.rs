@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::Duration;
 
+use super::{Error, Watch};
 use crate::signal::Signal;
 
 /// Time between two looks at a program and at the signals.
@@ -14,15 +15,38 @@ const POLL: Duration = Duration::from_millis(20);
 
 /// Why a program has not ended by itself.
 #[derive(Debug)]
-pub(super) enum Halt {
+enum Halt {
     /// It cannot be started, or its words cannot be kept.
     Io(PathBuf, io::Error),
     /// Somebody asked for an end.
     Interrupted(Signal),
 }
 
+/// Runs a program; nothing where it is not installed. What it says goes into the file `words`.
+pub(super) fn ask(command: &mut Command, words: &Path, watch: &mut dyn Watch) -> Result<Option<ExitStatus>, Error> {
+    match run(command, words, || watch.interrupted()) {
+        Ok(status) => Ok(Some(status)),
+        Err(Halt::Io(_, error)) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+        Err(Halt::Io(path, source)) => Err(Error::Io { path, source }),
+        Err(Halt::Interrupted(signal)) => Err(Error::Interrupted { signal }),
+    }
+}
+
+/// What a program has said.
+pub(super) fn said(words: &Path) -> Result<String, Error> {
+    let bytes = std::fs::read(words).map_err(|source| Error::Io { path: words.to_owned(), source })?;
+    Ok(String::from_utf8_lossy(&bytes).into_owned())
+}
+
+/// The last line that a program has said.
+pub(super) fn last_said(words: &Path) -> Result<String, Error> {
+    let text = said(words)?;
+    let last = text.lines().rev().find(|line| !line.trim().is_empty());
+    Ok(last.unwrap_or("it said nothing").trim().to_owned())
+}
+
 /// Runs a program without input and waits for it. What it says goes into the file `words`.
-pub(super) fn run(
+fn run(
     command: &mut Command,
     words: &Path,
     mut interrupted: impl FnMut() -> Option<Signal>,

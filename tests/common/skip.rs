@@ -34,6 +34,8 @@ pub enum Lack {
     GoldenCase,
     /// What a process's memory is, from the system.
     ProcessMemory,
+    /// The program `ffmpeg`.
+    Ffmpeg,
     /// `rustc`, which the tests of a failing disk compile a library with.
     Compiler,
 }
@@ -56,6 +58,7 @@ impl Lack {
             Self::Snakemake => "snakemake",
             Self::GoldenCase => "golden-case",
             Self::ProcessMemory => "process-memory",
+            Self::Ffmpeg => "ffmpeg",
             Self::Compiler => "compiler",
         }
     }

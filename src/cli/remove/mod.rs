@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 
-use super::prepare::{ObjectArgs, ShadowArgs};
+use super::prepare::{ObjectArgs, ShadowArgs, VideoArgs};
 use super::shared::DeviceArgs;
 use super::{next, signals, train};
 use crate::config::SettingsArgs;
@@ -28,7 +28,7 @@ use work::{Job, Places};
 /// --yes it opens a page with the photographs: draw around the object, look at what was understood in the other photographs,
 /// press Remove. With any of them it needs no browser and asks nothing.
 ///
-/// PHOTOS is what prepare takes: a folder of photographs, alone or with a COLMAP model or a transforms.json. Everything goes
+/// PHOTOS is what prepare takes: a folder of photographs, alone or with a COLMAP model or a transforms.json, or a video. Everything goes
 /// into one folder: the masks that were clicked (objects/NAME.png), the scene (scene/), the run (run/), and the files for
 /// viewers. The same command again goes on where it was cut off, and makes again only what has changed.
 ///
@@ -39,15 +39,18 @@ use work::{Job, Places};
 #[command(after_help = "Examples:
   gscream-vk remove photos
   gscream-vk remove photos --minutes 20
+  gscream-vk remove clip.mp4 --frames 80
   gscream-vk remove scene.ply --cameras sparse/0 --mask IMG_0012=mask.png --yes
   gscream-vk remove photos --out garden --mask IMG_0012=mask.png
   gscream-vk remove photos --out garden --box IMG_0012=310,220,540,470 --yes
   gscream-vk remove photos --out garden --click IMG_0012=430,340 --yes
   gscream-vk remove photos --out garden --yes      # with the masks in garden/objects")]
 pub(super) struct Args {
-    /// Folder of photographs, or a splat (PLY, SPZ, SOG, .splat or GLB)
+    /// Folder of photographs, a video, or a splat (PLY, SPZ, SOG, .splat or GLB)
     #[arg(value_name = "PHOTOS")]
     photographs: PathBuf,
+    #[command(flatten)]
+    video: VideoArgs,
     /// Folder for all that is made [default: PHOTOS-removed, here]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
@@ -110,7 +113,7 @@ impl Args {
 /// The last part of the photographs' folder, and `-removed`.
 fn default_folder(photographs: &Path) -> PathBuf {
     let absolute = photographs.canonicalize().unwrap_or_else(|_| photographs.to_owned());
-    let own = if read::is_splat(&absolute) { absolute.file_stem() } else { absolute.file_name() };
+    let own = if absolute.is_file() { absolute.file_stem() } else { absolute.file_name() };
     let mut name = own.map_or_else(|| "photos".into(), std::ffi::OsStr::to_owned);
     name.push("-removed");
     name.into()
@@ -125,15 +128,16 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     if args.cameras.is_some() && !is_splat {
         anyhow::bail!("--cameras: are a splat's; photographs bring theirs (see prepare)");
     }
-    let found = if is_splat { None } else { Some(poses::find(&args.photographs)?) };
+    let found = if args.photographs.is_file() { None } else { Some(poses::find(&args.photographs)?) };
     let _lock = Lock::take(&places.root)?;
     let splat = if is_splat { Some(splat::open(args, &places)?) } else { None };
-    let capture = match found {
-        Some(capture) => capture,
-        None => poses::find(splat.as_ref().map_or(&args.photographs, |splat| &splat.views))?,
+    let photographs = match &splat {
+        Some(splat) => splat.views.clone(),
+        None => args.video.photographs(&args.photographs, &places.root)?,
     };
+    let capture = found.map_or_else(|| poses::find(&photographs), Ok)?;
     let time = Time::new(args.minutes, args.work(capture.photographs.len()));
-    let job = Job { args, places, splat, time };
+    let job = Job { args, places, photographs, splat, time };
     if args.object.evidence().is_empty() && !args.yes {
         return page::run(&job, &capture);
     }

@@ -75,6 +75,8 @@ pub struct Source {
 pub struct Job<'a> {
     /// As the user asked for it.
     pub args: &'a Args,
+    /// The folder of the photographs, or of the splat's pictures.
+    pub photographs: PathBuf,
     /// The splat, where there is one in place of photographs.
     pub splat: Option<Source>,
     /// Where to.
@@ -206,11 +208,6 @@ impl Observer for Watched<'_, export::Bars> {
 }
 
 impl Job<'_> {
-    /// The folder of the photographs, or of the splat's pictures.
-    pub fn photographs(&self) -> &Path {
-        self.splat.as_ref().map_or(&self.args.photographs, |splat| &splat.views)
-    }
-
     /// The request to `prepare`.
     pub fn request(&self, object: Vec<(String, Evidence)>) -> Request {
         let Args { reference, shadow, fit_steps, .. } = self.args;
@@ -222,7 +219,7 @@ impl Job<'_> {
             reference: reference.clone(),
             shadow,
             fit_steps: *fit_steps,
-            ..Request::new(self.photographs(), &self.places.scene)
+            ..Request::new(&self.photographs, &self.places.scene)
         }
     }
 
