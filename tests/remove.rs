@@ -7,6 +7,8 @@ use std::process::{Command, Stdio};
 
 use crate::common::skip::{Lack, skip};
 use assert_cmd::cargo::cargo_bin;
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD;
 use gscream_vk::scene::synthetic;
 use serde_json::Value;
 use tempfile::TempDir;
@@ -152,7 +154,7 @@ fn an_object_is_removed_on_the_page() {
     drop(said);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let found: Value = serde_json::from_slice(&output.stdout).expect("JSON");
-    println!("{found}");
+    println!("{}, {}", found["shares"], found["files"]);
     let truth = |name: &Value| {
         let name = name.as_str().expect("a name");
         let mask = image::open(folder.join(format!("truth/{name}.png"))).expect("a mask").to_luma8();
@@ -167,6 +169,20 @@ fn an_object_is_removed_on_the_page() {
     for (name, bytes) in files {
         let own = name.strip_prefix("photos-").expect("the photographs' folder");
         assert_eq!(fs::metadata(folder.join("out").join(own)).expect(own).len(), bytes);
+    }
+    // What was compared is the trained model, from where the photographs were taken.
+    let rendered = program(folder, "render out/run --views train --out drawn").output().expect("the program starts");
+    assert!(rendered.status.success(), "{}", String::from_utf8_lossy(&rendered.stderr));
+    let compared: Vec<(String, String)> =
+        serde_json::from_value(found["compared"].clone()).expect("names and pictures");
+    assert!(compared.len() == 2 && compared[0].0 != compared[1].0);
+    for (name, jpeg) in &compared {
+        let shown =
+            image::load_from_memory(&BASE64_STANDARD.decode(jpeg).expect("base64")).expect("a picture").to_rgb8();
+        let drawn = image::open(folder.join(format!("drawn/{name}.png"))).expect("a picture").to_rgb8();
+        assert_eq!(shown.dimensions(), drawn.dimensions());
+        let off: f64 = shown.as_raw().iter().zip(drawn.as_raw()).map(|(a, b)| f64::from(a.abs_diff(*b))).sum();
+        assert!(off / (shown.as_raw().len() as f64) < 4.0, "{name}: {off}");
     }
     // What was clicked is there for the form without a browser.
     assert_eq!(names(&folder.join("out/objects")).len(), 2);

@@ -9,7 +9,7 @@
 pub mod objects;
 pub mod site;
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError, RwLock};
@@ -130,6 +130,10 @@ struct State {
     carried: u64,
     /// The user wants it removed; whether in spite of what was found.
     wanted: Option<bool>,
+    /// Views that a visitor wants to see without the object.
+    asked: BTreeSet<usize>,
+    /// Counts the removals that have ended.
+    removals: u64,
     problems: Vec<String>,
     error: Option<String>,
 }
@@ -142,13 +146,26 @@ pub enum Wish {
     Carry(u64, Vec<(usize, u64, Arc<GrayImage>)>),
     /// The object is to be removed; whether in spite of what is found.
     Remove(bool),
+    /// This view is to be drawn without the object.
+    Draw(usize),
 }
 
 /// The results of the work.
 #[derive(Default)]
-struct Results {
+pub struct Results {
     page: Vec<Arc<Resource>>,
     files: Vec<(String, PathBuf)>,
+    before: BTreeMap<usize, PathBuf>,
+    /// Those that were drawn, as JPEG.
+    after: BTreeMap<usize, Vec<u8>>,
+}
+
+impl Results {
+    /// The page that shows the scene, the files to take away by name, and the scene's photographs of the views that can be drawn
+    /// without the object.
+    pub fn new(page: Vec<Resource>, files: Vec<(String, PathBuf)>, before: BTreeMap<usize, PathBuf>) -> Self {
+        Self { page: page.into_iter().map(Arc::new).collect(), files, before, after: BTreeMap::new() }
+    }
 }
 
 /// The state that the page and the worker share.
@@ -408,6 +425,7 @@ impl Session {
         *write(&self.live) = None;
         state.phase = Phase::Working;
         state.wanted = Some(despite);
+        state.asked.clear();
         (state.error, state.problems) = (None, vec![]);
         self.changed.notify_all();
         Ok(())
@@ -478,11 +496,36 @@ impl Session {
         *write(&self.live) = Some(board);
     }
 
-    /// The object is gone: the page that shows it, and the files to take away.
-    pub fn done(&self, page: Vec<Resource>, files: Vec<(String, PathBuf)>) {
-        *write(&self.results) = Results { page: page.into_iter().map(Arc::new).collect(), files };
+    /// The object is gone.
+    pub fn done(&self, results: Results) {
+        *write(&self.results) = results;
         let mut state = self.lock();
         (state.phase, state.part) = (Phase::Done, None);
+        state.removals += 1;
+    }
+
+    /// A view without the object; where it cannot be drawn, it is not asked for again.
+    pub fn drew(&self, number: usize, jpeg: Option<Vec<u8>>) {
+        let mut results = write(&self.results);
+        match jpeg {
+            Some(jpeg) => drop(results.after.insert(number, jpeg)),
+            None => drop(results.before.remove(&number)),
+        }
+    }
+
+    /// A view without the object, which is asked for unless it is there.
+    fn after(&self, number: usize) -> Result<Vec<u8>, Refusal> {
+        let results = read(&self.results);
+        if let Some(jpeg) = results.after.get(&number) {
+            return Ok(jpeg.clone());
+        }
+        let mut state = self.lock();
+        if state.phase != Phase::Done || !results.before.contains_key(&number) {
+            return Err(Refusal::NotFound);
+        }
+        state.asked.insert(number);
+        self.changed.notify_all();
+        Err(Refusal::Busy)
     }
 
     /// The fit is there.
@@ -530,11 +573,16 @@ impl Session {
     /// The next task, waiting for it for a while.
     pub fn wish(&self, patience: Duration) -> Wish {
         let state = self.lock();
-        let idle = |state: &mut State| state.wanted.is_none() && (state.carried == state.revision || !state.ready);
+        let idle = |state: &mut State| {
+            state.wanted.is_none() && state.asked.is_empty() && (state.carried == state.revision || !state.ready)
+        };
         let (mut state, _) =
             self.changed.wait_timeout_while(state, patience, idle).unwrap_or_else(PoisonError::into_inner);
         if let Some(despite) = state.wanted.take() {
             return Wish::Remove(despite);
+        }
+        if let Some(number) = state.asked.pop_last() {
+            return Wish::Draw(number);
         }
         if !state.ready || state.carried == state.revision {
             return Wish::Nothing;

@@ -203,6 +203,13 @@ const pointers = new Map();
 let drag, pinch;
 
 stage.addEventListener('pointerdown', (e) => {
+  if (e.target.closest('#split')) return;
+  if (compares() && e.button === 0) {
+    stage.focus();
+    stage.setPointerCapture(e.pointerId);
+    pointers.set(e.pointerId, [e.clientX, e.clientY]);
+    divide(at(e)[0]);
+  }
   if (state?.phase === 'working' || (state?.phase === 'done' && !changing)) return;
   stage.focus();
   stage.setPointerCapture(e.pointerId);
@@ -225,6 +232,10 @@ stage.addEventListener('pointermove', (e) => {
   ring(e);
   if (!pointers.has(e.pointerId)) return;
   pointers.set(e.pointerId, [e.clientX, e.clientY]);
+  if (compares()) {
+    divide(at(e)[0]);
+    return;
+  }
   if (pinch && pointers.size === 2) {
     const [a, b] = [...pointers.values()];
     const far = Math.hypot(a[0] - b[0], a[1] - b[1]);
@@ -297,6 +308,63 @@ stage.addEventListener('wheel', (e) => {
 }, { passive: false });
 new ResizeObserver(place).observe(stage);
 
+// ---------------------------------------------------------------- before and after
+
+const compares = () => document.body.dataset.look === 'compare';
+
+// The part of the picture's width, 0 to 1, that shows the photograph.
+function divide(share) {
+  $('slider').value = 100 * share;
+  $('picture').style.setProperty('--split', $('slider').value);
+}
+
+// The view without the object, asked for until it is drawn.
+async function fetchAfter(key, source) {
+  const image = $('after');
+  while (image.dataset.key === key) {
+    const answer = await fetch(source).catch(() => undefined);
+    const picture = answer?.ok ? await answer.blob() : undefined;
+    if (image.dataset.key !== key) return;
+    if (picture) {
+      URL.revokeObjectURL(image.src);
+      image.src = URL.createObjectURL(picture);
+      image.dataset.drawn = key;
+      draw();
+      return;
+    }
+    if (answer && answer.status !== 503) {
+      say(`${current} cannot be drawn without the object.`);
+      return;
+    }
+    await new Promise((resolve) => setTimeout(resolve, 300));
+  }
+}
+
+function compare(on) {
+  document.body.dataset.look = on ? 'compare' : '';
+  if (on && !state.compare.includes(current)) current = order.find((name) => state.compare.includes(name));
+  const image = $('after'), key = on ? `${current} ${state.removals}` : '';
+  const source = (path) => url(path, current, `&v=${state.removals}`);
+  const photo = on ? source('before.jpg') : url('photo.jpg', current);
+  if ($('photo').getAttribute('src') !== photo) {
+    $('photo').src = photo;
+    $('photo').alt = `Photograph ${current}`;
+    place();
+  }
+  if (image.dataset.key !== key) {
+    image.dataset.key = key;
+    if (key) fetchAfter(key, source('after.jpg'));
+  }
+  const drawn = on && image.dataset.drawn === key;
+  image.hidden = $('edge').hidden = !drawn;
+  $('split').hidden = !on;
+  return on && !drawn;
+}
+
+$('slider').oninput = () => divide($('slider').value / 100);
+divide(0.5);
+for (const input of document.querySelectorAll('input[name=look]')) input.onchange = () => draw();
+
 // ---------------------------------------------------------------- keys
 
 function crosshair() {
@@ -310,8 +378,9 @@ function crosshair() {
 }
 
 function step(by) {
-  const i = order.indexOf(current);
-  if (order.length) show(order[(i + by + order.length) % order.length], true);
+  const all = compares() ? order.filter((name) => state.compare.includes(name)) : order;
+  const i = all.indexOf(current);
+  if (all.length) show(all[(i + by + all.length) % all.length], true);
 }
 
 addEventListener('keydown', (e) => {
@@ -319,9 +388,10 @@ addEventListener('keydown', (e) => {
   const command = e.ctrlKey || e.metaKey;
   const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[e.key];
   const onButton = e.target.closest?.('button') && !e.target.closest('.thumb');
+  if (command && compares()) return;
   if (command && e.key.toLowerCase() === 'z') (e.shiftKey ? redo : undo)();
   else if (command && e.key.toLowerCase() === 'y') redo();
-  else if (command) return;
+  else if (command || (compares() && !(arrows?.[0] && !e.shiftKey) && !'+=-0'.includes(e.key))) return;
   else if (arrows && e.shiftKey) {
     const [w, h] = view().size;
     const far = (e.altKey ? 0.002 : 0.02) * Math.max(w, h);
@@ -412,8 +482,6 @@ function show(name, focus) {
     cross = corner = undefined;
     corners = [];
     crosshair();
-    $('photo').src = url('photo.jpg', name);
-    $('photo').alt = `Photograph ${name}`;
     $('overlay').hidden = true;
     $('overlay').dataset.key = '';
     place();
@@ -447,13 +515,17 @@ function draw() {
   $('title').textContent = done ? 'It is gone' : `Remove an object from ${state.title}`;
   document.title = `${state.title}: ${done ? 'it is gone' : 'remove an object'}`;
   const busy = waiting.has(current) || v?.busy;
-  $('thinking').hidden = !busy || working || done;
+  const compared = done && state.compare.length > 0 && document.querySelector('input[name=look]:checked').value === 'compare';
+  const drawing = compare(compared);
+  $('looks').hidden = !done || !state.compare.length;
+  $('thinking').hidden = !(drawing || (busy && !working && !done));
+  $('thinking').textContent = drawing ? 'drawing it without the object' : 'finding the outline';
   $('name').textContent = current ?? '';
-  $('name').hidden = done;
+  $('name').hidden = done && !compared;
   if (v) {
     const key = v.overlay ? `${v.name} ${v.overlay}` : '';
-    overlay($('overlay'), url('overlay.png', v.name, `&v=${v.overlay}`), working ? '' : key);
-    const shown = working ? [] : marksOf();
+    overlay($('overlay'), url('overlay.png', v.name, `&v=${v.overlay}`), working || done ? '' : key);
+    const shown = working || done ? [] : marksOf();
     const sketched = $('lines').querySelector('.sketch');
     $('lines').replaceChildren(...shown.filter((m) => m.kind === 'lasso').map((m) => line(m.points, 'lasso')), ...(sketched ? [sketched] : []));
     $('marks').replaceChildren(...shown.filter((m) => m.at || m.bounds).map((m) => {
@@ -478,6 +550,7 @@ function draw() {
   const marked = state.views.some((o) => o.origin !== 'none') || waiting.size > 0;
   const empty = marksOf().length && !busy && !(v?.share > 0);
   const advice = working ? 'You can leave this page open or close it: the work goes on, and this page finds it again.'
+    : compared ? 'The photograph is on the left, the scene without the object on the right: drag across the picture or use the slider. Arrow keys and the pictures below show it from elsewhere.'
     : done ? 'Look around: drag turns, the wheel goes nearer, the slider shows the photograph.'
     : state.problems.length ? 'Something speaks against going on. Mend what is named, or go on anyway.'
     : empty ? `Nothing was found there. Draw a line around the object, or ${click} in the middle of it.`
@@ -512,9 +585,10 @@ function draw() {
   }
   $('around').hidden = !state.live;
   $('drawn').hidden = !(working && state.live && $('drawn').src);
-  if (done && $('viewer').hidden) $('viewer').src = 'result/?noui';
-  if (!done && !$('viewer').hidden) $('viewer').removeAttribute('src');
-  $('viewer').hidden = !done;
+  const shows = $('viewer').hasAttribute('src');
+  if (done && !shows) $('viewer').src = 'result/?noui';
+  if (!done && shows) $('viewer').removeAttribute('src');
+  $('viewer').hidden = !done || compared;
   $('files').hidden = !done;
   if (done && $('files').childElementCount !== state.files.length) {
     $('files').replaceChildren(...state.files.map((file) => {
@@ -530,6 +604,7 @@ function draw() {
   for (const o of state.views) {
     const thumb = thumbs.get(o.name);
     thumb.button.setAttribute('aria-current', o.name === current);
+    thumb.button.hidden = compared && !state.compare.includes(o.name);
     const key = o.overlay ?? '';
     if (key !== thumb.key) {
       thumb.key = key;

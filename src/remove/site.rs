@@ -2,6 +2,7 @@
 
 use std::fs::File;
 use std::io::Cursor;
+use std::path::Path;
 use std::sync::{Arc, PoisonError};
 
 use image::codecs::jpeg::JpegEncoder;
@@ -10,7 +11,7 @@ use serde::Deserialize;
 use serde_json::json;
 
 use super::{Origin, Phase, Photo, Refused, Session, THIN, View, read};
-use crate::prepare::click::Mark;
+use crate::prepare::click::{Mark, working};
 use crate::scene::{self, resample};
 use crate::view::server::{Answer, Body, Refusal, Resource, Site};
 
@@ -63,7 +64,7 @@ fn field(query: &str, name: &str) -> Option<String> {
     String::from_utf8(bytes).ok()
 }
 
-fn jpeg(picture: &image::RgbImage, quality: u8) -> Result<Vec<u8>, Refusal> {
+pub(super) fn jpeg(picture: &image::RgbImage, quality: u8) -> Result<Vec<u8>, Refusal> {
     let mut bytes = vec![];
     picture.write_with_encoder(JpegEncoder::new_with_quality(&mut bytes, quality)).map_err(|_| Refusal::Busy)?;
     Ok(bytes)
@@ -146,17 +147,20 @@ impl Session {
         field(query, "view").and_then(|name| self.number(&name)).ok_or(Refusal::NotFound)
     }
 
+    /// A photograph at another size.
+    fn decoded(&self, path: &Path, size: [u32; 2]) -> Result<image::RgbImage, scene::Error> {
+        // Large photographs are decoded one at a time.
+        let _turn = self.decoding.lock().unwrap_or_else(PoisonError::into_inner);
+        Ok(resample::photograph(&scene::photograph(path, 1)?, size))
+    }
+
     fn thumbnail(&self, number: usize) -> Result<Vec<u8>, Refusal> {
         if let Some(made) = self.thumbs[number].get() {
             return Ok(made.clone());
         }
         let photo = &self.photos[number];
-        let picture = {
-            // Large photographs are decoded one at a time.
-            let _turn = self.decoding.lock().unwrap_or_else(PoisonError::into_inner);
-            scene::photograph(&photo.path, 1).map_err(|_| Refusal::NotFound)?
-        };
-        let made = jpeg(&resample::photograph(&picture, thumb(photo.size)), 80)?;
+        let picture = self.decoded(&photo.path, thumb(photo.size)).map_err(|_| Refusal::NotFound)?;
+        let made = jpeg(&picture, 80)?;
         Ok(self.thumbs[number].get_or_init(|| made).clone())
     }
 
@@ -171,10 +175,11 @@ impl Session {
 
     /// The state as the page reads it. That of the views is made when it changes, not when it is asked for.
     pub(super) fn status(&self) -> String {
-        let files: Vec<_> = {
+        let (files, compare): (Vec<_>, Vec<_>) = {
             let results = read(&self.results);
-            let size = |path: &std::path::Path| std::fs::metadata(path).map_or(0, |file| file.len());
-            results.files.iter().map(|(name, path)| json!({ "name": name, "bytes": size(path) })).collect()
+            let size = |path: &Path| std::fs::metadata(path).map_or(0, |file| file.len());
+            let files = results.files.iter().map(|(name, path)| json!({ "name": name, "bytes": size(path) })).collect();
+            (files, results.before.keys().map(|number| self.photos[*number].name.as_str()).collect())
         };
         let steps = read(&self.live).as_ref().map(|board| board.steps().map(u64::from));
         let (views, status) = {
@@ -195,6 +200,7 @@ impl Session {
                 "next": views.next.as_ref().map(|(_, name)| name), "doubt": views.next.as_ref().map(|(doubt, _)| doubt),
                 "problems": state.problems, "error": state.error,
                 "live": steps.is_some() && state.phase == Phase::Working, "files": files,
+                "compare": compare, "removals": state.removals,
             });
             (views, status)
         };
@@ -240,6 +246,13 @@ impl Site for Session {
                 let picture = self.picture(number).map_err(|_| Refusal::NotFound)?;
                 Ok(owned("image/jpeg", jpeg(&picture, 90)?))
             }
+            "/before.jpg" => {
+                let number = self.named(query)?;
+                let path = read(&self.results).before.get(&number).cloned().ok_or(Refusal::NotFound)?;
+                let picture = self.decoded(&path, working(self.photos[number].size));
+                Ok(owned("image/jpeg", jpeg(&picture.map_err(|_| Refusal::NotFound)?, 90)?))
+            }
+            "/after.jpg" => Ok(owned("image/jpeg", self.after(self.named(query)?)?)),
             "/thumb.jpg" => Ok(owned("image/jpeg", self.thumbnail(self.named(query)?)?)),
             "/overlay.png" => {
                 let small = field(query, "small").is_some();

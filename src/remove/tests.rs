@@ -378,7 +378,47 @@ fn work_is_asked_for_once_and_can_be_stopped() {
     assert_eq!(state(address)["error"], "there is no device");
     let file = place.folder.path().join("scene.ply");
     std::fs::write(&file, b"ply").unwrap();
-    session.done(vec![], vec![("scene.ply".into(), file)]);
+    session.done(Results::new(vec![], vec![("scene.ply".into(), file)], BTreeMap::new()));
     assert_eq!(get(address, "/download/scene.ply"), (200, b"ply".to_vec()));
     assert_eq!(get(address, "/download/%2e%2e/a.png").0, 404);
+}
+
+/// What is there of before and after is told; a view is drawn once it is asked for, and once.
+#[test]
+fn views_without_the_object_are_drawn_when_they_are_looked_at() {
+    let place = Place::new();
+    let session = place.open();
+    let address = serve(&session);
+    let before = || {
+        let all = place.photographs.iter().take(2).map(|(name, path)| (session.number(name).unwrap(), path.clone()));
+        Results::new(vec![], vec![], all.collect())
+    };
+    assert_eq!((get(address, "/before.jpg?view=a").0, get(address, "/after.jpg?view=a").0), (404, 404));
+    session.done(before());
+    assert_eq!(state(address)["compare"], json!(["a", "b"]));
+    let (status, jpeg) = get(address, "/before.jpg?view=b");
+    let shown = image::load_from_memory(&jpeg).unwrap().into_rgb8();
+    assert!(status == 200 && shown.dimensions() == photograph().dimensions());
+    assert_eq!(get(address, "/after.jpg?view=c%20%26%20%3Cd%3E").0, 404, "it has no camera");
+    assert!(matches!(session.wish(Duration::ZERO), Wish::Nothing));
+    for view in ["a", "b", "a"] {
+        assert_eq!(get(address, &format!("/after.jpg?view={view}")).0, 503);
+    }
+    assert!(matches!(session.wish(Duration::ZERO), Wish::Draw(1)));
+    session.drew(1, Some(b"jpeg".to_vec()));
+    assert_eq!(get(address, "/after.jpg?view=b"), (200, b"jpeg".to_vec()));
+    assert!(matches!(session.wish(Duration::ZERO), Wish::Draw(0)));
+    // It failed, and is not asked for again.
+    session.drew(0, None);
+    assert_eq!(get(address, "/after.jpg?view=a").0, 404);
+    assert!(matches!(session.wish(Duration::ZERO), Wish::Nothing));
+    assert_eq!(state(address)["compare"], json!(["b"]));
+    // Those of another removal are others.
+    session.done(before());
+    assert_eq!((get(address, "/after.jpg?view=b").0, &state(address)["removals"]), (503, &json!(2)));
+    assert_eq!(post(address, "/api/marks", CLICK).0, 200);
+    assert_eq!(post(address, "/api/remove", "{}").0, 200);
+    assert!(matches!(session.wish(Duration::ZERO), Wish::Remove(false)));
+    assert_eq!(get(address, "/after.jpg?view=b").0, 404);
+    assert!(matches!(session.wish(Duration::ZERO), Wish::Nothing));
 }

@@ -1,6 +1,7 @@
 // Removes an object on the page of `gscream-vk remove` in headless Chromium, as a user would:
 // remove.mjs CHROMIUM URL PICTURES X,Y X,Y,... where the positions, 0 to 1, are clicked in the photograph that is shown; what
-// it sees goes into the folder PICTURES. Prints JSON: the masks' shares of two photographs, and the files' sizes.
+// it sees goes into the folder PICTURES. Prints JSON: the masks' shares of two photographs, the files' sizes, and pictures of
+// two views without the object.
 import puppeteer from 'puppeteer-core';
 
 const [executablePath, url, pictures, ...clicks] = process.argv.slice(2);
@@ -86,6 +87,40 @@ try {
   await frame.waitForFunction(() => document.documentElement.dataset.state, { timeout: 60_000 });
   await new Promise((resolve) => setTimeout(resolve, 1500));
   await shoot('done');
+  // Before and after, at two cameras, by the keys and by the mouse.
+  const named = () => page.evaluate(() => document.getElementById('name').textContent);
+  const split = () => page.evaluate(() => Number(getComputedStyle(document.getElementById('picture')).getPropertyValue('--split')));
+  const must = (what, is) => { if (!is) problems.push(`before and after: ${what}`); };
+  const compared = [];
+  await page.focus('input[name=look]:checked');
+  await page.keyboard.press('ArrowRight');
+  for (const turn of [0, 1]) {
+    const drawn = () => !document.getElementById('after').hidden && document.getElementById('after').naturalWidth > 0;
+    await page.waitForFunction(drawn, { timeout: 60_000, polling: 200 });
+    if (!turn) await shoot('compare');
+    const name = await named();
+    compared.push([name, await page.evaluate(async (of) => {
+      const bytes = await (await fetch(`after.jpg?view=${encodeURIComponent(of)}`)).arrayBuffer();
+      return btoa(String.fromCharCode(...new Uint8Array(bytes)));
+    }, name)]);
+    await page.focus('#slider');
+    const seen = [];
+    for (const [key, share] of [['Home', 0], ['End', 100], ['ArrowLeft', 99]]) {
+      await page.keyboard.press(key);
+      must(`${key} leads to ${await split()}`, await split() === share);
+      seen.push(Buffer.from(await (await page.$('#picture')).screenshot()));
+    }
+    must('the slider changes nothing', !seen[0].equals(seen[1]));
+    const box = await (await page.$('#picture')).boundingBox();
+    await page.mouse.click(box.x + 0.25 * box.width, box.y + 0.4 * box.height);
+    must(`the mouse leads to ${await split()}`, Math.abs(await split() - 25) <= 1);
+    await page.focus('#stage');
+    await page.keyboard.press('ArrowRight');
+    await page.waitForFunction((old) => document.getElementById('name').textContent !== old, { timeout: 10_000 }, name);
+  }
+  await page.focus('input[name=look]:checked');
+  await page.keyboard.press('ArrowLeft');
+  await until(() => !document.getElementById('viewer').hidden && document.getElementById('split').hidden);
   const files = await page.evaluate(async () => Promise.all([...document.querySelectorAll('#files a')].map(async (link) => {
     const bytes = await (await fetch(link.href)).arrayBuffer();
     return [link.download, bytes.byteLength];
@@ -93,7 +128,7 @@ try {
   problems.push(...await page.evaluate(() => globalThis.violations));
   if (problems.length) throw new Error(problems.join('; '));
   const share = (name) => before.views.find((view) => view.name === name).share;
-  console.log(JSON.stringify({ marked, other, shares: [share(marked), share(other)], files }));
+  console.log(JSON.stringify({ marked, other, shares: [share(marked), share(other)], files, compared }));
 } finally {
   await browser.close();
 }

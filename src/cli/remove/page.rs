@@ -3,30 +3,39 @@
 
 use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, SocketAddr};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use image::GrayImage;
+use image::codecs::jpeg::JpegEncoder;
 
-use super::work::{self, Audience, Job};
+use super::work::{self, Audience, Job, Places};
 use super::{open_browser, signals};
+use crate::cli::export::{Cameras, FIGURES};
+use crate::cli::folders::Origin;
 use crate::cli::train::{self, Stop};
-use crate::cli::view;
+use crate::cli::{shared, view};
 use crate::gpu::Gpu;
+use crate::model::stored::Stored;
 use crate::prepare::depth::DepthMap;
 use crate::prepare::fit::Fit;
 use crate::prepare::masks::{self, Shares, Votes};
 use crate::prepare::poses::Capture;
 use crate::prepare::splats::Splats;
-use crate::remove::{Session, Wish, objects};
+use crate::remove::{Results, Session, Wish, objects};
+use crate::render::view::Renderer;
 use crate::scene::doctor::{Finding, Report, Severity};
-use crate::scene::{self, Scene};
+use crate::scene::{self, Camera, Scene};
 use crate::view::live::Board;
 use crate::view::server::{self, Secret};
 
 /// How long the worker waits before it looks whether a signal has come.
 const PATIENCE: Duration = Duration::from_millis(200);
+
+/// JPEG's, of views without the object.
+const QUALITY: u8 = 92;
 
 /// The session as the work's audience.
 struct Visitors<'a>(&'a Session);
@@ -115,12 +124,21 @@ fn attend(job: &Job<'_>, gpu: &Gpu, session: &Arc<Session>, capture: &Capture) -
             }
         }
     };
+    let mut after = None;
     loop {
         check(job)?;
         match session.wish(PATIENCE) {
             Wish::Nothing => {}
+            Wish::Draw(number) => {
+                let drawn = draw(job, gpu, session, number, &mut after);
+                if let Err(error) = &drawn {
+                    eprintln!("{}: {error:#}", session.photos()[number].name);
+                }
+                session.drew(number, drawn.ok());
+            }
             Wish::Carry(revision, given) => carrier.carry(session, revision, &given)?,
             Wish::Remove(despite) => {
+                after = None;
                 let result = remove(job, gpu, session, capture, despite);
                 check(job)?;
                 if let Err(error) = result {
@@ -148,9 +166,51 @@ fn remove(job: &Job<'_>, gpu: &Gpu, session: &Session, capture: &Capture, despit
     job.work(gpu, work::evidence(masks).collect(), despite, &Visitors(session), began)?;
     session.begin("page", 0);
     let page = view::page_of(&job.places.root).context("the object is gone, but it cannot be shown")?;
-    session.done(page.resources(), job.places.files());
+    session.done(Results::new(page.resources(), job.places.files(), before(job, session)?));
     job.say();
     Ok(())
+}
+
+/// The scene's photographs of the views that the trained model can be drawn at; none where nothing was trained.
+fn before(job: &Job<'_>, session: &Session) -> anyhow::Result<BTreeMap<usize, PathBuf>> {
+    let Places { root, scene, run, .. } = &job.places;
+    if Origin::find(run).is_err() {
+        return Ok(BTreeMap::new());
+    }
+    let figures = std::fs::read(root.join(FIGURES)).context(FIGURES)?;
+    let cameras: Cameras = serde_json::from_slice(&figures).context(FIGURES)?;
+    let files = scene::train_files(scene)?;
+    let view = |name: &str| Some((session.number(name)?, files.get(name)?.clone()));
+    Ok(cameras.cameras.iter().filter_map(|pose| view(&pose.name)).collect())
+}
+
+/// The trained model on the device, and the cameras of its views.
+type After = (Renderer, BTreeMap<String, Camera>);
+
+/// A view without the object, as JPEG.
+fn draw(
+    job: &Job<'_>,
+    gpu: &Gpu,
+    session: &Session,
+    number: usize,
+    after: &mut Option<After>,
+) -> anyhow::Result<Vec<u8>> {
+    let (renderer, cameras) = match after {
+        Some(after) => after,
+        None => {
+            let origin = Origin::find(&job.places.run)?;
+            let mut settings = origin.settings(vec![])?;
+            let scene = shared::load_scene_of_model(&job.places.scene, &mut settings)?;
+            let background = settings.train.background.map(|channel| channel as f32);
+            let renderer = Renderer::of(gpu, &Stored::load(&origin.model())?, &settings.render, background)?;
+            let cameras = scene.train.into_iter().map(|view| (view.name, view.camera)).collect();
+            after.insert((renderer, cameras))
+        }
+    };
+    let camera = cameras.get(&session.photos()[number].name).context("the scene has no such view any more")?;
+    let mut jpeg = vec![];
+    renderer.render(camera)?.to_rgb8().write_with_encoder(JpegEncoder::new_with_quality(&mut jpeg, QUALITY))?;
+    Ok(jpeg)
 }
 
 /// Carries masks to all views, by the fit.
