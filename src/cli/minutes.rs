@@ -166,7 +166,7 @@ pub(super) fn fitted(
     let steps = ((60.0 * minutes - gone - after).max(0.0) / mean) as u32;
     ensure!(
         steps >= FEWEST,
-        "--minutes {minutes}: {} are the least here, of which {:.1} have gone before training: give more time, or \
+        "--minutes {minutes}: {:.1} min are the least here, of which {:.1} have gone before training: give more time, or \
          --downscale the pictures",
         least(gone + after + f64::from(FEWEST) * mean),
         gone / 60.0,

@@ -1,7 +1,7 @@
 //! The time of a whole removal: `--minutes N` counts from Remove, or from the command, to the files.
 //!
-//! What a part takes is told from the number of views at the pace of two CPU cores ([`COSTS`], after two captures of 24 and 60
-//! views), and as soon as the masks are there at the pace that was measured. Training has what the others leave ([`crate::cli::minutes`]).
+//! What a part takes is told from the number of views ([`COSTS`], after two captures of 24 and 60 views), and as soon as the masks
+//! are there from that and the pace that was measured. Training has what the others leave ([`crate::cli::minutes`]).
 
 use std::cell::Cell;
 use std::path::Path;
@@ -13,7 +13,7 @@ use crate::cli::minutes::{Reserve, least};
 use crate::model::config::Form;
 use crate::prepare::record;
 
-/// A part's time on two CPU cores, in seconds: of itself, and for each view.
+/// The processors' time for a part, in seconds: of itself, and for each view.
 struct Cost {
     part: &'static str,
     once: f64,
@@ -34,13 +34,15 @@ const COSTS: [Cost; 9] = [
     cost("reference", 5.0, 1.8),
     cost("points", 4.0, 0.6),
     cost("train", 8.0, 0.1),
-    cost("export", 40.0, 0.2),
+    cost("export", 45.0, 0.8),
 ];
+/// Cores that are busy on the mean, of those there are.
+const BUSY: f64 = 0.8;
 /// A removal is refused once this share of what is left, as it is told before, does not fit any more: it may go faster.
 const SURE: f64 = 0.5;
-/// Steps of training that the files take for each step of their refinement, for each view, and seconds besides.
-const REFINED: f64 = 0.3;
-const BAKED: f64 = 1.0;
+/// Steps of training that the files take for each step of their refinement, for baking and measuring them, and seconds besides.
+const REFINED: f64 = 0.6;
+const BAKED: f64 = 200.0;
 const WRITTEN: f64 = 3.0;
 
 /// What the parts are made of.
@@ -66,7 +68,7 @@ pub struct Time {
     part: Cell<Option<(usize, Instant)>>,
     /// The first part that has not begun.
     next: Cell<usize>,
-    /// Seconds that parts took, and that they take by [`COSTS`].
+    /// Seconds that parts took, and the processors' time by [`COSTS`].
     measured: Cell<[f64; 2]>,
     /// Parts that are there already.
     there: Cell<[bool; COSTS.len()]>,
@@ -118,8 +120,8 @@ impl Time {
         let [prepare, points, files] = [sum(0..6), sum(6..7), sum(8..9)];
         let left = (minutes - prepare - points - files).max(0.0);
         format!(
-            "plan: of {minutes} min prepare has about {prepare:.1}, stereo {points:.1} and the files {files:.1}, as on two CPU \
-             cores until it is measured, and training what is left, {left:.1}"
+            "plan: of {minutes} min prepare has about {prepare:.1}, stereo {points:.1} and the files {files:.1}, a guess until it \
+             is measured, and training what is left, {left:.1}"
         )
     }
 
@@ -128,7 +130,7 @@ impl Time {
         if self.there.get()[part] { 0.0 } else { self.pace() * self.told(part) }
     }
 
-    /// Seconds of a part by [`COSTS`].
+    /// The processors' time for a part by [`COSTS`].
     fn told(&self, part: usize) -> f64 {
         let Work { views, fit, files, splat } = self.work;
         let Cost { part: name, once, view } = COSTS[part];
@@ -136,17 +138,17 @@ impl Time {
             "fit" | "points" if splat => 0.0,
             "fit" => fit,
             "export" if splat => 0.1,
-            "export" => files,
+            "export" => 0.3 + 0.7 * files,
             _ => 1.0,
         };
         share * (once + view * views as f64)
     }
 
-    /// Measured time over that of [`COSTS`]; as many cores as there are, as long as nothing was measured.
+    /// Measured time over that of [`COSTS`]; by the number of cores, as long as nothing was measured.
     fn pace(&self) -> f64 {
         let [took, told] = self.measured.get();
         let cores = std::thread::available_parallelism().map_or(2, std::num::NonZero::get);
-        if told > 0.0 { took / told } else { 2.0 / cores as f64 }
+        if told > 0.0 { took / told } else { 1.0 / (BUSY * cores as f64) }
     }
 
     /// A part begins.
@@ -182,20 +184,20 @@ impl Time {
     fn refusal(&self, now: f64, next: usize) -> Option<String> {
         let minutes = self.minutes?;
         let rest: f64 = (next..COSTS.len()).map(|part| self.forecast(part)).sum();
+        let gone = format!(", of which {:.1} have gone", now / 60.0);
+        let [gone, stays] = if now < 6.0 { ["", ""] } else { [gone.as_str(), "; what is made stays"] };
+        let least = least(now + rest);
         (now + SURE * rest > 60.0 * minutes).then(|| {
             format!(
-                "--minutes {minutes}: about {} min are the least from Remove to the files, of which {:.1} have gone: give more \
-                 time, or fewer photographs; what is made stays, and the same command goes on with it",
-                least(now + rest),
-                now / 60.0
+                "--minutes {minutes}: about {least:.1} min are the least from Remove to the files{gone}: give more time, or fewer \
+                 photographs{stays}"
             )
         })
     }
 
     /// What the files of a model of this form take.
     pub fn files(&self, form: Form) -> Reserve {
-        let Work { views, files, .. } = self.work;
-        let baked = 1000.0 * files * REFINED + BAKED * views as f64;
+        let baked = 1000.0 * self.work.files * REFINED + BAKED;
         Reserve { steps: if form == Form::Anchors { baked } else { 0.0 }, seconds: WRITTEN }
     }
 }
