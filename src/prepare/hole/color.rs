@@ -99,11 +99,7 @@ fn candidates(sights: &Sights, of: usize) -> Vec<Vec<(usize, f64)>> {
         let (to, distance) = ((point - eye).normalize(), point.distance(eye));
         let mut found: Vec<(usize, f64, [u8; 3])> = vec![];
         for (view, sight) in sights.0.iter().enumerate().filter(|(view, sight)| *view != of && sight.grid.trusted) {
-            let Some((there, z)) = sight.see(point) else { continue };
-            let agrees = (sight.depth[there] / z - 1.0).abs() <= 1.5 * SAME;
-            if sight.hole[there] || !agrees {
-                continue;
-            }
+            let Some(there) = sight.shows(point, 1.5 * SAME) else { continue };
             let from = DVec3::from(sight.grid.camera.center());
             let angle = to.dot((point - from).normalize()).clamp(-1.0, 1.0).acos();
             let finer = (mean_focal(sight) * distance / (mean_focal(own) * point.distance(from))).ln();
@@ -176,30 +172,40 @@ fn shown(own: &Photograph<'_>, sight: &Sight, i: usize) -> Option<([f64; 2], DVe
     z.is_finite().then(|| (place, DVec3::from(own.camera.along(ray, z))))
 }
 
+/// A view that was filled.
+pub struct Filled {
+    /// `[pixel]` RGB, 0 to 1.
+    pub rgb: Vec<[f32; 3]>,
+    /// `[pixel]` whether its colour was made for this view and serves others: nothing has told it, neither a photograph nor
+    /// another view.
+    pub made: Vec<bool>,
+}
+
 /// What views that were filled before tell of the colours of a view's hole that no photograph shows: their gradients, so
-/// that it goes on in the view's own light.
+/// that it goes on in the view's own light. Each colour is from where it was made, as copies of copies would be ever softer,
+/// and of two views from the one that was filled first: a patchwork of many would be no picture.
 pub fn repaint(
     sights: &Sights,
     photographs: &[Photograph<'_>],
-    filled: &[Option<Vec<[f32; 3]>>],
+    filled: &[(usize, Filled)],
     of: usize,
     filling: &mut Filling,
 ) {
     let (own, sight) = (&photographs[of], &sights.0[of]);
     let size @ [w, h] = own.camera.size.map(|n| n as usize);
-    let painted: Vec<usize> = (0..filled.len()).filter(|view| *view != of && filled[*view].is_some()).collect();
-    // Beside its hole another view is a photograph, which has been asked.
+    // Beside what was made another view shows what photographs show, which have been asked.
     let repainted = |i: usize, beside: bool| -> Option<[f32; 3]> {
         let (_, point) = shown(own, sight, i)?;
-        painted.iter().find_map(|view| {
+        filled.iter().find_map(|(view, Filled { rgb, made })| {
             let (other, there) = (&photographs[*view], &sights.0[*view]);
             let [a, b, c] = there.grid.camera.to_camera(point.to_array());
             let place = (c > 0.0).then(|| there.grid.place([a / c, b / c]))?;
             let agrees = (there.depth_at(place) / c - 1.0).abs() <= SAME;
             let pixel = other.camera.project(point.to_array()).filter(|_| agrees)?;
-            let hole = other.hole.get_pixel_checked(pixel[0].max(0.0) as u32, pixel[1].max(0.0) as u32)?;
-            let rgb = filled[*view].as_ref().filter(|_| beside || hole.0[0] != 0)?;
             let width = other.camera.size[0] as usize;
+            let [x, y] = pixel.map(|v| v.max(0.0) as usize);
+            let inside = x < width && y < other.camera.size[1] as usize;
+            (inside && (beside || made[y * width + x])).then_some(())?;
             sample(|x, y| rgb[y * width + x], other.camera.size, pixel)
         })
     };
@@ -321,6 +327,43 @@ const BRIGHTER: f32 = 0.12;
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A view that made nothing tells nothing, though it comes first; from the one that made the hole the pattern of the wall
+    /// goes on.
+    #[test]
+    fn colours_are_from_where_they_were_made() {
+        use super::super::surface::tests::{SIZE, views};
+        let (grids, cameras, masks) = views(0.4);
+        let mut sights = Sights::new(grids, &cameras, &masks, &masks);
+        (0..5).for_each(|of| sights.solve(of, 1));
+        let pattern = |camera: &Camera, i: usize| {
+            let [x, ..] = camera.lift(camera.pixel_center(i), 4.0).expect("a ray");
+            [(0.5 + 0.2 * (3.0 * x).sin()) as f32; 3]
+        };
+        let pixels = (SIZE[0] * SIZE[1]) as usize;
+        let picture = |camera: &Camera| {
+            let bytes = (0..pixels).flat_map(|i| pattern(camera, i).map(|v| (v * 255.0).round() as u8)).collect();
+            RgbImage::from_raw(SIZE[0], SIZE[1], bytes).expect("three bytes per pixel")
+        };
+        let pictures: Vec<RgbImage> = cameras.iter().map(picture).collect();
+        let photographs: Vec<Photograph<'_>> = (cameras.iter().zip(&pictures).zip(masks))
+            .map(|((camera, picture), hole)| Photograph { camera: *camera, picture, hole })
+            .collect();
+        let hole = |view: usize| photographs[view].hole.as_raw().iter().map(|v| *v != 0).collect::<Vec<bool>>();
+        let colors = |view: usize| (0..pixels).map(|i| pattern(&cameras[view], i)).collect::<Vec<_>>();
+        let blank = Filled { rgb: vec![[0.9, 0.1, 0.1]; pixels], made: vec![false; pixels] };
+        let filled = [(0, blank), (2, Filled { rgb: colors(2), made: hole(2) })];
+        let mut filling = Filling { rgb: colors(1), guessed: hole(1), seen: vec![false; pixels] };
+        let inside: Vec<usize> = (0..pixels).filter(|i| filling.guessed[*i]).collect();
+        inside.iter().for_each(|i| filling.rgb[*i] = [0.0; 3]);
+        repaint(&sights, &photographs, &filled, 1, &mut filling);
+        let told: Vec<usize> = inside.into_iter().filter(|i| !filling.guessed[*i]).collect();
+        assert!(told.len() > 40, "{}", told.len());
+        for i in told {
+            let (found, truth) = (filling.rgb[i], pattern(&cameras[1], i));
+            assert!((0..3).all(|c| (found[c] - truth[c]).abs() < 0.03), "{i}: {found:?}, {truth:?}");
+        }
+    }
 
     /// Next to a pixel without a colour the others' count alone, and nothing of it is mixed in.
     #[test]

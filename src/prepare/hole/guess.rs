@@ -4,12 +4,14 @@
 //! lines meet; what all views show of the plane is in the chart. What lies on no plane is filled in the picture itself.
 
 use glam::{DVec2, DVec3};
+use image::{GrayImage, Luma};
 use rayon::prelude::*;
 
 use super::color::{Filling, Photograph, between};
 use super::surface::{SAME, Sights};
 use super::texture::{self, Texture};
 use crate::prepare::planes::{Plane, membrane};
+use crate::scene::resample;
 
 /// Longer side of a chart at most, pixels.
 const CHART: f64 = 960.0;
@@ -19,6 +21,8 @@ const MARGIN: f64 = 48.0;
 const FARTHEST: f64 = 4.0;
 /// Other views that a chart is filled from.
 const OTHERS: usize = 6;
+/// Difference of a channel from the median of the views from which on one of them shows a light's reflection.
+const GLARE: f32 = 0.06;
 
 /// A plane seen straight on. Lengths are in the view's camera coordinates.
 pub struct Chart {
@@ -91,11 +95,8 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
     if guessed.is_empty() {
         return;
     }
-    // A few pixels between known ones need no texture.
-    let hole = own.hole.as_raw().iter().filter(|v| **v != 0).count();
-    if guessed.len() as f64 <= SLIVER * hole as f64 {
-        return smooth(filling, [w, h]);
-    }
+    // What is thin between known pixels needs no texture, and would draw the chart out to wherever it is.
+    let thick = thick(&filling.guessed, own.camera.size);
     let ray = |i: usize| own.camera.unproject([(i % w) as f64 + 0.5, (i / w) as f64 + 0.5]);
     let surface = |i: usize| ray(i).map(|ray| sight.surface_at(sight.grid.place(ray)));
     let focal = f64::from(own.camera.focal[0].max(own.camera.focal[1]));
@@ -104,7 +105,7 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
             .filter(|i| filling.guessed[**i] && surface(**i) == Some(number as u8))
             .filter_map(|i| Some((*i, ray(*i)?)))
             .collect();
-        let rays: Vec<[f64; 2]> = on_it.iter().map(|(_, ray)| *ray).collect();
+        let rays: Vec<[f64; 2]> = on_it.iter().filter(|(i, _)| thick[*i]).map(|(_, ray)| *ray).collect();
         let Some(chart) = Chart::new(*plane, &rays, focal, 1.0) else { continue };
         let mut texture = charted(sights, photographs, of, filling, &chart, number as u8);
         let wanted = texture.hole.clone();
@@ -119,15 +120,26 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
             }
         }
     }
-    in_picture(filling, [w, h], |i| surface(i).unwrap_or(0));
+    in_picture(filling, [w, h], &thick, |i| surface(i).unwrap_or(0));
     // A picture that is nearly all hole has nothing to copy.
     if filling.guessed.contains(&true) {
         smooth(filling, [w, h]);
     }
 }
 
-/// Part of a hole that is so little that it is filled smoothly.
-pub const SLIVER: f64 = 0.01;
+/// Narrowest part of a hole that has a texture, as a part of the picture's longer side.
+const THIN: f64 = 0.008;
+
+/// `[pixel]` what of this is at least [`THIN`] wide. The rest is filled smoothly.
+pub fn thick(wanted: &[bool], [w, h]: [u32; 2]) -> Vec<bool> {
+    let reach = (0.5 * THIN * f64::from(w.max(h))).ceil() as u32;
+    let picture = |of: &dyn Fn(usize) -> bool| {
+        GrayImage::from_fn(w, h, |x, y| Luma([if of((y * w + x) as usize) { 255 } else { 0 }]))
+    };
+    let beside = resample::dilate(&picture(&|i| !wanted[i]), reach);
+    let inside = resample::dilate(&picture(&|i| beside.as_raw()[i] == 0), reach);
+    inside.as_raw().iter().map(|v| *v != 0).collect()
+}
 
 /// Goes on smoothly with the colours around what nothing tells.
 fn smooth(filling: &mut Filling, size: [usize; 2]) {
@@ -199,13 +211,9 @@ fn charted(
                 }
             }
         }
-        let seen = others.iter().find_map(|k| {
-            let (site, z) = sights.0[*k].see(world)?;
-            let there = &sights.0[*k];
-            let agrees = !there.hole[site] && (there.depth[site] / z - 1.0).abs() <= SAME;
-            agrees.then(|| photographs[*k].color(world)).flatten()
-        });
-        seen.map_or(Texel::Nothing, Texel::Known)
+        let seen = others.iter();
+        let seen = seen.filter_map(|k| sights.0[*k].shows(world, SAME).and_then(|_| photographs[*k].color(world)));
+        common(&seen.collect::<Vec<_>>()).map_or(Texel::Nothing, Texel::Known)
     };
     let texels: Vec<Texel> = (0..chart.size[0] * chart.size[1]).into_par_iter().map(one).collect();
     Texture {
@@ -216,10 +224,21 @@ fn charted(
     }
 }
 
-/// Fills what is left in the picture itself, from the same surface, else from any.
-fn in_picture(filling: &mut Filling, size: [usize; 2], surface: impl Fn(usize) -> u8 + Sync) {
+/// The first of the colours that several photographs show of one place that most of them come near: a highlight is elsewhere in
+/// each.
+fn common(colors: &[[f32; 3]]) -> Option<[f32; 3]> {
+    let middle: [f32; 3] = std::array::from_fn(|c| {
+        let mut values: Vec<f32> = colors.iter().map(|color| color[c]).collect();
+        values.sort_unstable_by(f32::total_cmp);
+        values.get(values.len() / 2).copied().unwrap_or(f32::NAN)
+    });
+    colors.iter().copied().find(|color| (0..3).all(|c| (color[c] - middle[c]).abs() <= GLARE))
+}
+
+/// Fills what is left and `wanted` in the picture itself, from the same surface, else from any.
+fn in_picture(filling: &mut Filling, size: [usize; 2], wanted: &[bool], surface: impl Fn(usize) -> u8 + Sync) {
     for same in [true, false] {
-        let left: Vec<usize> = (0..filling.guessed.len()).filter(|i| filling.guessed[*i]).collect();
+        let left: Vec<usize> = (0..wanted.len()).filter(|i| wanted[*i] && filling.guessed[*i]).collect();
         let mut labels: Vec<u8> = left.iter().map(|i| if same { surface(*i) } else { 0 }).collect();
         labels.sort_unstable();
         labels.dedup();
@@ -254,4 +273,32 @@ fn surroundings(of: &[usize], [w, h]: [usize; 2]) -> (Vec<usize>, [usize; 2]) {
     };
     let ((x0, x1), (y0, y1)) = (bounds(&|i| i % w, w), bounds(&|i| i / w, h));
     ((y0..y1).flat_map(|y| (x0..x1).map(move |x| y * w + x)).collect(), [x1 - x0, y1 - y0])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A line is smoothed over, a square has a texture, at every size of the picture.
+    #[test]
+    fn what_is_thin_is_no_texture() {
+        for size @ [w, h] in [[200, 100], [1000, 700]] {
+            let line = |x: u32, y: u32| y == 20 && x < w / 2;
+            let square = |x: u32, y: u32| (w / 2..w / 2 + w / 20).contains(&x) && (50..50 + w / 20).contains(&y);
+            let places = || (0..h).flat_map(|y| (0..w).map(move |x| (x, y)));
+            let wanted: Vec<bool> = places().map(|(x, y)| line(x, y) || square(x, y)).collect();
+            let found = thick(&wanted, size);
+            assert!(places().zip(&found).all(|((x, y), thick)| !*thick || square(x, y)), "{size:?}");
+            let middle = (50 + w / 40) * w + w / 2 + w / 40;
+            assert!(found[middle as usize], "{size:?}");
+        }
+    }
+
+    /// A light mirrored in one of three photographs is not what the surface looks like; a little brighter it may be.
+    #[test]
+    fn reflections_are_left_out() {
+        assert_eq!(common(&[[0.9; 3], [0.52; 3], [0.5; 3]]), Some([0.52; 3]));
+        assert_eq!(common(&[[0.54; 3], [0.5; 3], [0.5; 3]]), Some([0.54; 3]));
+        assert_eq!(common(&[]), None);
+    }
 }

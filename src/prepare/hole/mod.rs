@@ -28,7 +28,7 @@ use super::{Error, Watch};
 use crate::gpu::Gpu;
 use crate::multiview;
 use crate::scene::{self, Camera, HOLE, MADE_WITH, PriorKind, Scene, resample};
-use color::{Filling, Photograph};
+use color::{Filled, Filling, Photograph};
 use surface::{Sight, Sights};
 
 /// The longer side of the photographs that the hole is filled from, pixels; larger ones are reduced, and the filling is
@@ -140,7 +140,7 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
         let grids = sights.0.into_iter().map(|sight| sight.grid).collect();
         sights = Sights::new(grids, &cameras, &masks, &wide);
     }
-    let mut filled: Vec<Option<Vec<[f32; 3]>>> = vec![None; photographs.len()];
+    let mut filled: Vec<(usize, Filled)> = vec![];
     let unsolved = |sights: &Sights, i: usize| {
         let known = sights.carried(i).iter().filter(|(z, _)| z.is_finite()).count();
         sights.0[i].hole.iter().filter(|hole| **hole).count() - known
@@ -164,9 +164,9 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
         for (&i, mut filling) in some.iter().zip(gathered) {
             color::repaint(&sights, &photographs, &filled, i, &mut filling);
             // What was made for this view the others get from it; what photographs show they look up themselves.
-            let made = filling.guessed.iter().filter(|guessed| **guessed).count();
-            let hole = photographs[i].hole.as_raw().iter().filter(|v| **v != 0).count();
-            let made = task.given.contains_key(&i) || made as f64 > guess::SLIVER * hole as f64;
+            let hole: Vec<bool> = photographs[i].hole.as_raw().iter().map(|v| *v != 0).collect();
+            let made = if task.given.contains_key(&i) { hole } else { filling.guessed.clone() };
+            let made = guess::thick(&made, cameras[i].size);
             if task.given.contains_key(&i) {
                 painted(task, i, &photographs[i].hole, &mut filling)?;
             } else if let Some(network) = task.inpainting {
@@ -186,7 +186,9 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
                     "the surface behind the object, filled once for all views",
                 );
             }
-            filled[i] = made.then_some(filling.rgb);
+            if made.contains(&true) {
+                filled.push((i, Filled { rgb: filling.rgb, made }));
+            }
             done += 1;
             watch.turn(n + 1 + done)?;
         }

@@ -73,7 +73,7 @@ pub fn add(sights: &Sights, photographs: &[Photograph<'_>], of: usize, masks: &m
     true
 }
 
-/// The chart of the plane that the object stands on, and `[texel]` whether it is shaded.
+/// The chart of the plane that the object stands on, and `[texel]` whether it is shaded, or covered by the object.
 fn find(sights: &Sights, photographs: &[Photograph<'_>], of: usize) -> Option<(Chart, Vec<bool>)> {
     let (camera, sight) = (&photographs[of].camera, &sights.0[of]);
     // The foot is where no other photograph looks.
@@ -104,7 +104,10 @@ fn find(sights: &Sights, photographs: &[Photograph<'_>], of: usize) -> Option<(C
             }
         }
     }
-    shaded(&light, &footing, chart.size).map(|shade| (chart, shade))
+    let mut shade = shaded(&light, &footing, chart.size)?;
+    // A site of the foot reaches beyond the mask, into the darkest of the shade.
+    shade.iter_mut().zip(&footing).for_each(|(shade, foot)| *shade |= foot);
+    Some((chart, shade))
 }
 
 /// `[texel]` logarithms of what the views show of the plane: the median of each channel; NaN where none shows it.
@@ -118,11 +121,8 @@ fn luminances(sights: &Sights, photographs: &[Photograph<'_>], of: usize, chart:
             return [f64::NAN; 3];
         }
         let world = DVec3::from(own.along([point.x / point.z, point.y / point.z], point.z));
-        let shown = trusted.iter().step_by(every).filter_map(|k| {
-            let (site, z) = sights.0[*k].see(world)?;
-            let agrees = !sights.0[*k].hole[site] && (sights.0[*k].depth[site] / z - 1.0).abs() <= SAME;
-            agrees.then(|| photographs[*k].color(world)).flatten()
-        });
+        let some = trusted.iter().step_by(every);
+        let shown = some.filter_map(|k| sights.0[*k].shows(world, SAME).and_then(|_| photographs[*k].color(world)));
         let shown: Vec<[f32; 3]> = shown.collect();
         std::array::from_fn(|c| {
             let mut values: Vec<f32> = shown.iter().map(|color| color[c]).collect();

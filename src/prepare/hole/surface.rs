@@ -53,6 +53,8 @@ pub struct Sight {
     pub planes: Vec<planes::Plane>,
     /// Whether every site has its depth.
     pub solved: bool,
+    /// How many views were solved before it.
+    rank: usize,
 }
 
 /// How a view sees a point that some other view claims.
@@ -83,7 +85,16 @@ impl Sight {
         let hole: Vec<bool> = (0..grid.depth.len()).map(|site| covers(mask, camera, &grid, site)).collect();
         let depth = grid.depth.iter().zip(&hole).map(|(z, hole)| if *hole { f64::NAN } else { *z }).collect();
         let sites = hole.len();
-        Self { grid, hole, depth, measured: vec![false; sites], surface: vec![0; sites], planes: vec![], solved: false }
+        Self {
+            grid,
+            hole,
+            depth,
+            measured: vec![false; sites],
+            surface: vec![0; sites],
+            planes: vec![],
+            solved: false,
+            rank: 0,
+        }
     }
 
     /// Site and depth z of a world point that is in the picture.
@@ -98,23 +109,49 @@ impl Sight {
 
     /// Depth z at a place in sites, linear in its inverse between sites of one surface; NaN where nothing is known.
     pub fn depth_at(&self, place: [f64; 2]) -> f64 {
-        let nearest =
-            self.grid.site(place[0].floor() as i64, place[1].floor() as i64).map_or(f64::NAN, |s| self.depth[s]);
+        let inverse =
+            |column: i64, row: i64| self.grid.site(column, row).map_or(f64::NAN, |site| 1.0 / self.depth[site]);
+        let at = place.map(|v| v.floor() as i64);
+        let nearest = inverse(at[0], at[1]);
         if nearest.is_nan() {
             return f64::NAN;
         }
+        // Of two sides the flatter one: on the other another surface may begin.
+        let slope = |before: f64, after: f64| match (nearest - before, after - nearest) {
+            (one, other) if other.is_nan() || one.abs() < other.abs() => one,
+            (_, other) => other,
+        };
+        let slopes = [
+            slope(inverse(at[0] - 1, at[1]), inverse(at[0] + 1, at[1])),
+            slope(inverse(at[0], at[1] - 1), inverse(at[0], at[1] + 1)),
+        ]
+        .map(|slope| if slope.is_nan() { 0.0 } else { slope });
         let [x, y] = place.map(|v| v - 0.5);
         let (mut sum, mut total) = (0.0, 0.0);
         for (dx, dy) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
-            let (u, v) = (x.floor() + f64::from(dx), y.floor() + f64::from(dy));
-            let Some(z) = self.grid.site(u as i64, v as i64).map(|site| self.depth[site]) else { continue };
-            if (z / nearest - 1.0).abs() <= 2.0 * SAME {
-                let weight = (1.0 - (x - u).abs()) * (1.0 - (y - v).abs());
-                sum += weight / z;
+            let (u, v) = (x.floor() as i64 + dx, y.floor() as i64 + dy);
+            let there = inverse(u, v);
+            // A surface that is seen at a grazing angle goes on in equal steps.
+            let goes_on = nearest + slopes[0] * (u - at[0]) as f64 + slopes[1] * (v - at[1]) as f64;
+            if (there - nearest).abs().min((there - goes_on).abs()) <= 2.0 * SAME * nearest {
+                let weight = (1.0 - (x - u as f64).abs()) * (1.0 - (y - v as f64).abs());
+                sum += weight * there;
                 total += weight;
             }
         }
-        if total > 0.0 { total / sum } else { nearest }
+        // Where a surface ends its sites beyond the place are missing.
+        let here = nearest + slopes[0] * (x - at[0] as f64) + slopes[1] * (y - at[1] as f64);
+        let known = sum + (1.0 - total) * here;
+        1.0 / if known > 0.0 { known } else { nearest }
+    }
+
+    /// The site at which the photograph shows a world point: what it shows there, beside the object, is at most this part of
+    /// the depth before or behind it.
+    pub fn shows(&self, point: DVec3, part: f64) -> Option<usize> {
+        let (site, z) = self.see(point).filter(|(site, _)| !self.hole[*site])?;
+        let [x, y, _] = self.grid.camera.to_camera(point.to_array());
+        let depth = self.depth_at(self.grid.place([x / z, y / z]));
+        ((depth / z - 1.0).abs() <= part).then_some(site)
     }
 
     /// The surface at a place in sites: that of most of the four sites around it, the nearer ones counting more.
@@ -423,6 +460,10 @@ impl Sights {
                 return (f64::NAN, false);
             }
             let mut near: Vec<Claim> = own.around(site).flat_map(|site| claims[site].iter().copied()).collect();
+            // Of solved views the first tells: each later one would carry the surface a little nearer.
+            let solved = near.iter().filter(|claim| !claim.photographed);
+            let first = solved.map(|claim| self.0[claim.view].rank).min();
+            near.retain(|claim| claim.photographed || Some(self.0[claim.view].rank) == first);
             near.sort_unstable_by(|a, b| a.depth.total_cmp(&b.depth));
             let object = if own.grid.confirmed[site] { own.grid.depth[site] } else { 0.0 };
             let mut first = 0;
@@ -467,8 +508,8 @@ impl Sights {
         };
         let mut disparity: Vec<f32> = (0..own.hole.len()).map(|site| (1.0 / known(site)) as f32).collect();
         let (mut surface, mut found_planes) = (vec![0; own.hole.len()], vec![]);
-        let first = !self.0.iter().any(|sight| sight.solved);
-        if first || unknown.iter().filter(|unknown| **unknown).count() > FEW {
+        let rank = self.0.iter().filter(|sight| sight.solved).count();
+        if rank == 0 || unknown.iter().filter(|unknown| **unknown).count() > FEW {
             let window = Window::around(&own.grid, |site| near[site]).expect("a hole has surroundings");
             let sites = window.sites();
             let rays: Vec<Option<[f64; 2]>> = sites.iter().map(|site| Some(own.ray(*site))).collect();
@@ -519,21 +560,21 @@ impl Sights {
         }
         own.measured = carried.into_iter().map(|(_, photographed)| photographed).collect();
         (own.surface, own.planes) = (surface, found_planes);
-        own.solved = true;
+        (own.solved, own.rank) = (true, rank);
     }
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use image::Luma;
 
     use super::*;
 
-    const SIZE: [u32; 2] = [48, 32];
+    pub const SIZE: [u32; 2] = [48, 32];
 
     /// Five cameras side by side look at a wall at z = 4 with a square of this half width at z = 2 before it: grids, cameras,
     /// masks.
-    fn views(half: f64) -> (Vec<DepthGrid>, Vec<Camera>, Vec<GrayImage>) {
+    pub fn views(half: f64) -> (Vec<DepthGrid>, Vec<Camera>, Vec<GrayImage>) {
         let camera = |x: f64| Camera {
             rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
             translation: [-x, 0.0, 0.0],
@@ -579,6 +620,40 @@ mod tests {
             assert!(holes.iter().all(|site| (sight.depth[*site] / 4.0 - 1.0).abs() < 0.01));
             assert!(holes.iter().all(|site| sight.measured[*site]));
         }
+    }
+
+    /// Of a floor that is seen at a grazing angle, a fifth deeper from row to row, the depth between rows is the floor's.
+    #[test]
+    fn a_grazing_floor_is_one_surface() {
+        let (mut grids, cameras, masks) = views(0.0);
+        let floor = |row: f64| 1.0 / (0.01 * row);
+        for (site, depth) in grids[0].depth.iter_mut().enumerate() {
+            *depth = floor((site as u32 / SIZE[0]) as f64 + 0.5);
+        }
+        let sight = Sight::new(grids.swap_remove(0), &cameras[0], &masks[0]);
+        for row in [2.0, 4.3, 5.99, 17.6] {
+            let (found, true_depth) = (sight.depth_at([20.2, row]), floor(row));
+            assert!((found / true_depth - 1.0).abs() < 1e-9, "row {row}: {found}, {true_depth}");
+        }
+    }
+
+    /// Later views were solved a little nearer: what the first told stays, for whoever asks next.
+    #[test]
+    fn the_first_solved_view_tells() {
+        let (grids, cameras, masks) = views(0.4);
+        let mut sights = Sights::new(grids, &cameras, &masks, &masks);
+        for of in [2, 0, 4] {
+            sights.solve(of, 1);
+        }
+        for nearer in [0, 4] {
+            sights.0[nearer].depth.iter_mut().for_each(|z| *z *= 0.98);
+        }
+        let carried = sights.carried(1);
+        let told: Vec<f64> = carried.iter().map(|(z, _)| *z).filter(|z| z.is_finite()).collect();
+        assert!(told.len() > 40, "{}", told.len());
+        // At one side a later view alone has told.
+        let first = told.iter().filter(|z| (*z / 4.0 - 1.0).abs() < 0.002).count();
+        assert!(first * 5 > told.len() * 4, "{told:?}");
     }
 
     /// A plane as another, turned and moved camera sees it has the same points.

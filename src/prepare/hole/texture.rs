@@ -30,8 +30,11 @@ pub struct Texture {
 
 /// Longer side of the picture that shifts are chosen on, pixels.
 const SIDE: usize = 128;
-/// Shifts that are tried in the hole.
+/// Shifts that are tried in the hole because they repeat.
 const SHIFTS: usize = 48;
+/// More of them, that fit all around the hole, as judged by so many pixels of it and of its rim.
+const WHOLE: usize = 12;
+const SAMPLES: usize = 128;
 /// Patches that are compared are 2 `RADIUS` + 1 pixels wide.
 const RADIUS: usize = 3;
 /// Shortest shift, as a part of the longer side: every texture is like itself next to itself.
@@ -170,8 +173,43 @@ impl Texture {
                 shifts.push(shift);
             }
         }
+        let whole = self.whole(&holes, &all);
+        shifts.extend(whole);
         self.reach_all(&holes, &all, &mut shifts);
         shifts
+    }
+
+    /// The shifts that fill nearly all of the hole, and under which what is around it is most like what it is covered with.
+    fn whole(&self, holes: &[usize], all: &[Shift]) -> Vec<Shift> {
+        let every = |count: usize| count.div_ceil(SAMPLES).max(1);
+        let beside = |i: &usize| {
+            let mut near = (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| [dx, dy]));
+            near.any(|shift| self.shifted(*i, shift).is_some_and(|near| self.hole[near]))
+        };
+        let rim: Vec<usize> = (0..self.hole.len()).filter(|i| self.source[*i] && beside(i)).collect();
+        let rim: Vec<usize> = rim.iter().copied().step_by(every(rim.len())).collect();
+        let holes: Vec<usize> = holes.iter().copied().step_by(every(holes.len())).collect();
+        let score = |shift: Shift| {
+            let apart =
+                |i: &usize| self.source(*i, shift).map_or(DIFFERENT, |from| self.apart(*i, from).min(DIFFERENT));
+            let bare = holes.iter().filter(|i| self.source(**i, shift).is_none()).count();
+            rim.iter().map(apart).sum::<f32>() / rim.len().max(1) as f32 + bare as f32 / holes.len().max(1) as f32
+        };
+        let mut scored: Vec<(f32, Shift)> = (all.par_iter())
+            .flat_map_iter(|shift| [*shift, shift.map(|v| -v)].map(|shift| (score(shift), shift)))
+            .collect();
+        scored.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        let mut best: Vec<Shift> = vec![];
+        let apart = |a: &Shift, b: &Shift| (a[0] - b[0]).abs().max((a[1] - b[1]).abs()) > 2;
+        for (_, shift) in scored.into_iter().take_while(|(score, _)| *score < DIFFERENT) {
+            if best.len() == WHOLE {
+                break;
+            }
+            if best.iter().all(|other| apart(other, &shift)) {
+                best.push(shift);
+            }
+        }
+        best
     }
 
     /// Adds shifts until every pixel of the hole has a source, as far as there are any.
@@ -464,6 +502,27 @@ mod tests {
             let wrong = inside().filter(|i| (0..3).any(|c| (tiles.rgb[*i][c] - truth[*i][c]).abs() > 0.06)).count();
             let all = inside().count();
             assert!(wrong * 50 < all, "{wrong} of {all} at {size:?}");
+        }
+    }
+
+    /// A hole in the middle of a plain tile, on a floor of which a part alone is known: no joint comes into it.
+    #[test]
+    fn plain_stays_plain() {
+        let hole = |x: usize, y: usize| (70..100).contains(&x) && (55..75).contains(&y);
+        let joint = |x: usize, y: usize| x % 60 < 2 || y % 48 < 2;
+        let (mut floor, truth) =
+            texture([160, 130], hole, |x, y| if joint(x, y) { [0.35; 3] } else { [0.75, 0.73, 0.7] });
+        // Of the neighbouring tiles one side alone is known.
+        floor
+            .source
+            .iter_mut()
+            .enumerate()
+            .filter(|(i, _)| i % 160 > 135 || i % 160 < 25)
+            .for_each(|(_, s)| *s = false);
+        let before = floor.hole.clone();
+        assert!(fill(&mut floor));
+        for i in (0..truth.len()).filter(|i| before[*i]) {
+            assert!((0..3).all(|c| (floor.rgb[i][c] - truth[i][c]).abs() < 0.03), "{i}: {:?}", floor.rgb[i]);
         }
     }
 
