@@ -33,7 +33,7 @@ const DRAWN: f64 = 0.6;
 /// Seconds for what is written at the end.
 const WRITTEN: f64 = 1.0;
 
-/// What is to be done behind the training within the same time.
+/// The work behind the training, which has to end within the same time.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Reserve {
     /// Time in training steps on pictures of the full size.

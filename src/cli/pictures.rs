@@ -3,12 +3,11 @@
 use std::io::{self, Cursor};
 use std::path::{Path, PathBuf};
 
-use crate::atomic;
+use crate::{atomic, scene};
 use exr::prelude::{
     AnyChannel, AnyChannels, Encoding, FlatSamples, Layer, LayerAttributes, SmallVec, WritableImage as _,
 };
 use image::ImageFormat;
-use image::codecs::jpeg::JpegEncoder;
 
 pub use crate::render::view::to_rgb8;
 
@@ -55,9 +54,10 @@ pub fn write_rgb8(path: &Path, picture: &image::RgbImage) -> Result<(), Error> {
 /// # Errors
 /// A path that cannot be written.
 pub fn write_jpeg(path: &Path, picture: &image::RgbImage) -> Result<(), Error> {
-    let mut bytes = vec![];
-    let encoded = picture.write_with_encoder(JpegEncoder::new_with_quality(&mut bytes, 92)).map_err(io::Error::other);
-    encoded.and_then(|()| atomic::write_below(path, &bytes)).map_err(|source| Error { path: path.to_owned(), source })
+    let encoded = scene::jpeg(picture, 92).map_err(io::Error::other);
+    encoded
+        .and_then(|bytes| atomic::write_below(path, &bytes))
+        .map_err(|source| Error { path: path.to_owned(), source })
 }
 
 /// Writes a grey picture as PNG, making the folder if it is missing. The file appears complete or not at all.

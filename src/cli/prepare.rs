@@ -15,7 +15,7 @@ use crate::signal::Signal;
 ///
 /// PHOTOS is a folder of photographs, alone or with what is known of their cameras: a COLMAP model in sparse/ (photographs
 /// in images/), or nerfstudio's transforms.json. For photographs alone the program colmap is asked, where it is installed.
-/// Of a video the sharpest frames of even spacing are the photographs; the program ffmpeg takes them.
+/// PHOTOS may be a video, too: its sharpest frames of even spacing, which the program ffmpeg takes, are the photographs.
 /// The scene gets the plain layout, which `train` takes.
 ///
 /// The steps are poses, fit, masks, shadow, depth and reference. A step whose inputs have not changed is skipped, a file that was

@@ -5,14 +5,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::{Context as _, anyhow, bail};
-use image::codecs::jpeg::JpegEncoder;
 
 use super::export::{Cameras, EXPORT, FIGURES, Pose, STEM};
 use super::folders::Origin;
 use super::next;
 use super::shared;
 use crate::export;
-use crate::scene::Camera;
+use crate::scene::{self, Camera};
 use crate::view::server::{self, Secret};
 use crate::view::{self, Page, Start};
 
@@ -150,9 +149,7 @@ fn photograph(origin: &Origin, pose: &Pose) -> anyhow::Result<Vec<u8>> {
     let rotation = pose.rotation;
     let camera = Camera { rotation, translation: Camera::translation_to(&rotation, pose.center), ..view.camera };
     let picture = view::resampled(&view.image, &camera, &view::upright(&camera));
-    let mut jpeg = vec![];
-    picture.write_with_encoder(JpegEncoder::new_with_quality(&mut jpeg, 92))?;
-    Ok(jpeg)
+    Ok(scene::jpeg(&picture, 92)?)
 }
 
 #[cfg(test)]

@@ -5,7 +5,6 @@ use std::io::Cursor;
 use std::path::Path;
 use std::sync::{Arc, PoisonError};
 
-use image::codecs::jpeg::JpegEncoder;
 use image::{GrayImage, ImageFormat, Rgba, RgbaImage};
 use serde::Deserialize;
 use serde_json::json;
@@ -64,10 +63,8 @@ fn field(query: &str, name: &str) -> Option<String> {
     String::from_utf8(bytes).ok()
 }
 
-pub(super) fn jpeg(picture: &image::RgbImage, quality: u8) -> Result<Vec<u8>, Refusal> {
-    let mut bytes = vec![];
-    picture.write_with_encoder(JpegEncoder::new_with_quality(&mut bytes, quality)).map_err(|_| Refusal::Busy)?;
-    Ok(bytes)
+fn jpeg(picture: &image::RgbImage, quality: u8) -> Result<Vec<u8>, Refusal> {
+    scene::jpeg(picture, quality).map_err(|_| Refusal::Busy)
 }
 
 /// A mask as a picture to lay over its photograph.

@@ -58,7 +58,7 @@ pub(crate) use exposure::even_out;
 pub use hole::{HOLE, Hole, MADE_WITH};
 pub(crate) use layout::{PICTURES, stem};
 pub use note::{Note, Notes};
-pub use picture::{decode, dimensions, object_mask};
+pub use picture::{decode, dimensions, jpeg, object_mask};
 pub(crate) use priors::rank_correlation;
 pub use priors::read as read_prior;
 pub use priors::{Prior, PriorKind, in_own_range, own_range};

@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use image::{ColorType, DynamicImage, GrayImage, ImageDecoder, ImageReader, Limits};
+use image::codecs::jpeg::JpegEncoder;
+use image::{ColorType, DynamicImage, GrayImage, ImageDecoder, ImageReader, Limits, RgbImage};
 
 use super::Error;
 
@@ -14,6 +15,16 @@ const MAX_BYTES: u64 = 8 * MAX_PIXELS;
 /// JPEG needs a bit for a block of 8 x 8 pixels in 3 colours, which may stand for 4 x 2 such blocks; OpenEXR's methods stay
 /// below DEFLATE.
 pub const MOST_GROWTH: u64 = 8 * 8 * 8 * 3 * 8;
+
+/// A picture as JPEG of a quality of 1 to 100.
+///
+/// # Errors
+/// A picture that is larger than JPEG's 65,535 pixels a side.
+pub fn jpeg(picture: &RgbImage, quality: u8) -> image::ImageResult<Vec<u8>> {
+    let mut bytes = vec![];
+    picture.write_with_encoder(JpegEncoder::new_with_quality(&mut bytes, quality))?;
+    Ok(bytes)
+}
 
 /// A decoder that has read the file's header, by its content, whatever its extension says.
 fn open(path: &Path) -> Result<impl ImageDecoder, Error> {

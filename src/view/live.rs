@@ -16,7 +16,6 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
-use image::codecs::jpeg::JpegEncoder;
 use serde::Serialize;
 use serde_json::json;
 
@@ -24,7 +23,7 @@ use super::server::{Answer, Body, Refusal, Site};
 use crate::evaluate::Report;
 use crate::gpu;
 use crate::render::view::Rendered;
-use crate::scene::{Camera, Scene, path};
+use crate::scene::{self, Camera, Scene, path};
 use crate::train::run::Progress;
 
 /// Part of the time that pictures for visitors may take.
@@ -330,10 +329,7 @@ impl Site for Board {
             "/picture.jpg" => {
                 let camera = self.camera(query).ok_or(Refusal::BadRequest)?;
                 let picture = self.picture(camera)?.to_rgb8();
-                let mut jpeg = vec![];
-                let encoder = JpegEncoder::new_with_quality(&mut jpeg, QUALITY);
-                picture.write_with_encoder(encoder).map_err(|_| Refusal::Busy)?;
-                owned("image/jpeg", jpeg)
+                owned("image/jpeg", scene::jpeg(&picture, QUALITY).map_err(|_| Refusal::Busy)?)
             }
             _ => Err(Refusal::NotFound),
         }

@@ -95,7 +95,7 @@ pub(super) struct Args {
 }
 
 impl Args {
-    /// What there is to do for so many photographs.
+    /// The work that so many photographs are.
     fn work(&self, views: usize) -> Work {
         Work {
             views,

@@ -9,7 +9,6 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use image::GrayImage;
-use image::codecs::jpeg::JpegEncoder;
 
 use super::work::{self, Audience, Job, Places};
 use super::{open_browser, signals};
@@ -208,9 +207,7 @@ fn draw(
         }
     };
     let camera = cameras.get(&session.photos()[number].name).context("the scene has no such view any more")?;
-    let mut jpeg = vec![];
-    renderer.render(camera)?.to_rgb8().write_with_encoder(JpegEncoder::new_with_quality(&mut jpeg, QUALITY))?;
-    Ok(jpeg)
+    Ok(scene::jpeg(&renderer.render(camera)?.to_rgb8(), QUALITY)?)
 }
 
 /// Carries masks to all views, by the fit.

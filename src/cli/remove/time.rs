@@ -1,7 +1,7 @@
 //! The time of a whole removal: `--minutes N` counts from Remove, or from the command, to the files.
 //!
-//! What a part takes is told from the number of views ([`COSTS`], after two captures of 24 and 60 views), and as soon as the masks
-//! are there from that and the pace that was measured. Training has what the others leave ([`crate::cli::minutes`]).
+//! The number of views tells what a part takes ([`COSTS`], after two captures of 24 and 60 views), and as soon as the masks are
+//! there, so does the pace that was measured. Training has what the others leave ([`crate::cli::minutes`]).
 
 use std::cell::Cell;
 use std::path::Path;
@@ -45,7 +45,7 @@ const REFINED: f64 = 0.6;
 const BAKED: f64 = 200.0;
 const WRITTEN: f64 = 3.0;
 
-/// What the parts are made of.
+/// The size of a removal.
 #[derive(Clone, Copy, Default)]
 pub struct Work {
     /// Views.

@@ -198,10 +198,8 @@ pub fn repaint(
         let (_, point) = shown(own, sight, i)?;
         filled.iter().find_map(|(view, Filled { rgb, made })| {
             let (other, there) = (&photographs[*view], &sights.0[*view]);
-            let [a, b, c] = there.grid.camera.to_camera(point.to_array());
-            let place = (c > 0.0).then(|| there.grid.place([a / c, b / c]))?;
-            let agrees = (there.depth_at(place) / c - 1.0).abs() <= SAME;
-            let pixel = other.camera.project(point.to_array()).filter(|_| agrees)?;
+            there.agrees(point, SAME)?;
+            let pixel = other.camera.project(point.to_array())?;
             let width = other.camera.size[0] as usize;
             let [x, y] = pixel.map(|v| v.max(0.0) as usize);
             let inside = x < width && y < other.camera.size[1] as usize;

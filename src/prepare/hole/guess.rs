@@ -12,6 +12,7 @@ use super::surface::{SAME, Sights};
 use super::texture::{self, Texture};
 use crate::prepare::planes::{Plane, membrane};
 use crate::scene::resample;
+use crate::statistics::quantile;
 
 /// Longer side of a chart at most, pixels.
 const CHART: f64 = 960.0;
@@ -227,11 +228,9 @@ fn charted(
 /// The first of the colours that several photographs show of one place that most of them come near: a highlight is elsewhere in
 /// each.
 fn common(colors: &[[f32; 3]]) -> Option<[f32; 3]> {
-    let middle: [f32; 3] = std::array::from_fn(|c| {
-        let mut values: Vec<f32> = colors.iter().map(|color| color[c]).collect();
-        values.sort_unstable_by(f32::total_cmp);
-        values.get(values.len() / 2).copied().unwrap_or(f32::NAN)
-    });
+    // Of two the darker one.
+    let middle: [f32; 3] =
+        std::array::from_fn(|c| quantile(colors.iter().map(|color| color[c]), 0.5).map_or(f32::NAN, |v| v as f32));
     colors.iter().copied().find(|color| (0..3).all(|c| (color[c] - middle[c]).abs() <= GLARE))
 }
 
@@ -299,6 +298,7 @@ mod tests {
     fn reflections_are_left_out() {
         assert_eq!(common(&[[0.9; 3], [0.52; 3], [0.5; 3]]), Some([0.52; 3]));
         assert_eq!(common(&[[0.54; 3], [0.5; 3], [0.5; 3]]), Some([0.54; 3]));
+        assert_eq!(common(&[[0.9; 3], [0.5; 3]]), Some([0.5; 3]));
         assert_eq!(common(&[]), None);
     }
 }

@@ -43,7 +43,7 @@ const LEAST_HOLE: f64 = 0.4;
 /// Views whose pictures are filled at once: each is held as float32.
 const AT_ONCE: usize = 16;
 /// Name of the way in which holes are filled: a scene that was filled in another way is filled anew.
-pub const METHOD: &str = "one surface, all views";
+pub const METHOD: &str = "one surface, which the first view tells";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 
@@ -164,9 +164,11 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
         for (&i, mut filling) in some.iter().zip(gathered) {
             color::repaint(&sights, &photographs, &filled, i, &mut filling);
             // What was made for this view the others get from it; what photographs show they look up themselves.
-            let hole: Vec<bool> = photographs[i].hole.as_raw().iter().map(|v| *v != 0).collect();
-            let made = if task.given.contains_key(&i) { hole } else { filling.guessed.clone() };
-            let made = guess::thick(&made, cameras[i].size);
+            let made: Vec<bool> = if task.given.contains_key(&i) {
+                photographs[i].hole.as_raw().iter().map(|v| *v != 0).collect()
+            } else {
+                guess::thick(&filling.guessed, cameras[i].size)
+            };
             if task.given.contains_key(&i) {
                 painted(task, i, &photographs[i].hole, &mut filling)?;
             } else if let Some(network) = task.inpainting {

@@ -99,12 +99,18 @@ impl Sight {
 
     /// Site and depth z of a world point that is in the picture.
     pub fn see(&self, point: DVec3) -> Option<(usize, f64)> {
+        self.seen(point).map(|(site, _, z)| (site, z))
+    }
+
+    /// The same, with the place in sites.
+    fn seen(&self, point: DVec3) -> Option<(usize, [f64; 2], f64)> {
         let [x, y, z] = self.grid.camera.to_camera(point.to_array());
         if z <= 0.0 {
             return None;
         }
-        let [column, row] = self.grid.place([x / z, y / z]).map(f64::floor);
-        self.grid.site(column as i64, row as i64).map(|site| (site, z))
+        let place = self.grid.place([x / z, y / z]);
+        let [column, row] = place.map(f64::floor);
+        self.grid.site(column as i64, row as i64).map(|site| (site, place, z))
     }
 
     /// Depth z at a place in sites, linear in its inverse between sites of one surface; NaN where nothing is known.
@@ -145,13 +151,16 @@ impl Sight {
         1.0 / if known > 0.0 { known } else { nearest }
     }
 
-    /// The site at which the photograph shows a world point: what it shows there, beside the object, is at most this part of
-    /// the depth before or behind it.
+    /// The site at which a world point is seen without the object: what is there is at most this part of the depth before or
+    /// behind it.
+    pub fn agrees(&self, point: DVec3, part: f64) -> Option<usize> {
+        let (site, place, z) = self.seen(point)?;
+        ((self.depth_at(place) / z - 1.0).abs() <= part).then_some(site)
+    }
+
+    /// As [`Sight::agrees`], where the photograph shows it: beside the object.
     pub fn shows(&self, point: DVec3, part: f64) -> Option<usize> {
-        let (site, z) = self.see(point).filter(|(site, _)| !self.hole[*site])?;
-        let [x, y, _] = self.grid.camera.to_camera(point.to_array());
-        let depth = self.depth_at(self.grid.place([x / z, y / z]));
-        ((depth / z - 1.0).abs() <= part).then_some(site)
+        self.agrees(point, part).filter(|site| !self.hole[*site])
     }
 
     /// The surface at a place in sites: that of most of the four sites around it, the nearer ones counting more.
