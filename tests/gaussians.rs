@@ -59,7 +59,7 @@ fn a_run_learns_and_is_the_same_again() {
     let mean = |steps: &[Progress]| steps.iter().map(|p| f64::from(p.loss)).sum::<f64>() / steps.len() as f64;
     let (first, last) = (mean(&watch.steps[..6]), mean(&watch.steps[84..]));
     assert!(last < 0.7 * first, "{first} to {last}");
-    let rounds = watch.lines.iter().filter(|line| line.contains("faded Gaussians moved"));
+    let rounds = watch.lines.iter().filter(|line| line.contains("faded Gaussians are halves of others"));
     assert_eq!(rounds.count(), 5, "{:?}", watch.lines);
     assert_eq!(watch.steps[89].anchors, 330, "as many as there may be");
     assert!(watch.steps.iter().all(|p| p.visible == p.anchors && p.gaussians > 0));

@@ -568,7 +568,7 @@ fn frozen_gaussians_stay_and_the_others_learn() {
     let error = Run::new(&gpu, &scene, &settings).err().expect("fewer than are to stay").to_string();
     assert!(error.contains("set model.frozen to fewer"), "{error}");
     settings.densify.enabled = true;
-    assert!(settings.validate().is_err(), "relocation moves them");
+    assert!(settings.validate().is_err(), "growth splits them");
 }
 
 #[test]

@@ -101,7 +101,7 @@ impl Settings {
             frozen == 0 || !self.densify.enabled,
             "model.frozen",
             frozen,
-            "keeps Gaussians as they are, which relocation moves; set densify.enabled=false",
+            "keeps Gaussians as they are, which growth splits; set densify.enabled=false",
         )
         .map_err(|invalid| invalid.against("densify.enabled"))
     }

@@ -41,7 +41,7 @@ pub struct Config {
     /// Most anchors; growing stops there. 0 means no limit but memory.
     pub max_anchors: u32,
     /// Most plain Gaussians: the model has memory for so many from the first step on, and more points than that are
-    /// thinned. In every round those that fade below `min_opacity` move onto others (3DGS-MCMC).
+    /// thinned. In every round large ones are split, and those that fade below `min_opacity` become halves of others.
     pub max_gaussians: u32,
 }
 

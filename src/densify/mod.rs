@@ -1,9 +1,9 @@
-//! Statistics, growing and pruning of anchors; moving and adding of plain Gaussians.
+//! Statistics, growing and pruning of anchors; splitting of plain Gaussians.
 
 pub mod config;
 pub mod grow;
 pub mod prune;
-pub mod relocate;
+pub mod split;
 pub mod statistics;
 
 pub use config::Config;

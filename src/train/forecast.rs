@@ -181,7 +181,7 @@ pub fn expected_anchors(gpu: &Gpu, plan: &Plan, settings: &Settings, initial: &B
         Beginning::Anchors(initial) => initial,
         Beginning::Gaussians(cloud) => {
             let rounds = (rounds.last - rounds.first) / config.every + 1;
-            let grown = f64::from(count) * (1.0 + crate::densify::relocate::GROWTH).powi(rounds.min(10_000) as i32);
+            let grown = f64::from(count) * (1.0 + crate::densify::split::GROWTH).powi(rounds.min(10_000) as i32);
             let most = config.max_gaussians.min(Static::most(gpu, cloud.degree));
             return grown.min(most.max(count).into()) as u32;
         }

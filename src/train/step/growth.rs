@@ -1,7 +1,7 @@
 //! Growing and pruning behind a step.
 
 use super::Step;
-use crate::densify::{self, relocate};
+use crate::densify::{self, split};
 use crate::gpu::Error;
 use crate::model::learnt::Learnt;
 use crate::render::forward;
@@ -34,11 +34,11 @@ impl Step {
             Learnt::Anchors { anchors, .. } => anchors,
             Learnt::Gaussians(gaussians) => {
                 let before = gaussians.count;
-                let round = relocate::Round { seed: self.config.train.seed, step };
-                let moved = relocate::run(&self.gpu, gaussians, &self.config.densify, round)?;
+                let round = split::Round { seed: self.config.train.seed, step };
+                let moved = split::run(&self.gpu, gaussians, &self.config.densify, round)?;
                 let now = gaussians.count;
                 return Ok(format!(
-                    "step {step}: {moved} faded Gaussians moved, {} new: {before} -> {now}",
+                    "step {step}: {moved} faded Gaussians are halves of others, {} new: {before} -> {now}",
                     now - before
                 ));
             }
