@@ -188,7 +188,7 @@ impl Drawer {
         };
         project_backward.record(rec, binned.drawn, activate.gaussians(), splats, camera, self.config.near as f32);
         let drawn = DrawnGradients {
-            drawn: binned.tiles,
+            drawn: binned.drawn,
             seen: &project_backward.grad_position,
             scale: &project_backward.grad_scale,
             rotation: &project_backward.grad_rotation,

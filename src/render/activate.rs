@@ -1,6 +1,7 @@
 //! From what is learnt of static Gaussians to what is drawn, and back.
 
-use super::project::Gaussians;
+use super::project::{Gaussians, listed};
+use super::slots::Slots;
 use crate::gpu::kernels::render::{activate, activate_backward};
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
 use crate::math::camera::{from_center, split};
@@ -54,10 +55,9 @@ impl Reference for activate::Kernel {
 impl Reference for activate_backward::Kernel {
     fn reference(host: activate_backward::Host<'_>, push: activate_backward::Push, (): ()) {
         let each = push.coefficients as usize;
-        for i in 0..push.count as usize {
-            let drawn = host.drawn[i] != 0;
-            let of = |v: f32| if drawn { f64::from(v) } else { 0.0 };
-            host.grad_position[i] = narrow(host.grad_seen[i].map(of));
+        let of = f64::from;
+        for i in listed(host.count, host.list) {
+            host.grad_position[i] = host.grad_seen[i];
             let (scale, grad_scale) = (wide(host.scale[i]), host.grad_scale[i].map(of));
             host.grad_log_scale[i] = std::array::from_fn(|k| (grad_scale[k] * scale[k]) as f32);
             let (q, g) = (wide(host.quaternion[i]), host.grad_rotation[i].map(of));
@@ -141,8 +141,8 @@ impl Activate {
 /// Gradients of [`Activate`]'s outputs, of Gaussians that touch a tile.
 #[derive(Clone, Copy)]
 pub struct DrawnGradients<'a> {
-    /// Not 0 where a Gaussian has a gradient: the tiles that it touches.
-    pub drawn: &'a Buffer<u32>,
+    /// Those that touch a tile.
+    pub drawn: &'a Slots,
     /// World.
     pub seen: &'a Buffer<[f32; 3]>,
     /// Of the standard deviations.
@@ -160,13 +160,15 @@ fn gradient(parameter: &Parameter) -> &Buffer<f32> {
     parameter.gradient.as_ref().expect("made before the way back is recorded")
 }
 
-/// Records the gradients of what is learnt, after [`Activate::record`] of the same Gaussians.
+/// Records the gradients of what is learnt, after [`Activate::record`] of the same Gaussians: zero for those that touch no
+/// tile.
 ///
 /// # Panics
 /// When a parameter has no buffer for its gradient.
 pub fn backward(rec: &mut Recorder<'_>, of: &Static, forward: &Activate, grad: DrawnGradients<'_>) {
     let buffers = activate_backward::Buffers {
-        drawn: grad.drawn,
+        count: &grad.drawn.count,
+        list: &grad.drawn.list,
         seen: &forward.seen,
         scale: &forward.scale,
         quaternion: &of.quaternion.value.view(),
@@ -183,9 +185,11 @@ pub fn backward(rec: &mut Recorder<'_>, of: &Static, forward: &Activate, grad: D
         grad_logit: gradient(&of.logit),
         grad_harmonics: &gradient(&of.harmonics).view(),
     };
+    // Only rows of those that do are written: fewer are visited, and filling costs next to nothing.
+    of.parameters().into_iter().for_each(|parameter| rec.zero(gradient(parameter)));
     let coefficients = coefficients(of.degree) as u32;
-    let push = activate_backward::Push { count: of.count, coefficients, higher: of.higher };
-    rec.run(activate_backward::Kernel, buffers, push, of.count);
+    let push = activate_backward::Push { coefficients, higher: of.higher };
+    rec.run(activate_backward::Kernel, buffers, push, &grad.drawn.groups);
 }
 
 #[cfg(test)]
@@ -228,7 +232,8 @@ mod tests {
         let n = forward.position.len();
         let mut random = || rng.random_range(-1.0f32..1.0);
         activate_backward::Arrays {
-            drawn: (0..n as u32).map(|i| i % 5).collect(),
+            count: vec![(0..n).filter(|i| i % 5 != 0).count() as u32],
+            list: (0..n as u32).filter(|i| i % 5 != 0).chain([0; 3]).collect(),
             seen: forward.seen.clone(),
             scale: forward.scale.clone(),
             quaternion: forward.quaternion.clone(),
@@ -266,7 +271,7 @@ mod tests {
                 backward.grad_color[i] = [f32::NAN; 3];
             }
             let coefficients = coefficients(degree) as u32;
-            let push = activate_backward::Push { count: n as u32, coefficients, higher: HIGHER };
+            let push = activate_backward::Push { coefficients, higher: HIGHER };
             testing::assert_twin(activate_backward::Kernel, &gpu, backward, push, n);
         }
     }
@@ -282,9 +287,9 @@ mod tests {
             activate::Arrays { log_scale: start.log_scale.iter().map(|v| v.map(|v| v / 8.0)).collect(), ..start };
         let there = forward(&start, n, degree);
         let mut grad = backward_case(&mut rng, &there, degree);
-        grad.drawn = vec![1; n];
+        (grad.count, grad.list) = (vec![n as u32], (0..n as u32).collect());
         grad.grad_seen = vec![[0.0; 3]; n];
-        let push = activate_backward::Push { count: n as u32, coefficients: 16, higher: HIGHER };
+        let push = activate_backward::Push { coefficients: 16, higher: HIGHER };
         let got = testing::run_twin(activate_backward::Kernel, (), grad.clone(), push);
         let value = |at: &activate::Arrays, i: usize| -> f64 {
             let out = forward(at, n, degree);

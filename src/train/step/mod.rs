@@ -442,7 +442,7 @@ impl Step {
             }
             Drawable::Gaussians { gaussians, activate } => {
                 let gradients = DrawnGradients {
-                    drawn: binned.tiles,
+                    drawn: binned.drawn,
                     seen: &project_backward.grad_position,
                     scale: &project_backward.grad_scale,
                     rotation: &project_backward.grad_rotation,
