@@ -16,7 +16,7 @@ const PLANES: usize = 6;
 /// Least part of the known pixels that makes a plane.
 const LEAST: f64 = 0.05;
 /// An inverse depth lies on a plane if it differs by at most this part.
-const THICKNESS: f64 = 0.02;
+pub const THICKNESS: f64 = 0.02;
 /// Triples of pixels that are tried for each plane.
 const TRIES: usize = 500;
 /// Known pixels that take part in the search.
@@ -24,9 +24,9 @@ const SAMPLES: usize = 6000;
 /// Longer side of the grid that surfaces are chosen on, pixels.
 const SIDE: usize = 320;
 /// What a pixel off its surface costs at most, in thicknesses.
-const OFF: f64 = 4.0;
+pub const OFF: f64 = 4.0;
 /// What a pixel without a surface of its own costs: a plane that fits is preferred.
-const REST: f64 = 1.5;
+pub const REST: f64 = 1.5;
 /// The same in the hole, where nothing fits better or worse.
 const UNKNOWN_REST: f64 = 0.4;
 /// What a pixel costs where its surface is impossible.
@@ -50,6 +50,9 @@ pub struct Hole<'a, F> {
     pub rays: &'a [Option<[f64; 2]>],
     /// `[pixel]` whether it is to be filled; its inverse depth is not looked at.
     pub unknown: &'a [bool],
+    /// `[pixel]` what each plane costs there, and at last to be off all of them, where more is known of that than the inverse
+    /// depth.
+    pub costs: &'a [Option<Vec<f64>>],
     /// `[pixel]` whether it lies along the object's outline.
     pub outline: &'a [bool],
     /// What speaks against a surface of this inverse depth at the pixel (its number): from 0, nothing, to 1, it cannot be.
@@ -145,10 +148,20 @@ fn labels<F: Fn(usize, f64) -> f64>(hole: &Hole<'_, F>, planes: &[Plane]) -> Vec
     let cost = |node: usize, label: usize| -> f64 {
         let i = middle(node);
         let Some(ray) = hole.rays[i] else { return 0.0 };
+        if let Some(costs) = &hole.costs[i] {
+            return costs[label];
+        }
         let d = f64::from(hole.disparity[i]);
         let is_known = !hole.unknown[i] && d > 0.0 && d.is_finite();
         if label == rest {
-            return if hole.unknown[i] { UNKNOWN_REST } else { REST };
+            // What speaks against all planes alike speaks against what is between them, too.
+            let likely =
+                || planes.iter().map(|plane| (hole.against)(i, on(plane, ray))).filter(|against| *against < 0.5);
+            return if hole.unknown[i] {
+                UNKNOWN_REST + IMPOSSIBLE * likely().reduce(f64::min).unwrap_or(0.0)
+            } else {
+                REST
+            };
         }
         let surface = on(&planes[label], ray);
         if is_known {
@@ -385,6 +398,7 @@ mod tests {
             disparity: &seen,
             rays: &rays,
             unknown: &unknown,
+            costs: &vec![None; SIZE[0] * SIZE[1]],
             outline: &outline,
             against: |_, _| 0.0,
         };
@@ -409,7 +423,15 @@ mod tests {
             (0..truth.len()).map(|i| (40..80).contains(&(i % SIZE[0])) && (20..70).contains(&(i / SIZE[0]))).collect();
         let against = |i: usize, d: f64| if d > 0.4 && i % SIZE[0] >= 45 { 1.0 } else { 0.0 };
         let outline = outline(&unknown);
-        let hole = Hole { size: SIZE, disparity: &truth, rays: &rays, unknown: &unknown, outline: &outline, against };
+        let hole = Hole {
+            size: SIZE,
+            disparity: &truth,
+            rays: &rays,
+            unknown: &unknown,
+            costs: &vec![None; SIZE[0] * SIZE[1]],
+            outline: &outline,
+            against,
+        };
         let found = surfaces(&hole, around(hole.disparity, hole.rays, hole.unknown, 5));
         for i in (0..truth.len()).filter(|i| unknown[*i] && (40..50).contains(&(i / SIZE[0]))) {
             let expected = if i % SIZE[0] < 45 { 0.5 } else { 0.25 };
@@ -433,6 +455,7 @@ mod tests {
             disparity: &truth,
             rays: &rays,
             unknown: &unknown,
+            costs: &vec![None; SIZE[0] * SIZE[1]],
             outline: &outline,
             against: |_, _| 0.0,
         };
@@ -452,6 +475,7 @@ mod tests {
             disparity: &nothing,
             rays: &rays,
             unknown: &unknown,
+            costs: &vec![None; SIZE[0] * SIZE[1]],
             outline: &outline,
             against: |_, _| 0.0,
         };

@@ -1,5 +1,6 @@
 //! The scene without the object: one surface behind it, filled once, for every view.
 //!
+//! - `flat`: what is bare lies on the planes around it.
 //! - `surface`: the depth of what is behind the object, in all views.
 //! - `color`: what photographs show of it, and what views that were filled before show of it.
 //! - `guess`: what nobody shows is filled with pieces of the same surface, seen straight on (`texture`), or by a network.
@@ -8,6 +9,7 @@
 //! holes are filled from the same surface, into `hole/`.
 
 mod color;
+mod flat;
 mod gradient;
 mod guess;
 mod shade;
@@ -43,7 +45,7 @@ const LEAST_HOLE: f64 = 0.4;
 /// Views whose pictures are filled at once: each is held as float32.
 const AT_ONCE: usize = 16;
 /// Name of the way in which holes are filled: a scene that was filled in another way is filled anew.
-pub const METHOD: &str = "one surface, which the first view tells";
+pub const METHOD: &str = "one surface, and what is bare lies on its planes";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 
@@ -121,6 +123,7 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
         ));
     }
     let mut sights = Sights::new(grids, &cameras, &masks, &wide);
+    sights.flatten(task.seed);
     let of = reference(task, &sights, &with_holes)?;
     let photographed = |masks: &[GrayImage]| -> Vec<Photograph<'_>> {
         let views = task.fine.train.iter().zip(masks);
@@ -139,6 +142,7 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
         }
         let grids = sights.0.into_iter().map(|sight| sight.grid).collect();
         sights = Sights::new(grids, &cameras, &masks, &wide);
+        sights.flatten(task.seed);
     }
     let mut filled: Vec<(usize, Filled)> = vec![];
     let unsolved = |sights: &Sights, i: usize| {

@@ -9,6 +9,7 @@ use glam::{DMat3, DVec3};
 use image::GrayImage;
 use rayon::prelude::*;
 
+use super::flat;
 use super::support::Support;
 use crate::multiview::DepthGrid;
 use crate::prepare::planes;
@@ -34,6 +35,10 @@ const BELOW: f64 = 0.5;
 const FLAT: f32 = 0.015;
 /// Least width of a hole's surroundings, sites.
 const LEAST_MARGIN: i64 = 16;
+/// What its being on a plane must cost more than where it was carried to for a site to be off the plane of its surroundings.
+const BETTER: f64 = 2.0;
+/// What a depth costs where too few photographs show what is there.
+const UNSHOWN: f64 = 1.0;
 /// Sites of a hole that are filled from their neighbours where no more than these are unknown.
 const FEW: usize = 12;
 
@@ -51,6 +56,8 @@ pub struct Sight {
     pub surface: Vec<u8>,
     /// Planes around the hole: inverse depth by x/z, y/z and 1.
     pub planes: Vec<planes::Plane>,
+    /// Planes around the hole that were found before it is solved.
+    pub(super) around: Vec<planes::Plane>,
     /// Whether every site has its depth.
     pub solved: bool,
     /// How many views were solved before it.
@@ -92,6 +99,7 @@ impl Sight {
             measured: vec![false; sites],
             surface: vec![0; sites],
             planes: vec![],
+            around: vec![],
             solved: false,
             rank: 0,
         }
@@ -103,7 +111,7 @@ impl Sight {
     }
 
     /// The same, with the place in sites.
-    fn seen(&self, point: DVec3) -> Option<(usize, [f64; 2], f64)> {
+    pub(super) fn seen(&self, point: DVec3) -> Option<(usize, [f64; 2], f64)> {
         let [x, y, z] = self.grid.camera.to_camera(point.to_array());
         if z <= 0.0 {
             return None;
@@ -217,7 +225,7 @@ impl Sight {
     }
 
     /// `[site]` whether it is in the hole's box, or within as much again on each side: the surfaces there go on in it.
-    fn surroundings(&self) -> Vec<bool> {
+    pub(super) fn surroundings(&self) -> Vec<bool> {
         let place = |site: usize| [site as u32 % self.grid.columns, site as u32 / self.grid.columns].map(i64::from);
         let holes = (0..self.hole.len()).filter(|site| self.hole[*site]).map(place);
         let (low, high) = holes.fold(([i64::MAX; 2], [i64::MIN; 2]), |(low, high), at| {
@@ -503,6 +511,115 @@ impl Sights {
         (0..own.hole.len()).into_par_iter().map(one).collect()
     }
 
+    /// `[cell]` what each plane costs there by what photographs show on it, and at last where the site was carried to; nothing
+    /// beside the hole, and where no view tells.
+    fn evidence(
+        &self,
+        of: usize,
+        sites: &[usize],
+        size: [usize; 2],
+        disparity: &[f32],
+        planes: &[planes::Plane],
+    ) -> Vec<Option<Vec<f64>>> {
+        let own = &self.0[of];
+        let unlike =
+            |depth: &(dyn Fn(usize) -> f64 + Sync)| -> Vec<f64> {
+                let raw = self.unlike_in_hole(of, sites, |cell| {
+                    if disparity[sites[cell]].is_finite() { depth(cell) } else { f64::NAN }
+                });
+                (0..raw.len()).map(|cell| flat::around(&raw, cell, size)).collect()
+            };
+        let mut all: Vec<Vec<f64>> =
+            planes.iter().map(|plane| unlike(&|cell| 1.0 / planes::on(plane, own.ray(sites[cell])))).collect();
+        all.push(unlike(&|cell| 1.0 / f64::from(disparity[sites[cell]])));
+        let one = |cell: usize| -> Option<Vec<f64>> {
+            let site = sites[cell];
+            (own.hole[site] && disparity[site].is_finite()).then_some(())?;
+            let levels = |label: usize| all[label][cell];
+            let least = (0..all.len()).map(levels).filter(|v| v.is_finite()).fold(f64::INFINITY, f64::min);
+            let cost = |label: usize| {
+                let apart = if levels(label).is_finite() {
+                    ((levels(label) - least) / flat::LEVELS).min(planes::OFF)
+                } else {
+                    UNSHOWN
+                };
+                apart + if label == planes.len() { planes::REST } else { flat::LATER * label as f64 }
+            };
+            Some((0..all.len()).map(cost).collect())
+        };
+        (0..sites.len()).map(one).collect()
+    }
+
+    /// Continues the planes around a view's hole in it: what is unknown, and what is carried there and does not speak against
+    /// them, gets their inverse depth. Returns `[site]` the number of its plane, and the planes.
+    fn continued(
+        &self,
+        of: usize,
+        unknown: &[bool],
+        disparity: &mut [f32],
+        seed: u64,
+    ) -> (Vec<u8>, Vec<planes::Plane>) {
+        let own = &self.0[of];
+        let near = own.surroundings();
+        let mut surface = vec![0; own.hole.len()];
+        let window = Window::around(&own.grid, |site| near[site]).expect("a hole has surroundings");
+        let sites = window.sites();
+        let rays: Vec<Option<[f64; 2]>> = sites.iter().map(|site| Some(own.ray(*site))).collect();
+        // Between what is known and the hole lies what the object's depth has bled into.
+        let ring = |site: usize| !own.hole[site] && own.depth[site].is_nan();
+        let edge = |site: usize| own.hole[site] && own.around(site).any(|s| !own.hole[s]);
+        let outline: Vec<bool> = sites.iter().map(|site| ring(*site) || edge(*site)).collect();
+        let open: Vec<bool> = sites.iter().map(|site| unknown[*site] || ring(*site)).collect();
+        let known: Vec<f32> = sites.iter().map(|site| disparity[*site]).collect();
+        let size = window.size;
+        let planes =
+            if own.around.is_empty() { planes::around(&known, &rays, &open, seed) } else { own.around.clone() };
+        let supports = own.supports(&planes);
+        let under = |site: &usize| {
+            let depths = supports.iter().filter_map(|support| support.under(own.ray(*site)));
+            depths.reduce(f64::min).filter(|_| own.hole[*site])
+        };
+        let under: Vec<Option<f64>> = sites.iter().map(under).collect();
+        let against = |cell: usize, d: f64| {
+            let site = sites[cell];
+            let object = own.hole[site] && own.grid.confirmed[site];
+            if d.is_nan() || d <= 0.0 || object && 1.0 / d < (1.0 - APART) * own.grid.depth[site] {
+                return 1.0;
+            }
+            let hidden = under[cell].is_some_and(|z| 1.0 / d > (1.0 + SAME) * z);
+            self.against(of, own.point(site, 1.0 / d)).max(if hidden { BELOW } else { 0.0 })
+        };
+        let costs = self.evidence(of, &sites, size, disparity, &planes);
+        let hole = planes::Hole {
+            costs: &costs,
+            size,
+            disparity: &known,
+            rays: &rays,
+            unknown: &open,
+            outline: &outline,
+            against,
+        };
+        let found = planes::surfaces(&hole, planes);
+        surface.fill(found.planes.len() as u8);
+        // What is thin, before or behind a plane, is on none, though its surroundings are.
+        let better = |cell: usize| {
+            let label = usize::from(found.label[cell]);
+            costs[cell].as_ref().is_some_and(|costs| costs[label] > costs[costs.len() - 1] + BETTER)
+        };
+        for (cell, &site) in sites.iter().enumerate() {
+            surface[site] = found.label[cell];
+            // What was measured to lie on a plane lies on it: single depths are noisier than all of them.
+            let plane = found.planes.get(usize::from(found.label[cell])).filter(|_| own.hole[site]);
+            let flat = plane.map_or(f32::NAN, |plane| planes::on(plane, own.ray(site)) as f32);
+            if unknown[site] {
+                disparity[site] = found.disparity[cell];
+            } else if (flat / disparity[site] - 1.0).abs() <= FLAT || flat > 0.0 && !better(cell) {
+                disparity[site] = flat;
+            }
+        }
+        (surface, found.planes)
+    }
+
     /// Gives every site of a view's hole its depth. The same seed finds the same.
     pub fn solve(&mut self, of: usize, seed: u64) {
         let carried = self.carried(of);
@@ -518,49 +635,8 @@ impl Sights {
         let mut disparity: Vec<f32> = (0..own.hole.len()).map(|site| (1.0 / known(site)) as f32).collect();
         let (mut surface, mut found_planes) = (vec![0; own.hole.len()], vec![]);
         let rank = self.0.iter().filter(|sight| sight.solved).count();
-        if rank == 0 || unknown.iter().filter(|unknown| **unknown).count() > FEW {
-            let window = Window::around(&own.grid, |site| near[site]).expect("a hole has surroundings");
-            let sites = window.sites();
-            let rays: Vec<Option<[f64; 2]>> = sites.iter().map(|site| Some(own.ray(*site))).collect();
-            // Between what is known and the hole lies what the object's depth has bled into.
-            let ring = |site: usize| !own.hole[site] && own.depth[site].is_nan();
-            let edge = |site: usize| own.hole[site] && own.around(site).any(|s| !own.hole[s]);
-            let outline: Vec<bool> = sites.iter().map(|site| ring(*site) || edge(*site)).collect();
-            let open: Vec<bool> = sites.iter().map(|site| unknown[*site] || ring(*site)).collect();
-            let known: Vec<f32> = sites.iter().map(|site| disparity[*site]).collect();
-            let size = window.size;
-            let planes = planes::around(&known, &rays, &open, seed);
-            let supports = own.supports(&planes);
-            let under = |site: &usize| {
-                let depths = supports.iter().filter_map(|support| support.under(own.ray(*site)));
-                depths.reduce(f64::min).filter(|_| own.hole[*site])
-            };
-            let under: Vec<Option<f64>> = sites.iter().map(under).collect();
-            let against = |cell: usize, d: f64| {
-                let site = sites[cell];
-                let object = own.hole[site] && own.grid.confirmed[site];
-                if d.is_nan() || d <= 0.0 || object && 1.0 / d < (1.0 - APART) * own.grid.depth[site] {
-                    return 1.0;
-                }
-                let hidden = under[cell].is_some_and(|z| 1.0 / d > (1.0 + SAME) * z);
-                self.against(of, own.point(site, 1.0 / d)).max(if hidden { BELOW } else { 0.0 })
-            };
-            let hole =
-                planes::Hole { size, disparity: &known, rays: &rays, unknown: &open, outline: &outline, against };
-            let found = planes::surfaces(&hole, planes);
-            surface.fill(found.planes.len() as u8);
-            for (cell, &site) in sites.iter().enumerate() {
-                surface[site] = found.label[cell];
-                // What was measured to lie on a plane lies on it: single depths are noisier than all of them.
-                let plane = found.planes.get(usize::from(found.label[cell])).filter(|_| own.hole[site]);
-                let flat = plane.map_or(f32::NAN, |plane| planes::on(plane, own.ray(site)) as f32);
-                if unknown[site] {
-                    disparity[site] = found.disparity[cell];
-                } else if (flat / disparity[site] - 1.0).abs() <= FLAT {
-                    disparity[site] = flat;
-                }
-            }
-            found_planes = found.planes;
+        if rank == 0 || !own.around.is_empty() || unknown.iter().filter(|unknown| **unknown).count() > FEW {
+            (surface, found_planes) = self.continued(of, &unknown, &mut disparity, seed);
         }
         planes::membrane(&mut disparity, size, |site| own.hole[site]);
         let own = &mut self.0[of];

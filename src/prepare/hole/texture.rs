@@ -377,8 +377,7 @@ pub fn fill(texture: &mut Texture) -> bool {
         return false;
     }
     let labels = small.labels(&coarse);
-    let shifts: Vec<Shift> =
-        (0..coarse.len()).map(|label| refined(texture, &small, &labels, label, coarse[label], by)).collect();
+    let shifts = refined(texture, &small, &labels, &coarse, by);
     // Of each pixel the pixel that it copies.
     let [w, h] = texture.size;
     let copied: Vec<Option<usize>> = (0..w * h)
@@ -401,32 +400,61 @@ pub fn fill(texture: &mut Texture) -> bool {
     true
 }
 
-/// A shift of the reduced picture at full size: the nearest at which what is around its pixels is most like what it copies.
-fn refined(texture: &Texture, small: &Texture, labels: &[usize], label: usize, shift: Shift, by: usize) -> Shift {
-    let large = shift.map(|v| v * by as isize);
+/// The shifts of the reduced picture at full size: of each the nearest at which what is around its pixels is most like what it
+/// copies. That touching most of what is known comes first, and what it fills is known to the next, so that a line goes on from
+/// piece to piece.
+fn refined(texture: &Texture, small: &Texture, labels: &[usize], coarse: &[Shift], by: usize) -> Vec<Shift> {
+    let mut shifts: Vec<Shift> = coarse.iter().map(|shift| shift.map(|v| v * by as isize)).collect();
     if by == 1 {
-        return large;
+        return shifts;
     }
-    let [sw, _] = small.size;
-    // Known pixels beside the label's own: the seam to what is known, and what is not far from it.
+    let (mut known, mut filled) = (small.source.clone(), texture.clone());
+    let mut left: Vec<usize> = (0..coarse.len()).filter(|label| labels.contains(label)).collect();
+    while !left.is_empty() {
+        let beside = |label: usize| beside(small, labels, label, &known);
+        let all = left.iter().enumerate().map(|(at, label)| (at, beside(*label)));
+        let Some((at, cells)) = all.max_by_key(|(at, cells)| (cells.len(), std::cmp::Reverse(*at))) else { break };
+        let label = left.remove(at);
+        // The whole surroundings, where it touches nothing known.
+        let cells = if cells.is_empty() { (0..known.len()).filter(|cell| known[*cell]).collect() } else { cells };
+        shifts[label] = refine(&filled, small.size[0], &cells, shifts[label], by);
+        for cell in (0..labels.len()).filter(|cell| labels[*cell] == label) {
+            known[cell] = true;
+            let [x0, y0] = [cell % small.size[0] * by, cell / small.size[0] * by];
+            for (x, y) in (y0..(y0 + by).min(texture.size[1])).flat_map(|y| (x0..x0 + by).map(move |x| (x, y))) {
+                let i = y * texture.size[0] + x;
+                if let Some(from) = texture.source(i, shifts[label]).filter(|_| x < texture.size[0] && texture.hole[i])
+                {
+                    filled.rgb[i] = texture.rgb[from];
+                }
+            }
+        }
+    }
+    shifts
+}
+
+/// The known cells of the reduced picture around those of a label.
+fn beside(small: &Texture, labels: &[usize], label: usize, known: &[bool]) -> Vec<usize> {
+    const REACH: isize = 3;
     let mut beside: Vec<usize> = vec![];
-    let reach = 3isize;
     for at in (0..labels.len()).filter(|at| labels[*at] == label) {
-        for (dx, dy) in (-reach..=reach).flat_map(|dy| (-reach..=reach).map(move |dx| (dx, dy))) {
-            beside.extend(small.shifted(at, [dx, dy]).filter(|near| small.source[*near]));
+        for (dx, dy) in (-REACH..=REACH).flat_map(|dy| (-REACH..=REACH).map(move |dx| (dx, dy))) {
+            beside.extend(small.shifted(at, [dx, dy]).filter(|near| known[*near]));
         }
     }
     beside.sort_unstable();
     beside.dedup();
-    if beside.is_empty() {
-        // The whole surroundings, where it touches nothing known.
-        beside = (0..small.source.len()).filter(|at| small.source[*at]).collect();
-    }
-    let every = beside.len().div_ceil(1500).max(1);
-    let pixels: Vec<usize> = (beside.into_iter().step_by(every))
+    beside
+}
+
+/// The shift near another, at full size, under which these cells of the reduced picture are most like what they would be copied
+/// from.
+fn refine(texture: &Texture, columns: usize, cells: &[usize], large: Shift, by: usize) -> Shift {
+    let every = cells.len().div_ceil(1500).max(1);
+    let pixels: Vec<usize> = (cells.iter().step_by(every))
         .map(|at| {
-            (at / sw * by + by / 2).min(texture.size[1] - 1) * texture.size[0]
-                + (at % sw * by + by / 2).min(texture.size[0] - 1)
+            (at / columns * by + by / 2).min(texture.size[1] - 1) * texture.size[0]
+                + (at % columns * by + by / 2).min(texture.size[0] - 1)
         })
         .collect();
     let by = by as isize;

@@ -1,0 +1,380 @@
+//! What is bare lies on the planes around it.
+//!
+//! A bare floor matches everywhere, so that its measured depth is a guess, and what it continues is what happens to be beside
+//! it. Around a hole the planes are known well, from joints and edges. Where the photographs look as much alike on a plane as
+//! on the measured surface, the plane is taken: a surface must earn its being off the planes by what it looks like.
+
+use glam::{DMat3, DVec3};
+use rand::RngExt;
+use rand_pcg::Pcg64;
+use rayon::prelude::*;
+
+use super::surface::{SAME, Sight, Sights, Window};
+use crate::prepare::planes::{self, Plane, neighbours};
+use crate::scene::resample;
+use crate::statistics::quantile;
+
+/// Views that a view is compared with at most.
+const VIEWS: usize = 16;
+/// Largest angle between their axes, radians.
+const TURNED: f64 = 1.0;
+/// Share of the views, those that differ least, that count: in the others something else may stand before it.
+const ALIKE: f64 = 0.5;
+/// Fewest views that tell something: of two the one that differs less is no witness.
+const FEWEST: usize = 3;
+/// Difference of colours, 8-bit levels in the mean of the channels, that costs as much as a border of one site.
+pub const LEVELS: f64 = 2.0;
+/// Most that a site costs, in these.
+const MOST: f64 = 6.0;
+/// What a site costs beside the planes: as much as a level of difference.
+const BESIDE: f64 = 2.0;
+/// The same where other views confirm its depth and it does not lie on the plane.
+const CONFIRMED: f64 = 1.5;
+/// What it costs to be off the measured depth by [`SAME`], up to four times.
+const NEAR: f64 = 0.05;
+/// What each plane costs more than one with more points.
+pub const LATER: f64 = 0.3;
+/// Largest relative difference between the measured depth and the plane's.
+const FARTHEST: f64 = 0.25;
+/// Cost of a border per site of its length.
+const BORDER: f64 = 0.5;
+
+/// Points of each view that common planes are looked for among.
+const POINTS: usize = 300;
+/// Common planes that are looked for, and least part of the points that makes one.
+const PLANES: usize = 6;
+const LEAST: f64 = 0.06;
+/// Triples of points that are tried for each.
+const TRIES: usize = 1500;
+/// A point lies on a plane if it is off by at most this part of its camera's distance from the plane.
+const THICKNESS: f64 = 0.01;
+/// Part of a view's own plane's points that lie within twice [`planes::THICKNESS`] of a common one for it to be the same.
+const COMMON: f64 = 0.5;
+
+/// A plane `normal . x = offset` of world points.
+#[derive(Clone, Copy, Debug)]
+struct Common {
+    normal: DVec3,
+    offset: f64,
+}
+
+/// The planes around a view's hole, the sites that lie on one, and their depth there.
+#[derive(Default)]
+struct Flat {
+    planes: Vec<Plane>,
+    sites: Vec<(usize, f64)>,
+}
+
+/// A point that a camera at `eye` sees.
+#[derive(Clone, Copy)]
+struct Measured {
+    point: DVec3,
+    eye: DVec3,
+}
+
+impl Common {
+    /// How far the plane is from the point along the camera's ray, as a part of the distance: nearer is positive.
+    fn off(&self, at: &Measured) -> f64 {
+        (self.normal.dot(at.point) - self.offset) / (self.offset - self.normal.dot(at.eye))
+    }
+
+    fn through([a, b, c]: [DVec3; 3]) -> Option<Self> {
+        let normal = (b - a).cross(c - a).try_normalize()?;
+        Some(Self { normal, offset: normal.dot(a) })
+    }
+
+    /// The plane of least squares, relative to the distances.
+    fn fitted(self, points: &[Measured]) -> Self {
+        let origin = points[0].eye;
+        let (mut matrix, mut right) = (DMat3::ZERO, DVec3::ZERO);
+        for at in points {
+            let from = at.point - origin;
+            let row = from / (self.offset - self.normal.dot(at.eye));
+            matrix += DMat3::from_cols(row * row.x, row * row.y, row * row.z);
+            right += row / (self.offset - self.normal.dot(at.eye));
+        }
+        let p = matrix.inverse() * right;
+        let length = p.length();
+        if !p.is_finite() || length == 0.0 {
+            return self;
+        }
+        let normal = p / length;
+        Self { normal, offset: 1.0 / length + normal.dot(origin) }
+    }
+
+    /// As a view sees it; nothing where its camera stands in it.
+    fn seen_by(&self, sight: &Sight) -> Option<Plane> {
+        let camera = &sight.grid.camera;
+        let distance = self.offset - self.normal.dot(DVec3::from(camera.center()));
+        let turned = camera.rotation.map(|row| DVec3::from(row.map(f64::from)).dot(self.normal) / distance);
+        turned.iter().all(|v| v.is_finite()).then_some(turned)
+    }
+}
+
+impl Sights {
+    /// The largest planes of what all views together show around their holes.
+    fn common(&self, seed: u64) -> Vec<Common> {
+        let mut points: Vec<Measured> = (self.0.par_iter())
+            .flat_map_iter(|sight| {
+                let near = sight.surroundings();
+                let known = |site: &usize| near[*site] && sight.grid.confirmed[*site] && sight.depth[*site].is_finite();
+                let sites: Vec<usize> = (0..near.len()).filter(|site| sight.grid.trusted && known(site)).collect();
+                let every = sites.len().div_ceil(POINTS).max(1);
+                let eye = DVec3::from(sight.grid.camera.center());
+                let point = |site: usize| Measured { point: sight.point(site, sight.depth[site]), eye };
+                sites.into_iter().step_by(every).map(point).collect::<Vec<_>>()
+            })
+            .collect();
+        let mut rng = Pcg64::new(seed.into(), 43);
+        let least = (LEAST * points.len() as f64).ceil().max(12.0) as usize;
+        let mut found = vec![];
+        while found.len() < PLANES && points.len() >= least {
+            let tried: Vec<Common> = (0..TRIES)
+                .filter_map(|_| {
+                    // Two of one view, so that the three are near each other more often.
+                    Common::through(std::array::from_fn(|_| points[rng.random_range(0..points.len())].point))
+                })
+                .collect();
+            let count = |plane: &Common| points.iter().filter(|at| plane.off(at).abs() <= THICKNESS).count();
+            let Some((_, mut plane)) = (tried.par_iter().enumerate())
+                .map(|(i, plane)| ((count(plane), std::cmp::Reverse(i)), *plane))
+                .max_by_key(|(count, _)| *count)
+            else {
+                break;
+            };
+            for _ in 0..4 {
+                let inliers: Vec<Measured> =
+                    points.iter().filter(|at| plane.off(at).abs() <= THICKNESS).copied().collect();
+                if inliers.len() >= 3 {
+                    plane = plane.fitted(&inliers);
+                }
+            }
+            let on_it = points.iter().filter(|at| plane.off(at).abs() <= THICKNESS).count();
+            points.retain(|at| plane.off(at).abs() > 3.0 * THICKNESS);
+            if on_it < least {
+                break;
+            }
+            found.push(plane);
+        }
+        found
+    }
+
+    /// Brings what is bare around the holes of all views onto the planes there. The same seed finds the same.
+    pub fn flatten(&mut self, seed: u64) {
+        let common = self.common(seed);
+        let of = |view: usize| self.flat(view, &common, seed + view as u64);
+        let flat: Vec<Flat> = (0..self.0.len()).into_par_iter().map(of).collect();
+        for (sight, Flat { planes, sites }) in self.0.iter_mut().zip(flat) {
+            sight.around = planes;
+            sites.into_iter().for_each(|(site, depth)| sight.depth[site] = depth);
+        }
+    }
+
+    /// What lies on the planes around a view's hole: the common ones, and those of its own that are not among them.
+    fn flat(&self, of: usize, common: &[Common], seed: u64) -> Flat {
+        let own = &self.0[of];
+        let near = own.surroundings();
+        let Some(window) = Window::around(&own.grid, |site| near[site]) else { return Flat::default() };
+        let sites = window.sites();
+        let rays: Vec<Option<[f64; 2]>> = sites.iter().map(|site| Some(own.ray(*site))).collect();
+        let disparity: Vec<f32> = sites.iter().map(|site| (1.0 / own.depth[*site]) as f32).collect();
+        let hole: Vec<bool> = sites.iter().map(|site| own.hole[*site]).collect();
+        let mut planes: Vec<Plane> = common.iter().filter_map(|plane| plane.seen_by(own)).collect();
+        for plane in planes::around(&disparity, &rays, &hole, seed) {
+            let on = |plane: &Plane, cell: usize, part: f64| {
+                let d = f64::from(disparity[cell]);
+                !hole[cell] && (planes::on(plane, own.ray(sites[cell])) - d).abs() <= part * d
+            };
+            let its: Vec<usize> = (0..sites.len()).filter(|cell| on(&plane, *cell, planes::THICKNESS)).collect();
+            let again = |known: &&Plane| {
+                let also = its.iter().filter(|cell| on(known, **cell, 2.0 * planes::THICKNESS)).count();
+                also as f64 > COMMON * its.len() as f64
+            };
+            if planes.iter().find(again).is_none() {
+                planes.push(plane);
+            }
+        }
+        if planes.is_empty() || !own.grid.trusted {
+            return Flat { planes, sites: vec![] };
+        }
+        let others = self.beside(of);
+        let depth_on = |plane: &Plane, site: usize| 1.0 / planes::on(plane, own.ray(site));
+        let possible = |site: usize, z: f64| {
+            let measured = own.depth[site];
+            z > 0.0 && !(own.hole[site] || measured.is_finite() && (z / measured - 1.0).abs() > FARTHEST)
+        };
+        let unlike = |depth: &(dyn Fn(usize) -> f64 + Sync)| -> Vec<f64> {
+            let one = |site: &usize| Some(depth(*site)).filter(|z| possible(*site, *z));
+            let raw: Vec<f64> = (sites.par_iter())
+                .map(|site| one(site).and_then(|z| self.unlike(own, &others, *site, z)).unwrap_or(f64::NAN))
+                .collect();
+            (0..raw.len()).into_par_iter().map(|cell| around(&raw, cell, window.size)).collect()
+        };
+        let measured = unlike(&|site| own.depth[site]);
+        let on_planes: Vec<Vec<f64>> = planes.iter().map(|plane| unlike(&|site| depth_on(plane, site))).collect();
+        let cost = |levels: f64| if levels.is_nan() { MOST } else { (levels / LEVELS).min(MOST) };
+        let cost = |label: usize, cell: usize| -> f64 {
+            let site = sites[cell];
+            let Some(plane) = planes.get(label) else {
+                return if hole[cell] { 0.0 } else { BESIDE + cost(measured[cell]) };
+            };
+            let z = depth_on(plane, site);
+            let apart = (z / own.depth[site] - 1.0).abs() / SAME;
+            let off = match (apart.is_nan(), own.grid.confirmed[site] && apart > 1.0) {
+                (true, _) => 0.0,
+                (false, refuted) => NEAR * apart.min(4.0) + if refuted { CONFIRMED } else { 0.0 },
+            };
+            match (hole[cell], possible(site, z)) {
+                (true, _) => 0.0,
+                (false, false) => 10.0 * MOST,
+                (false, true) => cost(on_planes[label][cell]) + off + LATER * label as f64,
+            }
+        };
+        let costs: Vec<Vec<f64>> =
+            (0..=planes.len()).map(|label| (0..sites.len()).map(|cell| cost(label, cell)).collect()).collect();
+        let labels = planes::cheapest(&costs, |_, _| BORDER, window.size);
+        let on_plane = |cell: usize| {
+            let site = sites[cell];
+            let z = depth_on(planes.get(labels[cell])?, site);
+            (!hole[cell] && possible(site, z)).then_some((site, z))
+        };
+        Flat { sites: (0..sites.len()).filter_map(on_plane).collect(), planes }
+    }
+
+    /// The views that look nearly the same way as a view.
+    fn beside(&self, of: usize) -> Vec<usize> {
+        let axis = |view: usize| DVec3::from(self.0[view].grid.camera.rotation[2].map(f64::from));
+        let angle = |view: usize| axis(view).dot(axis(of)).clamp(-1.0, 1.0).acos();
+        let trusted = (0..self.0.len()).filter(|view| *view != of && self.0[*view].grid.trusted);
+        let found: Vec<usize> = trusted.filter(|view| angle(*view) <= TURNED).collect();
+        let every = found.len().div_ceil(VIEWS).max(1);
+        found.into_iter().step_by(every).collect()
+    }
+
+    /// `[cell]` by how many levels the views differ that show what sites of a view's hole have at these depths.
+    pub fn unlike_in_hole(&self, of: usize, sites: &[usize], depth: impl Fn(usize) -> f64 + Sync) -> Vec<f64> {
+        let own = &self.0[of];
+        let others = self.beside(of);
+        let one = |cell: usize| -> Option<f64> {
+            let z = Some(depth(cell)).filter(|z| own.hole[sites[cell]] && *z > 0.0)?;
+            let point = own.point(sites[cell], z);
+            let colors: Vec<[f64; 3]> = others.iter().filter_map(|view| self.0[*view].color(point)).collect();
+            let middle: [f64; 3] =
+                std::array::from_fn(|c| quantile(colors.iter().map(|color| color[c]), 0.5).unwrap_or(0.0));
+            most_alike(
+                colors.iter().map(|color| (0..3).map(|c| (color[c] - middle[c]).abs()).sum::<f64>() / 3.0).collect(),
+            )
+        };
+        (0..sites.len()).into_par_iter().map(|cell| one(cell).unwrap_or(f64::NAN)).collect()
+    }
+
+    /// By how many levels other views, those that show a site's point at this depth, differ from what the site shows.
+    fn unlike(&self, own: &Sight, others: &[usize], site: usize, z: f64) -> Option<f64> {
+        let point = own.point(site, z);
+        let color = own.grid.colors[site];
+        let apart: Vec<f64> = (others.iter())
+            .filter_map(|view| {
+                let shown = self.0[*view].color(point)?;
+                Some((0..3).map(|c| (shown[c] - f64::from(color[c])).abs()).sum::<f64>() / 3.0)
+            })
+            .collect();
+        most_alike(apart)
+    }
+}
+
+impl Sight {
+    /// The colour, 8-bit levels, that the photograph shows of a point; nothing where the object hides it, or what is known to
+    /// stand before it.
+    fn color(&self, point: DVec3) -> Option<[f64; 3]> {
+        let (at, place, z) = self.seen(point)?;
+        let hidden = self.grid.confirmed[at] && z > (1.0 + 2.0 * SAME) * self.grid.depth[at];
+        let size = [self.grid.columns, self.grid.rows];
+        let color = || resample::bilinear(size, place, |i| self.grid.colors[i].map(f64::from));
+        (!self.hole[at] && !hidden).then(color)
+    }
+}
+
+/// Mean of the differences that count; nothing where too few do.
+fn most_alike(mut apart: Vec<f64>) -> Option<f64> {
+    apart.sort_unstable_by(f64::total_cmp);
+    let enough = apart.len() >= FEWEST;
+    apart.truncate((ALIKE * apart.len() as f64).ceil() as usize);
+    enough.then(|| apart.iter().sum::<f64>() / apart.len() as f64)
+}
+
+/// Mean of a cell's value and its neighbours', of those that have one; NaN where the cell has none.
+pub fn around(values: &[f64], cell: usize, size: [usize; 2]) -> f64 {
+    if values[cell].is_nan() {
+        return f64::NAN;
+    }
+    let near = neighbours(cell, size).chain([cell]).map(|cell| values[cell]).filter(|v| v.is_finite());
+    let (sum, count) = near.fold((0.0, 0.0), |(sum, n), v| (sum + v, n + 1.0));
+    sum / count
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::surface::tests::{SIZE, views};
+    use super::*;
+
+    /// Five views of a wall at z = 4 with a patch at the left of it, in world x from -2 to -1, that is 3.6 deep by the measured
+    /// depth; the colours of the wall's points, and of the patch's where they are at 3.6.
+    fn patched(color: impl Fn(f64, f64) -> u8, confirmed: bool) -> (Sights, Vec<Vec<usize>>) {
+        let (mut grids, cameras, masks) = views(0.2);
+        let mut patches = vec![];
+        for (grid, camera) in grids.iter_mut().zip(&cameras) {
+            let pixels = 0..(SIZE[0] * SIZE[1]) as usize;
+            let at = |pixel: usize, z: f64| camera.lift(camera.pixel_center(pixel), z).expect("a ray");
+            let patch: Vec<usize> = pixels
+                .clone()
+                .filter(|i| (-2.0..-1.0).contains(&at(*i, 3.6)[0]) && at(*i, 3.6)[1].abs() < 0.7)
+                .collect();
+            for i in pixels {
+                let z = if patch.contains(&i) { 3.6 } else { grid.depth[i] };
+                let [x, y, _] = at(i, z);
+                (grid.depth[i], grid.colors[i]) = (z, [color(x, y); 3]);
+                grid.confirmed[i] &= confirmed || z != 3.6;
+            }
+            patches.push(patch);
+        }
+        (Sights::new(grids, &cameras, &masks, &masks), patches)
+    }
+
+    /// Where a wall is bare its depth is a guess, and it lies on the plane of what is known of it.
+    #[test]
+    fn what_is_bare_lies_on_its_plane() {
+        let (mut sights, patches) = patched(|_, _| 90, false);
+        sights.flatten(1);
+        for (sight, patch) in sights.0.iter().zip(&patches) {
+            let near = sight.surroundings();
+            let patch: Vec<usize> = patch.iter().copied().filter(|site| near[*site]).collect();
+            assert!(patch.len() > 30, "{}", patch.len());
+            let flat = patch.iter().filter(|site| (sight.depth[**site] / 4.0 - 1.0).abs() < 0.005).count();
+            assert!(flat * 10 > patch.len() * 9, "{flat} of {}", patch.len());
+        }
+    }
+
+    /// What the photographs show before the plane stays there.
+    #[test]
+    fn what_looks_alike_off_the_plane_stays() {
+        let pattern = |x: f64, y: f64| (120.0 + 60.0 * (9.0 * x).sin() + 50.0 * (8.0 * y).cos()) as u8;
+        for confirmed in [false, true] {
+            let (mut sights, patches) = patched(pattern, confirmed);
+            sights.flatten(1);
+            for (sight, patch) in sights.0.iter().zip(&patches) {
+                let kept = patch.iter().filter(|site| (sight.depth[**site] / 3.6 - 1.0).abs() < 0.005).count();
+                assert!(kept * 10 > patch.len() * 8, "{kept} of {}", patch.len());
+            }
+        }
+    }
+
+    /// A plane through points of several cameras, some of them off it, is that of most.
+    #[test]
+    fn the_common_plane_is_that_of_most_points() {
+        let (sights, _) = patched(|_, _| 90, true);
+        let plane = sights.common(1)[0];
+        let normal = plane.normal * plane.normal.z.signum();
+        assert!(normal.distance(DVec3::Z) < 1e-3, "{normal}");
+        assert!((plane.offset.abs() - 4.0).abs() < 1e-3, "{}", plane.offset);
+    }
+}
