@@ -4,7 +4,7 @@
 //! it. Around a hole the planes are known well, from joints and edges. Where the photographs look as much alike on a plane as
 //! on the measured surface, the plane is taken: a surface must earn its being off the planes by what it looks like.
 
-use glam::{DMat3, DVec3};
+use glam::{DMat3, DVec2, DVec3};
 use rand::RngExt;
 use rand_pcg::Pcg64;
 use rayon::prelude::*;
@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use super::surface::{SAME, Sight, Sights, Window};
 use crate::prepare::planes::{self, Plane, neighbours};
 use crate::scene::resample;
-use crate::statistics::quantile;
+use crate::statistics::{median, quantile};
 
 /// Views that a view is compared with at most.
 const VIEWS: usize = 16;
@@ -36,6 +36,9 @@ const NEAR: f64 = 0.05;
 pub const LATER: f64 = 0.3;
 /// Largest relative difference between the measured depth and the plane's.
 const FARTHEST: f64 = 0.25;
+/// Sites by which the depths of two planes, `APART` of them, must be apart in other views for these to tell which it is.
+const PARALLAX: f64 = 1.0;
+const APART: f64 = 0.05;
 /// Cost of a border per site of its length.
 const BORDER: f64 = 0.5;
 
@@ -161,8 +164,13 @@ impl Sights {
 
     /// Brings what is bare around the holes of all views onto the planes there. The same seed finds the same.
     pub fn flatten(&mut self, seed: u64) {
+        self.flatten_from(PARALLAX, seed);
+    }
+
+    /// The same for views with at least this parallax.
+    fn flatten_from(&mut self, parallax: f64, seed: u64) {
         let common = self.common(seed);
-        let of = |view: usize| self.flat(view, &common, seed + view as u64);
+        let of = |view: usize| self.flat(view, &common, parallax, seed + view as u64);
         let flat: Vec<Flat> = (0..self.0.len()).into_par_iter().map(of).collect();
         for (sight, Flat { planes, sites }) in self.0.iter_mut().zip(flat) {
             sight.around = planes;
@@ -171,7 +179,7 @@ impl Sights {
     }
 
     /// What lies on the planes around a view's hole: the common ones, and those of its own that are not among them.
-    fn flat(&self, of: usize, common: &[Common], seed: u64) -> Flat {
+    fn flat(&self, of: usize, common: &[Common], parallax: f64, seed: u64) -> Flat {
         let own = &self.0[of];
         let near = own.surroundings();
         let Some(window) = Window::around(&own.grid, |site| near[site]) else { return Flat::default() };
@@ -198,6 +206,9 @@ impl Sights {
             return Flat { planes, sites: vec![] };
         }
         let others = self.beside(of);
+        if self.parallax(own, &others, &sites).is_none_or(|sites| sites < parallax) {
+            return Flat::default();
+        }
         let depth_on = |plane: &Plane, site: usize| 1.0 / planes::on(plane, own.ray(site));
         let possible = |site: usize, z: f64| {
             let measured = own.depth[site];
@@ -239,6 +250,23 @@ impl Sights {
             (!hole[cell] && possible(site, z)).then_some((site, z))
         };
         Flat { sites: (0..sites.len()).filter_map(on_plane).collect(), planes }
+    }
+
+    /// By how many sites what a view shows moves in other views, a quarter of which shows more, where it is farther by `APART`:
+    /// the median over the view's sites.
+    fn parallax(&self, own: &Sight, others: &[usize], sites: &[usize]) -> Option<f64> {
+        let of = |site: &usize| -> Option<f64> {
+            let z = Some(own.depth[*site]).filter(|z| z.is_finite())?;
+            let moves = |view: &usize| {
+                let place = |z: f64| self.0[*view].seen(own.point(*site, z)).map(|(_, [x, y], _)| DVec2::new(x, y));
+                Some(place(z)?.distance(place((1.0 + APART) * z)?))
+            };
+            quantile(others.iter().filter_map(moves), 0.75)
+        };
+        let every = sites.len().div_ceil(POINTS).max(1);
+        let found = median(sites.iter().step_by(every).filter_map(of));
+        log::debug!("flat: parallax {found:.2?}");
+        found
     }
 
     /// The views that look nearly the same way as a view.
@@ -344,7 +372,7 @@ mod tests {
     #[test]
     fn what_is_bare_lies_on_its_plane() {
         let (mut sights, patches) = patched(|_, _| 90, false);
-        sights.flatten(1);
+        sights.flatten_from(0.1, 1);
         for (sight, patch) in sights.0.iter().zip(&patches) {
             let near = sight.surroundings();
             let patch: Vec<usize> = patch.iter().copied().filter(|site| near[*site]).collect();
@@ -354,13 +382,23 @@ mod tests {
         }
     }
 
+    /// Views that are too near each other to tell two planes apart by their colours tell nothing.
+    #[test]
+    fn where_views_are_too_near_nothing_is_moved() {
+        let (mut sights, patches) = patched(|_, _| 90, false);
+        sights.flatten(1);
+        for (sight, patch) in sights.0.iter().zip(&patches) {
+            assert!(sight.around.is_empty() && patch.iter().all(|site| sight.depth[*site] == 3.6));
+        }
+    }
+
     /// What the photographs show before the plane stays there.
     #[test]
     fn what_looks_alike_off_the_plane_stays() {
         let pattern = |x: f64, y: f64| (120.0 + 60.0 * (9.0 * x).sin() + 50.0 * (8.0 * y).cos()) as u8;
         for confirmed in [false, true] {
             let (mut sights, patches) = patched(pattern, confirmed);
-            sights.flatten(1);
+            sights.flatten_from(0.1, 1);
             for (sight, patch) in sights.0.iter().zip(&patches) {
                 let kept = patch.iter().filter(|site| (sight.depth[**site] / 3.6 - 1.0).abs() < 0.005).count();
                 assert!(kept * 10 > patch.len() * 8, "{kept} of {}", patch.len());

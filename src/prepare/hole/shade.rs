@@ -31,7 +31,7 @@ const FEWEST_SITES: usize = 8;
 /// The dark part of a shade covers at least this part of the foot's area, and all of it at most so much: what is larger is a
 /// pattern of the surface, or something else's shadow.
 const LEAST: f64 = 0.05;
-const MOST: f64 = 2.0;
+const MOST: f64 = 3.5;
 /// Views that are asked for the colours of the plane.
 const VIEWS: usize = 12;
 

@@ -56,7 +56,8 @@ pub struct Sight {
     pub surface: Vec<u8>,
     /// Planes around the hole: inverse depth by x/z, y/z and 1.
     pub planes: Vec<planes::Plane>,
-    /// Planes around the hole that were found before it is solved.
+    /// Planes around the hole that were found before it is solved; none where the views are too near each
+    /// other to tell.
     pub(super) around: Vec<planes::Plane>,
     /// Whether every site has its depth.
     pub solved: bool,
@@ -589,7 +590,8 @@ impl Sights {
             let hidden = under[cell].is_some_and(|z| 1.0 / d > (1.0 + SAME) * z);
             self.against(of, own.point(site, 1.0 / d)).max(if hidden { BELOW } else { 0.0 })
         };
-        let costs = self.evidence(of, &sites, size, disparity, &planes);
+        let told = !own.around.is_empty();
+        let costs = if told { self.evidence(of, &sites, size, disparity, &planes) } else { vec![None; sites.len()] };
         let hole = planes::Hole {
             costs: &costs,
             size,
@@ -613,7 +615,7 @@ impl Sights {
             let flat = plane.map_or(f32::NAN, |plane| planes::on(plane, own.ray(site)) as f32);
             if unknown[site] {
                 disparity[site] = found.disparity[cell];
-            } else if (flat / disparity[site] - 1.0).abs() <= FLAT || flat > 0.0 && !better(cell) {
+            } else if (flat / disparity[site] - 1.0).abs() <= FLAT || told && flat > 0.0 && !better(cell) {
                 disparity[site] = flat;
             }
         }
