@@ -157,7 +157,7 @@ mod tests {
     use crate::render::Config as Render;
     use crate::scene::Camera;
 
-    /// What two halves leave of the light along the axis, x from the middle in deviations of the whole and y across it.
+    /// Share of the light that two halves take along the axis, x from the middle in deviations of the whole and y across it.
     fn taken(each: f64, x: f64, y: f64) -> f64 {
         let of = |side: f64| each * (-0.5 * (((x - side) / DEVIATION).powi(2) + y * y)).exp();
         1.0 - (1.0 - of(SHIFT)) * (1.0 - of(-SHIFT))

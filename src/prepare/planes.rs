@@ -51,7 +51,7 @@ pub struct Hole<'a, F> {
     /// `[pixel]` whether it is to be filled; its inverse depth is not looked at.
     pub unknown: &'a [bool],
     /// `[pixel]` what each plane costs there, and at last to be off all of them, where more is known of that than the inverse
-    /// depth.
+    /// depth. Empty where nothing is.
     pub costs: &'a [Option<Vec<f64>>],
     /// `[pixel]` whether it lies along the object's outline.
     pub outline: &'a [bool],
@@ -148,7 +148,7 @@ fn labels<F: Fn(usize, f64) -> f64>(hole: &Hole<'_, F>, planes: &[Plane]) -> Vec
     let cost = |node: usize, label: usize| -> f64 {
         let i = middle(node);
         let Some(ray) = hole.rays[i] else { return 0.0 };
-        if let Some(costs) = &hole.costs[i] {
+        if let Some(Some(costs)) = hole.costs.get(i) {
             return costs[label];
         }
         let d = f64::from(hole.disparity[i]);
@@ -398,7 +398,7 @@ mod tests {
             disparity: &seen,
             rays: &rays,
             unknown: &unknown,
-            costs: &vec![None; SIZE[0] * SIZE[1]],
+            costs: &[],
             outline: &outline,
             against: |_, _| 0.0,
         };
@@ -428,7 +428,7 @@ mod tests {
             disparity: &truth,
             rays: &rays,
             unknown: &unknown,
-            costs: &vec![None; SIZE[0] * SIZE[1]],
+            costs: &[],
             outline: &outline,
             against,
         };
@@ -455,7 +455,7 @@ mod tests {
             disparity: &truth,
             rays: &rays,
             unknown: &unknown,
-            costs: &vec![None; SIZE[0] * SIZE[1]],
+            costs: &[],
             outline: &outline,
             against: |_, _| 0.0,
         };
@@ -475,7 +475,7 @@ mod tests {
             disparity: &nothing,
             rays: &rays,
             unknown: &unknown,
-            costs: &vec![None; SIZE[0] * SIZE[1]],
+            costs: &[],
             outline: &outline,
             against: |_, _| 0.0,
         };

@@ -1,4 +1,4 @@
-//! What is bare lies on the planes around it.
+//! Bare surfaces lie on the planes around them.
 //!
 //! A bare floor matches everywhere, so that its measured depth is a guess, and what it continues is what happens to be beside
 //! it. Around a hole the planes are known well, from joints and edges. Where the photographs look as much alike on a plane as
@@ -26,13 +26,13 @@ const FEWEST: usize = 3;
 pub const LEVELS: f64 = 2.0;
 /// Most that a site costs, in these.
 const MOST: f64 = 6.0;
-/// What a site costs beside the planes: as much as a level of difference.
+/// Cost of a site beside the planes, in these.
 const BESIDE: f64 = 2.0;
-/// The same where other views confirm its depth and it does not lie on the plane.
+/// Cost of a plane where other views confirm a depth that does not lie on it.
 const CONFIRMED: f64 = 1.5;
-/// What it costs to be off the measured depth by [`SAME`], up to four times.
+/// Cost of a plane for each [`SAME`] that it is off the measured depth, up to four times.
 const NEAR: f64 = 0.05;
-/// What each plane costs more than one with more points.
+/// Cost of each plane above the one before it, which has more points.
 pub const LATER: f64 = 0.3;
 /// Largest relative difference between the measured depth and the plane's.
 const FARTHEST: f64 = 0.25;
@@ -178,36 +178,22 @@ impl Sights {
         }
     }
 
-    /// What lies on the planes around a view's hole: the common ones, and those of its own that are not among them.
+    /// Planes around a view's hole, and the sites on them; nothing where the view's neighbours are too near to tell.
     fn flat(&self, of: usize, common: &[Common], parallax: f64, seed: u64) -> Flat {
         let own = &self.0[of];
         let near = own.surroundings();
         let Some(window) = Window::around(&own.grid, |site| near[site]) else { return Flat::default() };
         let sites = window.sites();
-        let rays: Vec<Option<[f64; 2]>> = sites.iter().map(|site| Some(own.ray(*site))).collect();
-        let disparity: Vec<f32> = sites.iter().map(|site| (1.0 / own.depth[*site]) as f32).collect();
-        let hole: Vec<bool> = sites.iter().map(|site| own.hole[*site]).collect();
-        let mut planes: Vec<Plane> = common.iter().filter_map(|plane| plane.seen_by(own)).collect();
-        for plane in planes::around(&disparity, &rays, &hole, seed) {
-            let on = |plane: &Plane, cell: usize, part: f64| {
-                let d = f64::from(disparity[cell]);
-                !hole[cell] && (planes::on(plane, own.ray(sites[cell])) - d).abs() <= part * d
-            };
-            let its: Vec<usize> = (0..sites.len()).filter(|cell| on(&plane, *cell, planes::THICKNESS)).collect();
-            let again = |known: &&Plane| {
-                let also = its.iter().filter(|cell| on(known, **cell, 2.0 * planes::THICKNESS)).count();
-                also as f64 > COMMON * its.len() as f64
-            };
-            if planes.iter().find(again).is_none() {
-                planes.push(plane);
-            }
-        }
-        if planes.is_empty() || !own.grid.trusted {
-            return Flat { planes, sites: vec![] };
-        }
         let others = self.beside(of);
         if self.parallax(own, &others, &sites).is_none_or(|sites| sites < parallax) {
             return Flat::default();
+        }
+        let rays: Vec<Option<[f64; 2]>> = sites.iter().map(|site| Some(own.ray(*site))).collect();
+        let disparity: Vec<f32> = sites.iter().map(|site| (1.0 / own.depth[*site]) as f32).collect();
+        let hole: Vec<bool> = sites.iter().map(|site| own.hole[*site]).collect();
+        let planes = own.planes_among(common, &sites, planes::around(&disparity, &rays, &hole, seed));
+        if planes.is_empty() || !own.grid.trusted {
+            return Flat { planes, sites: vec![] };
         }
         let depth_on = |plane: &Plane, site: usize| 1.0 / planes::on(plane, own.ray(site));
         let possible = |site: usize, z: f64| {
@@ -311,6 +297,25 @@ impl Sights {
 }
 
 impl Sight {
+    /// The common planes as the view sees them, and those of its own that are not among them.
+    fn planes_among(&self, common: &[Common], sites: &[usize], its_own: Vec<Plane>) -> Vec<Plane> {
+        let mut planes: Vec<Plane> = common.iter().filter_map(|plane| plane.seen_by(self)).collect();
+        for plane in its_own {
+            let on = |plane: &Plane, site: usize, part: f64| {
+                !self.hole[site] && (planes::on(plane, self.ray(site)) * self.depth[site] - 1.0).abs() <= part
+            };
+            let its: Vec<usize> = sites.iter().copied().filter(|site| on(&plane, *site, planes::THICKNESS)).collect();
+            let again = |known: &Plane| {
+                let also = its.iter().filter(|site| on(known, **site, 2.0 * planes::THICKNESS)).count();
+                also as f64 > COMMON * its.len() as f64
+            };
+            if !planes.iter().any(again) {
+                planes.push(plane);
+            }
+        }
+        planes
+    }
+
     /// The colour, 8-bit levels, that the photograph shows of a point; nothing where the object hides it, or what is known to
     /// stand before it.
     fn color(&self, point: DVec3) -> Option<[f64; 3]> {

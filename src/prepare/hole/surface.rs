@@ -591,7 +591,7 @@ impl Sights {
             self.against(of, own.point(site, 1.0 / d)).max(if hidden { BELOW } else { 0.0 })
         };
         let told = !own.around.is_empty();
-        let costs = if told { self.evidence(of, &sites, size, disparity, &planes) } else { vec![None; sites.len()] };
+        let costs = if told { self.evidence(of, &sites, size, disparity, &planes) } else { vec![] };
         let hole = planes::Hole {
             costs: &costs,
             size,
@@ -606,7 +606,8 @@ impl Sights {
         // What is thin, before or behind a plane, is on none, though its surroundings are.
         let better = |cell: usize| {
             let label = usize::from(found.label[cell]);
-            costs[cell].as_ref().is_some_and(|costs| costs[label] > costs[costs.len() - 1] + BETTER)
+            let costs = costs.get(cell).and_then(Option::as_ref);
+            costs.is_some_and(|costs| costs[label] > costs[costs.len() - 1] + BETTER)
         };
         for (cell, &site) in sites.iter().enumerate() {
             surface[site] = found.label[cell];
