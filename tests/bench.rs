@@ -159,51 +159,6 @@ fn a_step_is_measured_and_compared() {
     assert!(error.starts_with("error: scene/sparse/0/cameras.txt: "), "{error}");
 }
 
-#[test]
-#[ignore = "long; .ci/run has it"]
-fn loads_are_generated_and_what_does_not_fit_is_named() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    let folder = folder.path();
-    let stdout = succeeds(folder, "--loads --seconds 0.001 --repetitions 1 --validate --out loads");
-    let loads = &json(&folder.join("loads/bench.json"))["loads"];
-    let (runs, left) = (loads["runs"].as_array().expect("runs"), loads["left_out"].as_array().expect("a list"));
-    // Seven of anchors, five of pairs, seven of pixels; the first is begun whatever it takes.
-    assert_eq!((runs.len() + left.len(), runs.len()), (19, 1));
-    assert!(left.iter().all(|l| l["why"] == "nothing is left of the 0.001 s"), "{left:?}");
-    assert_eq!((number(&runs[0]["step"]["counts"]["anchors"]), &runs[0]["sweep"]), (1000.0, &Value::from("anchors")));
-    assert!(
-        stdout.contains("left out, pairs varied: 40000 anchors, 3e7 pairs, 1280 x 720: nothing is left"),
-        "{stdout}"
-    );
-    let memory = loads["memory"].as_object().expect("memory");
-    assert!(memory.len() == 4 && memory.values().all(|bytes| number(bytes) > 10.0), "{memory:?}");
-    for name in ["loads.csv", "loads.svg", "exponents.csv"] {
-        assert!(folder.join("loads").join(name).exists(), "{name}");
-    }
-    let error = fails(folder, "synthetic --against loads/bench.json");
-    assert!(error.contains("was measured on generated loads, this run is on synthetic (160 x 120, "), "{error}");
-}
-
-#[test]
-#[ignore = "long; .ci/run has it"]
-fn shapes_are_tuned() {
-    let scene = common::folder();
-    let folder = scene.path();
-    let stdout = succeeds(folder, "scene --tune --warm-up 1 --views 1 --repetitions 1 --out tuned");
-    let record = json(&folder.join("tuned/bench.json"));
-    let choices = record["tune"].as_array().expect("choices");
-    for choice in choices {
-        let (name, best) = (choice["choice"].as_str().expect("a name"), choice["best"].as_str().expect("an option"));
-        let options = choice["options"].as_array().expect("options");
-        assert!(options.iter().any(|o| o["option"] == best), "{choice}");
-        assert_eq!(options.iter().filter(|o| o["shipped"] == true && number(&o["ratio"]["median"]) == 1.0).count(), 1);
-        assert!(stdout.contains(&format!("\"{name}\", \"{best}\"), // ")), "{stdout}");
-    }
-    assert!(
-        choices.iter().any(|c| c["choice"] == "sort") && choices.iter().any(|c| c["choice"] == "attention kernels")
-    );
-}
-
 /// Runs the program in `folder`; whether it went well, what it printed, and what it said of an error.
 fn program(folder: &Path, arguments: &str) -> (bool, String, String) {
     let mut command = cargo_bin_cmd!("gscream-vk");

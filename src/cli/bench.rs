@@ -13,7 +13,7 @@ use crate::config::SettingsArgs;
 use crate::gpu::Options;
 use crate::lab::bench::ceilings::Prober;
 use crate::lab::bench::compare::{self, Subject};
-use crate::lab::bench::{self, Device, Record, Trained, figures, loads, predict, tables, text};
+use crate::lab::bench::{self, Device, Record, Trained, figures, predict, tables, text};
 use crate::lab::plots;
 use crate::lab::report::SceneFacts;
 use crate::lab::report::tables::write;
@@ -26,10 +26,6 @@ use crate::work::{Loaded, Ready};
 /// pass by pass, beside what it has to do by the numbers read back from it: bytes, operations, exponentials. In the same
 /// rounds the device's copy bandwidth, multiply-adds, exponentials, dispatches and barriers are measured. A ratio of 1 is
 /// the floor.
-///
-/// With --loads generated scenes of 1e3 to 1e6 anchors, 160 x 90 to 3840 x 2160 pixels and up to 3e7 pairs are measured
-/// instead, and how every pass grows with them. With --tune the choices of tile and group shapes are run in turn, on
-/// the scene or on a generated load, and the best printed as a table for the source.
 ///
 /// With --predict what the step has to do is set against the published peaks of GPUs that are not at hand: the time of
 /// every pass, of the step and of train.iterations steps like it, on paper. --form gpu measures the kernels that a GPU
@@ -44,27 +40,16 @@ use crate::work::{Loaded, Ready};
   gscream-vk bench synthetic --preset demo
   gscream-vk bench garden --preset lavapipe --warm-up 200 --repetitions 15 --out before
   gscream-vk bench garden --preset lavapipe --warm-up 200 --repetitions 15 --against before/bench.json
-  gscream-vk bench --loads --seconds 600 --preset lavapipe --out loads
-  gscream-vk bench --tune --preset lavapipe
   gscream-vk bench garden --preset paper --form gpu --warm-up 20 --repetitions 1 --predict published
   gscream-vk bench --hole set/* --seeds 3 --iterations 800 --out before")]
 pub(super) struct Args {
     /// Folder of the scene, or the word `synthetic` for the built-in one
-    #[arg(value_name = "SCENE", required_unless_present_any = ["loads", "tune", "hole"])]
+    #[arg(value_name = "SCENE", required_unless_present = "hole")]
     scene: Option<PathBuf>,
     #[command(flatten)]
     settings: SettingsArgs,
-    /// Measure generated scenes of growing size
-    #[arg(long, conflicts_with_all = ["scene", "tune"])]
-    loads: bool,
-    /// Seconds that they may take; what does not fit is named
-    #[arg(long, value_name = "S", default_value_t = 120.0, requires = "loads", value_parser = seconds)]
-    seconds: f64,
-    /// Run the choices of tile and group shapes
-    #[arg(long)]
-    tune: bool,
     /// TOML file with the peaks of GPUs to predict the step for, or the word `published` for the list that comes along
-    #[arg(long, value_name = "PEAKS", conflicts_with_all = ["loads", "tune"])]
+    #[arg(long, value_name = "PEAKS")]
     predict: Option<PathBuf>,
     /// Folder for bench.json and the tables; must not hold a record already
     #[arg(long, value_name = "DIR")]
@@ -99,79 +84,43 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let peaks = args.predict.as_deref().map(predict::read).transpose()?.unwrap_or_default();
     let settings = args.settings.resolve()?;
     only_anchors(&settings, "bench")?;
-    let loaded = args
-        .scene
-        .clone()
-        .map(|scene| {
-            let args = SceneArgs { scene, settings: args.settings.clone() };
-            let loaded = Loaded::read(&args.scene, settings.clone())?;
-            let facts = SceneFacts::new(last_part(&args.name()), &loaded.scene);
-            Ok::<_, anyhow::Error>((loaded, facts))
-        })
-        .transpose()?;
-    let (loaded, facts) = loaded.map_or((None, None), |(loaded, facts)| (Some(loaded), Some(facts)));
+    let Some(scene) = args.scene.clone() else { bail!("SCENE: name the scene to measure a step of") };
+    let args_of_scene = SceneArgs { scene, settings: args.settings.clone() };
+    let loaded = Loaded::read(&args_of_scene.scene, settings.clone())?;
+    let facts = SceneFacts::new(last_part(&args_of_scene.name()), &loaded.scene);
     let json = serde_json::to_value(&settings).context("the settings as JSON")?;
     let MeasureArgs { warm_up, step, views, repetitions } = args.measure;
     let (views, repetitions) = (views as usize, repetitions as usize);
-    let number = |Loaded { scene, .. }: &Loaded| {
-        step.unwrap_or_else(|| bench::usual_step(&Plan::new(scene, &settings), &settings, warm_up))
-    };
-    let step = loaded.as_ref().map(number);
+    let number = || bench::usual_step(&Plan::new(&loaded.scene, &settings), &settings, warm_up);
+    let step = step.unwrap_or_else(number);
     let mut say = |line: &str| eprintln!("{line}");
     let options = Options { timestamps: true, ..args.device.options() };
     let (record, notes) = with_gpu(&options, |gpu| {
         bench::ensure_timestamps(gpu)?;
         let device = Device::from(gpu.info());
-        let subject = Subject { device: &device, scene: facts.as_ref(), settings: &json, warm_up, step };
+        let subject = Subject { device: &device, scene: &facts, settings: &json, warm_up, step };
         let notes = old
             .as_ref()
             .map(|(path, old)| compare::ensure_comparable(path, old, subject))
             .transpose()?
             .unwrap_or_default();
-        let (scene, settings) = match loaded {
-            Some(loaded) => loaded.ready(gpu).map(|Ready { scene, settings }| (Some(scene), settings))?,
-            None => (None, settings),
-        };
+        let Ready { scene, settings } = loaded.ready(gpu)?;
         say("bench: ceilings of the device");
         let mut prober = Prober::new(gpu)?;
-        if scene.is_none() {
-            (0..repetitions).try_for_each(|_| prober.round())?;
-        }
-        let trained = scene
-            .as_ref()
-            .zip(step)
-            .map(|(scene, step)| Trained::new(gpu, scene, &settings, warm_up, (step, views), &mut say))
-            .transpose()?;
-        let figures = match &trained {
-            Some(trained) => Some(trained.measure(gpu, &settings, &mut prober, repetitions, &mut say)?),
-            None => None,
-        };
+        let trained = Trained::new(gpu, &scene, &settings, warm_up, (step, views), &mut say)?;
+        let figures = trained.measure(gpu, &settings, &mut prober, repetitions, &mut say)?;
         let ceilings = prober.ceilings();
-        // The loads need the room.
-        drop(prober);
-        let loads = match args.loads {
-            true => Some(loads::measure(gpu, &settings, &ceilings, (repetitions, args.seconds), &mut say)?),
-            false => None,
-        };
-        let tune = match args.tune {
-            true => Some(bench::tune(gpu, trained.as_ref(), &settings, repetitions, &mut say)?),
-            false => None,
-        };
         let steps = settings.train.iterations;
-        let predictions = figures
-            .as_ref()
-            .map_or_else(Vec::new, |step| peaks.iter().map(|peak| predict::predict(step, steps, peak)).collect());
+        let predictions = peaks.iter().map(|peak| predict::predict(&figures, steps, peak)).collect();
         let record = Record {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             command: command_line(),
             device,
             settings: json.clone(),
-            scene: facts.clone(),
+            scene: facts,
             warm_up,
             ceilings,
             step: figures,
-            loads,
-            tune,
             predictions,
         };
         Ok((record, notes))
@@ -191,25 +140,14 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn seconds(text: &str) -> Result<f64, String> {
-    let seconds: f64 = text.parse().map_err(|_| "not a number of seconds".to_owned())?;
-    if seconds.is_finite() && seconds >= 0.0 { Ok(seconds) } else { Err("must be 0 or more".to_owned()) }
-}
-
 fn write_files(record: &Record, out: &Path) -> anyhow::Result<Vec<&'static str>> {
     std::fs::create_dir_all(out).with_context(|| format!("{}: cannot be made", out.display()))?;
-    let mut files: Vec<(&'static str, Vec<u8>)> = vec![];
-    if let Some(step) = &record.step {
-        files.push(("passes.csv", tables::passes(step)));
-        files.push(("passes.svg", plots::draw(&figures::passes(step))?.into_bytes()));
-    }
-    if let Some(loads) = record.loads.as_ref().filter(|loads| !loads.runs.is_empty()) {
-        files.push(("loads.csv", tables::loads(loads)));
-        files.push(("exponents.csv", tables::exponents(loads)));
-        files.push(("loads.svg", plots::draw(&figures::loads(loads))?.into_bytes()));
-    }
-    // Last: its presence says that the record is complete.
-    files.push((JSON, record.to_json().into_bytes()));
+    let files: Vec<(&'static str, Vec<u8>)> = vec![
+        ("passes.csv", tables::passes(&record.step)),
+        ("passes.svg", plots::draw(&figures::passes(&record.step))?.into_bytes()),
+        // Last: its presence says that the record is complete.
+        (JSON, record.to_json().into_bytes()),
+    ];
     for (name, contents) in &files {
         write(&out.join(name), contents)?;
     }

@@ -37,7 +37,7 @@ pub(super) struct HoleArgs {
     /// apart. --out gets hole.json (every run), hole.md (the table) and for each run a picture, SCENE/seed-N.png. The same
     /// command goes on where it was stopped, and only adds what is missing.
     #[arg(long, value_name = "SET", num_args = 1..,
-        conflicts_with_all = ["scene", "loads", "tune", "predict", "against", "overwrite"])]
+        conflicts_with_all = ["scene", "predict", "against", "overwrite"])]
     pub hole: Vec<PathBuf>,
     /// Masks that are given to `prepare` [default: 1, or 2 from opposite sides where cameras stand all around]
     #[arg(long, value_name = "N", requires = "hole", value_parser = clap::value_parser!(u32).range(1..))]

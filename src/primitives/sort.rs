@@ -16,17 +16,17 @@ const GROUP: u32 = 64;
 
 /// How work is cut up. The result does not depend on it.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Tuning {
+struct Tuning {
     /// Keys of a thread.
-    pub(crate) items: u32,
+    items: u32,
     /// Most bits of a digit, at most 7.
-    pub(crate) digit_bits: u32,
+    digit_bits: u32,
 }
 
 /// On a CPU shared memory costs as much as any other: long runs and wide digits spread the cost of the counters. On a
 /// GPU neighbouring threads should read neighbouring cache lines: short runs.
-pub(crate) const CPU: Tuning = Tuning { items: 256, digit_bits: 7 };
-pub(crate) const GPU: Tuning = Tuning { items: 16, digit_bits: 6 };
+const CPU: Tuning = Tuning { items: 256, digit_bits: 7 };
+const GPU: Tuning = Tuning { items: 16, digit_bits: 6 };
 
 fn digit(key: u32, shift: u32, mask: u32) -> usize {
     ((key >> shift) & mask) as usize
@@ -115,7 +115,7 @@ impl Sort {
         Self::tuned(gpu, capacity, if gpu.form() == Form::Cpu { CPU } else { GPU })
     }
 
-    pub(crate) fn tuned(gpu: &Gpu, capacity: u32, tuning: Tuning) -> Result<Self, Error> {
+    fn tuned(gpu: &Gpu, capacity: u32, tuning: Tuning) -> Result<Self, Error> {
         let block = GROUP * tuning.items;
         let stride = capacity.div_ceil(block).max(1);
         Ok(Self {

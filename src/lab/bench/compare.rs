@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use super::loads::LoadFigures;
 use super::{Device, Record, digits};
 use crate::lab::report::SceneFacts;
 use crate::lab::statistics::Spread;
@@ -60,14 +59,14 @@ pub fn read(path: &Path) -> Result<Record, Error> {
 pub struct Subject<'a> {
     /// On which device.
     pub device: &'a Device,
-    /// On which scene; nothing: on generated loads.
-    pub scene: Option<&'a SceneFacts>,
+    /// On which scene.
+    pub scene: &'a SceneFacts,
     /// With which settings.
     pub settings: &'a Value,
-    /// Behind how many steps; of a scene.
+    /// Behind how many steps.
     pub warm_up: u32,
-    /// The step; of a scene.
-    pub step: Option<u32>,
+    /// The step.
+    pub step: u32,
 }
 
 /// The first setting that both have and that differs: its name and the two values.
@@ -109,14 +108,13 @@ pub fn ensure_comparable(path: &Path, old: &Record, new: Subject<'_>) -> Result<
         let hint = "choose the same with --device";
         return other(format!("on {}", old.device.name), format!("on {}", new.device.name), hint);
     }
-    let scene = |scene: Option<&SceneFacts>| match scene {
-        None => "on generated loads".to_owned(),
-        Some(s) => format!(
+    let scene = |s: &SceneFacts| {
+        format!(
             "on {} ({} x {}, {} views, {} points, {} masks, {} priors)",
             s.name, s.size[0], s.size[1], s.train_views, s.points, s.masks, s.priors
-        ),
+        )
     };
-    let (theirs, ours) = (scene(old.scene.as_ref()), scene(new.scene));
+    let (theirs, ours) = (scene(&old.scene), scene(new.scene));
     if theirs != ours {
         return other(theirs, ours, "measure the same scene");
     }
@@ -124,12 +122,9 @@ pub fn ensure_comparable(path: &Path, old: &Record, new: Subject<'_>) -> Result<
         let hint = "give the same settings, or measure again with these";
         return other(format!("with {name} = {theirs}"), format!("with {name} = {ours}"), hint);
     }
-    let state = |warm_up: u32, step: Option<u32>| match step {
-        Some(step) => format!("at step {step} behind {warm_up} steps of warm-up"),
-        None => "without a step".to_owned(),
-    };
-    let (theirs, ours) = (state(old.warm_up, old.step.as_ref().map(|s| s.step)), state(new.warm_up, new.step));
-    if new.scene.is_some() && theirs != ours {
+    let state = |warm_up: u32, step: u32| format!("at step {step} behind {warm_up} steps of warm-up");
+    let (theirs, ours) = (state(old.warm_up, old.step.step), state(new.warm_up, new.step));
+    if theirs != ours {
         return other(theirs, ours, "give the same --warm-up and --step");
     }
     let mut notes = vec![];
@@ -183,8 +178,6 @@ pub struct Comparison {
     pub passes: Vec<Change>,
     /// Milliseconds of the whole step, and of the host's part.
     pub whole: Vec<Change>,
-    /// Milliseconds of the steps of generated loads.
-    pub loads: Vec<Change>,
 }
 
 /// Compares two records that [`ensure_comparable`] lets through.
@@ -194,32 +187,22 @@ pub fn compare(old: &Record, new: &Record, notes: Vec<String>) -> Comparison {
         .iter()
         .zip(&now)
         .map(|((name, unit, old), (.., new))| Change::of(&format!("{name}, {unit}"), Some(old), Some(new)));
-    let mut comparison = Comparison { notes, ceilings: ceilings.collect(), ..Comparison::default() };
-    if let (Some(old), Some(new)) = (&old.step, &new.step) {
-        let then = |name: &str| old.passes.iter().find(|p| p.pass == name).map(|p| &p.milliseconds);
-        let now = |name: &str| new.passes.iter().find(|p| p.pass == name).map(|p| &p.milliseconds);
-        let mut names: Vec<&str> = new.passes.iter().map(|p| p.pass.as_str()).collect();
-        names.extend(old.passes.iter().map(|p| p.pass.as_str()).filter(|name| now(name).is_none()));
-        comparison.passes = names.into_iter().map(|name| Change::of(name, then(name), now(name))).collect();
-        let most = |c: &Change| c.old.unwrap_or(0.0).max(c.new.unwrap_or(0.0));
-        comparison.passes.sort_by(|a, b| most(b).total_cmp(&most(a)));
-        comparison.whole = vec![
-            Change::of("between passes: barriers", Some(&old.between), Some(&new.between)),
-            Change::of("total", Some(&old.total), Some(&new.total)),
-            Change::of("host: recording", Some(&old.host.recording), Some(&new.host.recording)),
-            Change::of("host: submission", Some(&old.host.submission), Some(&new.host.submission)),
-            Change::of("host: waiting", Some(&old.host.waiting), Some(&new.host.waiting)),
-        ];
-    }
-    if let (Some(old), Some(new)) = (&old.loads, &new.loads) {
-        let then = |run: &LoadFigures| {
-            let same = |other: &&LoadFigures| other.sweep == run.sweep && other.load == run.load;
-            old.runs.iter().find(same).map(|other| &other.step.total)
-        };
-        let change = |run: &LoadFigures| Change::of(&run.load.to_string(), then(run), Some(&run.step.total));
-        comparison.loads = new.runs.iter().map(change).collect();
-    }
-    comparison
+    let (old, new) = (&old.step, &new.step);
+    let then = |name: &str| old.passes.iter().find(|p| p.pass == name).map(|p| &p.milliseconds);
+    let now = |name: &str| new.passes.iter().find(|p| p.pass == name).map(|p| &p.milliseconds);
+    let mut names: Vec<&str> = new.passes.iter().map(|p| p.pass.as_str()).collect();
+    names.extend(old.passes.iter().map(|p| p.pass.as_str()).filter(|name| now(name).is_none()));
+    let mut passes: Vec<Change> = names.into_iter().map(|name| Change::of(name, then(name), now(name))).collect();
+    let most = |c: &Change| c.old.unwrap_or(0.0).max(c.new.unwrap_or(0.0));
+    passes.sort_by(|a, b| most(b).total_cmp(&most(a)));
+    let whole = vec![
+        Change::of("between passes: barriers", Some(&old.between), Some(&new.between)),
+        Change::of("total", Some(&old.total), Some(&new.total)),
+        Change::of("host: recording", Some(&old.host.recording), Some(&new.host.recording)),
+        Change::of("host: submission", Some(&old.host.submission), Some(&new.host.submission)),
+        Change::of("host: waiting", Some(&old.host.waiting), Some(&new.host.waiting)),
+    ];
+    Comparison { notes, ceilings: ceilings.collect(), passes, whole }
 }
 
 impl std::fmt::Display for Comparison {
@@ -232,7 +215,7 @@ impl std::fmt::Display for Comparison {
             "{:<42} {:>10} {:>10} {:>8}  range by quartiles",
             "against the older record", "then", "now", "ratio"
         )?;
-        for change in self.ceilings.iter().chain(&self.passes).chain(&self.whole).chain(&self.loads) {
+        for change in self.ceilings.iter().chain(&self.passes).chain(&self.whole) {
             let or = |value: Option<f64>| value.map_or("-".to_owned(), digits);
             let range = change.range.map_or(String::new(), |[low, high]| format!("{}..{}", digits(low), digits(high)));
             let line = format!(

@@ -1,8 +1,7 @@
 //! How far from the floor every pass is.
 //!
 //! [`ceilings`] measures what the device gives at most; [`cost`] says what every pass has to do, from the numbers that
-//! [`counts`] reads back from a traced step; [`step`] times the step beside it. [`loads`] generates scenes of chosen sizes
-//! and fits how every pass grows; [`tune()`] runs the choices that exist as data. [`predict`] says what the step would take
+//! [`counts`] reads back from a traced step; [`step`] times the step beside it. [`predict`] says what the step would take
 //! by a GPU's published peaks. [`compare`] sets one record against another, [`text`],
 //! [`tables`] and [`figures`] write them down.
 //!
@@ -13,12 +12,10 @@ pub mod compare;
 pub mod cost;
 pub mod counts;
 pub mod figures;
-pub mod loads;
 pub mod predict;
 pub mod step;
 pub mod tables;
 pub mod text;
-pub mod tune;
 
 use std::rc::Rc;
 
@@ -81,22 +78,14 @@ pub struct Record {
     pub device: Device,
     /// Every setting, as JSON: a value that is not finite is null.
     pub settings: serde_json::Value,
-    /// The scene; absent for generated loads.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub scene: Option<SceneFacts>,
+    /// The scene.
+    pub scene: SceneFacts,
     /// Steps trained before.
     pub warm_up: u32,
     /// What the device gives at most.
     pub ceilings: ceilings::Ceilings,
     /// A step on the scene.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub step: Option<step::StepFigures>,
-    /// Generated loads.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub loads: Option<loads::Loads>,
-    /// Choices of shapes.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub tune: Option<Vec<tune::ChoiceFigures>>,
+    pub step: step::StepFigures,
     /// The step on devices that are not at hand.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub predictions: Vec<predict::Prediction>,
@@ -156,14 +145,6 @@ impl<'a> Trained<'a> {
         Ok(Self { scene, subset: choose_views(scene, views), warm, number })
     }
 
-    /// The step on the device.
-    fn furnish(&self, gpu: &Gpu, settings: &Settings) -> Result<Bench, Error> {
-        let plan = Plan::new(self.scene, settings);
-        let photographs = Rc::new(photographs::upload(gpu, &self.subset, &plan, 1)?);
-        let variant = Variant { name: String::new(), changes: vec![], settings: settings.clone() };
-        Bench::new(gpu, self.scene, &variant, plan, photographs, &self.warm, self.number)
-    }
-
     /// Measures the step in so many rounds, each with one of the device's ceilings.
     ///
     /// # Errors
@@ -177,7 +158,10 @@ impl<'a> Trained<'a> {
         say: &mut dyn FnMut(&str),
     ) -> Result<step::StepFigures, Error> {
         ensure_timestamps(gpu)?;
-        let mut bench = self.furnish(gpu, settings)?;
+        let plan = Plan::new(self.scene, settings);
+        let photographs = Rc::new(photographs::upload(gpu, &self.subset, &plan, 1)?);
+        let variant = Variant { name: String::new(), changes: vec![], settings: settings.clone() };
+        let mut bench = Bench::new(gpu, self.scene, &variant, plan, photographs, &self.warm, self.number)?;
         say(&format!("bench: step {}, {repetitions} rounds", self.number));
         let mut ceilings = || {
             prober.round()?;
@@ -185,27 +169,6 @@ impl<'a> Trained<'a> {
         };
         step::measure(gpu, &mut bench, settings, &mut ceilings, repetitions)
     }
-}
-
-/// The load that shapes are judged by where there is no scene.
-const TUNED: loads::Load = loads::Load { anchors: 40_000, pairs: 5e5, size: [640, 360] };
-
-/// Runs the choices of shapes, on a scene or on a generated load.
-///
-/// # Errors
-/// When the device has no room, or no timestamps.
-pub fn tune(
-    gpu: &Gpu,
-    trained: Option<&Trained<'_>>,
-    settings: &Settings,
-    repetitions: usize,
-    say: &mut dyn FnMut(&str),
-) -> Result<Vec<tune::ChoiceFigures>, Error> {
-    let mut make = |settings: &Settings| match trained {
-        Some(trained) => trained.furnish(gpu, settings),
-        None => loads::furnish(gpu, settings, &TUNED),
-    };
-    tune::measure(gpu, settings, repetitions, &mut make, say)
 }
 
 #[cfg(test)]

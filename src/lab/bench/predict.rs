@@ -205,7 +205,7 @@ mod tests {
     #[test]
     fn a_step_is_the_sum_of_its_passes_and_barriers() {
         let record = super::super::tests::record();
-        let prediction = predict(record.step.as_ref().expect("a step"), 3000, &peak());
+        let prediction = predict(&record.step, 3000, &peak());
         // 8 MB at 4 GB/s, 1 M operations at 0.5 G/s: 2 ms each, and 0.1 ms of a dispatch; two barriers of 0.25 ms.
         let close = |got: f64, want: f64| assert!((got - want).abs() < 1e-12 * want, "{got}, not {want}");
         assert_eq!(prediction.passes.len(), 2);

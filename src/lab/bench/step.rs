@@ -114,13 +114,6 @@ pub struct StepFigures {
     pub host: HostFigures,
 }
 
-impl StepFigures {
-    /// The whole step in terms of its floor.
-    pub fn ratio(&self) -> f64 {
-        self.total.median / self.total_floor
-    }
-}
-
 /// What a step has to do by kernel, with its dispatches, and its barriers.
 pub(super) fn work_of(
     gpu: &Gpu,

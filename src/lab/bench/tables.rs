@@ -1,6 +1,5 @@
 //! The same numbers as CSV.
 
-use super::loads::Loads;
 use super::step::StepFigures;
 use crate::lab::report::tables::{number, optional, rows};
 
@@ -56,53 +55,4 @@ pub fn passes(figures: &StepFigures) -> Vec<u8> {
         lines.push(line);
     }
     rows(header, lines)
-}
-
-/// A row per load and pass; `total` is the whole step.
-pub fn loads(loads: &Loads) -> Vec<u8> {
-    let header = [
-        "varied",
-        "anchors",
-        "visible",
-        "drawn",
-        "pairs",
-        "samples",
-        "width",
-        "height",
-        "pass",
-        "ms_median",
-        "floor_ms",
-    ];
-    let mut lines = vec![];
-    for run in &loads.runs {
-        let c = &run.step.counts;
-        let mut line = |pass: &str, ms: f64, floor: Option<f64>| {
-            lines.push([
-                run.sweep.name().to_owned(),
-                number(c.anchors),
-                number(c.visible),
-                number(c.drawn),
-                number(c.pairs),
-                number(c.samples),
-                run.load.size[0].to_string(),
-                run.load.size[1].to_string(),
-                pass.to_owned(),
-                number(ms),
-                optional(floor),
-            ]);
-        };
-        line("total", run.step.total.median, Some(run.step.total_floor));
-        for pass in &run.step.passes {
-            line(&pass.pass, pass.milliseconds.median, pass.floor);
-        }
-    }
-    rows(header, lines)
-}
-
-/// A row per pass and varied quantity.
-pub fn exponents(loads: &Loads) -> Vec<u8> {
-    let line = |e: &super::loads::Exponent| {
-        [e.pass.clone(), e.sweep.name().to_owned(), number(e.exponent), number(e.residual), e.points.to_string()]
-    };
-    rows(["pass", "varied", "exponent", "residual", "loads"], loads.exponents.iter().map(line))
 }

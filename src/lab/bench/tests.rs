@@ -104,7 +104,7 @@ pub(super) fn record() -> Record {
             max_binding_bytes: 1 << 27,
         },
         settings: serde_json::json!({ "render": { "near": 0.2, "tiles": "auto" }, "epsilon": 1e-15 }),
-        scene: Some(crate::lab::report::SceneFacts {
+        scene: crate::lab::report::SceneFacts {
             name: "scene".into(),
             train_views: 3,
             test_views: 0,
@@ -113,12 +113,10 @@ pub(super) fn record() -> Record {
             masks: 3,
             priors: 0,
             references: 1,
-        }),
+        },
         warm_up: 50,
         ceilings,
-        step: Some(step),
-        loads: None,
-        tune: None,
+        step,
         predictions: vec![],
     }
 }
@@ -149,8 +147,8 @@ fn records_survive_json() {
     let read = compare::read(&path).expect("a record");
     let again = |r: &Record| serde_json::from_str::<Record>(&r.to_json()).expect("a record");
     assert_eq!(again(&read), again(&record));
-    assert_eq!(read.step.as_ref().map(|s| s.passes.len()), Some(3));
-    let medians = |r: &Record| r.step.as_ref().expect("a step").passes.iter().map(|p| p.milliseconds.median).collect();
+    assert_eq!(read.step.passes.len(), 3);
+    let medians = |r: &Record| r.step.passes.iter().map(|p| p.milliseconds.median).collect();
     let (a, b): (Vec<f64>, Vec<f64>) = (medians(&read), medians(&record));
     assert!(a.iter().zip(&b).all(|(a, b)| (a - b).abs() <= 1e-12 * b), "{a:?} {b:?}");
 
@@ -167,10 +165,10 @@ fn other_subjects_are_refused() {
     let subject = |r: &Record, check: &dyn Fn(Result<Vec<String>, compare::Error>)| {
         let subject = Subject {
             device: &r.device,
-            scene: r.scene.as_ref(),
+            scene: &r.scene,
             settings: &r.settings,
             warm_up: r.warm_up,
-            step: r.step.as_ref().map(|s| s.step),
+            step: r.step.step,
         };
         check(compare::ensure_comparable(Path::new("old.json"), &old, subject));
     };
@@ -184,8 +182,7 @@ fn other_subjects_are_refused() {
         });
     };
     refused(&|r| r.device.name = "another".into(), "on device, this run is on another:");
-    refused(&|r| r.scene = None, "this run is on generated loads:");
-    refused(&|r| r.scene.as_mut().expect("a scene").size = [32, 24], "on scene (64 x 48, ");
+    refused(&|r| r.scene.size = [32, 24], "on scene (64 x 48, ");
     refused(
         &|r| r.settings["render"]["tiles"] = "wide".into(),
         "with render.tiles = \"auto\", this run is with render.tiles = \"wide\"",
@@ -209,9 +206,8 @@ fn other_subjects_are_refused() {
 fn changes_and_their_ranges() {
     let old = record();
     let mut new = record();
-    let step = new.step.as_mut().expect("a step");
-    step.passes[0].milliseconds = Spread::of(&[3.9, 4.0, 4.4]);
-    step.passes[2].pass = "render/fused".into();
+    new.step.passes[0].milliseconds = Spread::of(&[3.9, 4.0, 4.4]);
+    new.step.passes[2].pass = "render/fused".into();
     let comparison = compare::compare(&old, &new, vec!["so".into()]);
     let change = |name: &str| comparison.passes.iter().find(|c| c.name == name).expect("compared").clone();
     let raster = change("render/cpu/rasterize_backward");
@@ -220,7 +216,7 @@ fn changes_and_their_ranges() {
     let [low, high] = raster.range.expect("a range");
     assert!((low - 3.95 / 8.8).abs() < 1e-12 && (high - 4.2 / 7.6).abs() < 1e-12, "{low} {high}");
     assert_eq!((change("render/fused").old, change("render/unheard_of").new), (None, None));
-    assert!(comparison.whole.iter().all(|c| c.ratio == Some(1.0)) && comparison.loads.is_empty());
+    assert!(comparison.whole.iter().all(|c| c.ratio == Some(1.0)));
     assert_eq!(comparison.passes[0].name, raster.name, "what costs most comes first");
     let text = comparison.to_string();
     assert!(text.starts_with("note: so\n") && text.contains("render/fused"), "{text}");

@@ -3,11 +3,9 @@
 use std::fmt::Write as _;
 
 use super::ceilings::Ceilings;
-use super::loads::{Loads, Sweep};
 use super::predict;
 use super::step::StepFigures;
-use super::tune::ChoiceFigures;
-use super::{Record, digits};
+use super::{Device, Record, digits};
 use crate::lab::statistics::Spread;
 
 fn quartiles(spread: &Spread) -> String {
@@ -126,144 +124,10 @@ pub fn step(figures: &StepFigures) -> String {
 
 /// The whole record.
 pub fn record(record: &Record) -> String {
-    let mut text = format!("{}, {}\n\n{}", record.device.name, record.device.driver, ceilings(&record.ceilings));
-    if let Some(figures) = &record.step {
-        text += &format!("\n{}", step(figures));
-    }
-    if let Some(figures) = &record.loads {
-        text += &format!("\n{}", loads(figures));
-    }
-    if let Some(choices) = &record.tune {
-        text += &format!("\n{}", tune(choices, record));
-    }
+    let Device { name, driver, .. } = &record.device;
+    let mut text = format!("{name}, {driver}\n\n{}\n{}", ceilings(&record.ceilings), step(&record.step));
     if !record.predictions.is_empty() {
         text += &format!("\n{}", predict::text(&record.predictions));
-    }
-    text
-}
-
-/// Generated loads: the whole steps, how the passes grow, what memory they take.
-pub fn loads(loads: &Loads) -> String {
-    let mut text = String::new();
-    line(
-        &mut text,
-        format_args!(
-            "{:<8} {:>9} {:>9} {:>9} {:>10} {:>12} {:>10} {:>10} {:>10} {:>7}",
-            "varied", "anchors", "in view", "drawn", "pairs", "picture", "M samples", "step ms", "floor ms", "ratio"
-        ),
-    );
-    for run in &loads.runs {
-        let (c, step) = (&run.step.counts, &run.step);
-        line(
-            &mut text,
-            format_args!(
-                "{:<8} {:>9.0} {:>9.0} {:>9.0} {:>10.0} {:>12} {:>10} {:>10} {:>10} {:>7}",
-                run.sweep.name(),
-                c.anchors,
-                c.visible,
-                c.drawn,
-                c.pairs,
-                format!("{} x {}", run.load.size[0], run.load.size[1]),
-                millions(c.samples),
-                digits(step.total.median),
-                digits(step.total_floor),
-                digits(step.ratio()),
-            ),
-        );
-    }
-    for left in &loads.left_out {
-        line(&mut text, format_args!("left out, {} varied: {}: {}", left.sweep.name(), left.load, left.why));
-    }
-    // The costliest first: by their largest share of any load.
-    let mut names: Vec<(&str, f64)> = vec![];
-    for e in &loads.exponents {
-        if names.iter().all(|(name, _)| *name != e.pass) {
-            let share = |run: &super::loads::LoadFigures| {
-                let pass = run.step.passes.iter().find(|p| p.pass == e.pass);
-                pass.map_or(0.0, |p| p.milliseconds.median / run.step.total.median)
-            };
-            let most = if e.pass == "total" { 2.0 } else { loads.runs.iter().map(share).fold(0.0, f64::max) };
-            names.push((&e.pass, most));
-        }
-    }
-    names.sort_by(|a, b| b.1.total_cmp(&a.1));
-    text.push('\n');
-    line(
-        &mut text,
-        format_args!(
-            "{:<42} {:>8}  {:>8}  {:>8}  {:>12}",
-            "exponent of the time by", "anchors", "pairs", "pixels", "largest share"
-        ),
-    );
-    for (name, share) in names {
-        let of = |sweep: Sweep| {
-            let found = loads.exponents.iter().find(|e| e.pass == name && e.sweep == sweep);
-            found.map_or("-".to_owned(), |e| format!("{:.2}{}", e.exponent, if e.residual > 0.2 { "~" } else { "" }))
-        };
-        let share = if name == "total" { String::new() } else { format!("{:.0} %", 100.0 * share) };
-        let [anchors, pairs, pixels] = Sweep::ALL.map(of);
-        line(&mut text, format_args!("{name:<42} {anchors:>8}  {pairs:>8}  {pixels:>8}  {share:>12}"));
-    }
-    text += "time beyond that of empty dispatches; - too few loads with more than that; ~ off the line by more than 20 %; \
-             pairs grow with the anchors, two per Gaussian\n";
-    let m = &loads.memory;
-    line(
-        &mut text,
-        format_args!(
-            "device memory by the ledger: {:.0} B per anchor, {:.0} B more for one in view, {:.0} B per pair, {:.0} B per pixel",
-            m.per_anchor, m.per_visible, m.per_pair, m.per_pixel
-        ),
-    );
-    text
-}
-
-/// The choices, their evidence, and the table for the source.
-pub fn tune(choices: &[ChoiceFigures], record: &Record) -> String {
-    let mut text = String::new();
-    line(
-        &mut text,
-        format_args!("{:<20} {:<28} {:>10} {:>8}  {}", "choice", "option", "ms", "ratio", "quartiles of the ratio"),
-    );
-    for choice in choices {
-        for option in &choice.options {
-            let mark = match (option.option == choice.best, option.shipped) {
-                (true, true) => "  best, as shipped",
-                (true, false) => "  best",
-                (false, true) => "  as shipped",
-                (false, false) => "",
-            };
-            line(
-                &mut text,
-                format_args!(
-                    "{:<20} {:<28} {:>10} {:>8}  {}{mark}",
-                    choice.choice,
-                    option.option,
-                    digits(option.milliseconds.median),
-                    digits(option.ratio.median),
-                    quartiles(&option.ratio),
-                ),
-            );
-        }
-    }
-    text.push('\n');
-    line(
-        &mut text,
-        format_args!("// {}, {}; ratios of medians to the shipped option", record.device.name, record.device.driver),
-    );
-    for choice in choices {
-        let evidence: Vec<String> =
-            choice.options.iter().map(|o| format!("{} {}", o.option, digits(o.ratio.median))).collect();
-        line(
-            &mut text,
-            format_args!(
-                "(\"{}\", \"{}\", \"{}\"), // {}: {}",
-                record.device.kind,
-                choice.choice,
-                choice.best,
-                choice.work,
-                evidence.join("; ")
-            ),
-        );
     }
     text
 }

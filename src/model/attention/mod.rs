@@ -43,6 +43,7 @@ impl Sharing {
     const MOST_KEPT: u32 = 512;
 
     /// Those that a device can run, whether they are good for it or not.
+    #[cfg(test)]
     pub(crate) fn all(gpu: &Gpu) -> &'static [Self] {
         if gpu.runs_lanes() { &[Self::Blocks, Self::Lanes, Self::Pairs] } else { &[Self::Blocks] }
     }
