@@ -17,8 +17,9 @@ use std::collections::BinaryHeap;
 use image::{GrayImage, RgbImage};
 
 use super::depth::DepthMap;
-use super::graph_cut::{self, COMPONENTS, Grid, Mixture, SHIFTS, SMOOTHNESS, UNIT};
+use super::graph_cut::{self, COMPONENTS, Mixture, SMOOTHNESS, UNIT};
 use super::masks;
+use super::min_cut::{Grid, SHIFTS};
 use crate::scene::resample;
 use crate::statistics::median;
 

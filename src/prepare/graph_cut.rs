@@ -2,16 +2,15 @@
 //!
 //! GrabCut (Rother et al. 2004): each side's colours are a mixture of Gaussians; a pixel's label costs what its side's
 //! mixture says of its colour, and labels of neighbours differ at a cost that falls with their contrast. The cheapest
-//! labelling is a minimum cut of a graph on the pixels, found by Dinic's algorithm on the grid itself; mixtures and
-//! labels take turns.
+//! labelling is a minimum cut of a graph on the pixels (`min_cut`); mixtures and labels take turns.
 
-use std::collections::VecDeque;
 use std::path::Path;
 
 use image::{GrayImage, Luma, RgbImage};
 use rand::RngExt;
 use rand_pcg::Pcg64;
 
+use super::min_cut::{Grid, SHIFTS};
 use super::{Error, masks};
 use crate::scene::{self, resample};
 
@@ -45,141 +44,6 @@ pub enum Known {
     Maybe,
     /// Nothing; the cut decides, beginning with the background.
     MaybeBackground,
-}
-
-// ---------------------------------------------------------------- minimum cut
-
-/// Shifts to the neighbours of a pixel; the opposite of the `d`-th is the `d`-th from the end.
-pub(super) const SHIFTS: [[isize; 2]; 8] = [[-1, -1], [0, -1], [1, -1], [-1, 0], [1, 0], [-1, 1], [0, 1], [1, 1]];
-
-/// A graph whose nodes are pixels, each joined to its neighbours, to the object's terminal and to the background's.
-pub struct Grid<const N: usize> {
-    size: [usize; 2],
-    shifts: &'static [[isize; 2]; N],
-    /// What still fits through the edge to each neighbour.
-    edges: Vec<[i32; N]>,
-    /// What still fits from the object's terminal, or, below zero, to the background's.
-    terminal: Vec<i64>,
-}
-
-impl<const N: usize> Grid<N> {
-    /// Without any edges. The opposite of shift `d` is shift `N - 1 - d`.
-    pub fn new(size: [usize; 2], shifts: &'static [[isize; 2]; N]) -> Self {
-        let n = size[0] * size[1];
-        Self { size, shifts, edges: vec![[0; N]; n], terminal: vec![0; n] }
-    }
-
-    pub(super) fn neighbour(&self, node: usize, direction: usize) -> Option<usize> {
-        let (x, y) = ((node % self.size[0]) as isize, (node / self.size[0]) as isize);
-        let [u, v] = [x + self.shifts[direction][0], y + self.shifts[direction][1]];
-        let inside = u >= 0 && v >= 0 && u < self.size[0] as isize && v < self.size[1] as isize;
-        inside.then(|| (v * self.size[0] as isize + u) as usize)
-    }
-
-    /// Labelling this pixel as background costs `object`, as object `background`.
-    pub fn set_terminals(&mut self, node: usize, object: i64, background: i64) {
-        self.terminal[node] = object - background;
-    }
-
-    /// Different labels of a pixel and its neighbour in this direction cost so much, either way.
-    pub fn set_edge(&mut self, node: usize, direction: usize, cost: i32) {
-        if let Some(other) = self.neighbour(node, direction) {
-            self.edges[node][direction] = cost;
-            self.edges[other][N - 1 - direction] = cost;
-        }
-    }
-
-    /// Labelling this pixel as object and its neighbour in this direction as background costs so much more than the other
-    /// way round.
-    pub fn set_arc(&mut self, node: usize, direction: usize, cost: i32) {
-        if self.neighbour(node, direction).is_some() {
-            self.edges[node][direction] = cost;
-        }
-    }
-
-    /// The cheapest labelling: true on the object's side. Where both are equally cheap, the background's.
-    pub fn cut(mut self) -> Vec<bool> {
-        let n = self.terminal.len();
-        loop {
-            // Levels: steps from the object's terminal along edges through which something fits.
-            let mut level = vec![u32::MAX; n];
-            let mut queue: VecDeque<usize> = (0..n).filter(|i| self.terminal[*i] > 0).collect();
-            queue.iter().for_each(|i| level[*i] = 0);
-            let mut last = u32::MAX;
-            while let Some(node) = queue.pop_front() {
-                if level[node] >= last {
-                    break;
-                }
-                for d in 0..N {
-                    if self.edges[node][d] > 0
-                        && let Some(next) = self.neighbour(node, d)
-                        && level[next] == u32::MAX
-                    {
-                        level[next] = level[node] + 1;
-                        if self.terminal[next] < 0 {
-                            last = level[next];
-                        }
-                        queue.push_back(next);
-                    }
-                }
-            }
-            if last == u32::MAX {
-                return level.into_iter().map(|level| level != u32::MAX).collect();
-            }
-            self.block(&level);
-        }
-    }
-
-    /// Sends flow along the levels until nothing more fits.
-    fn block(&mut self, level: &[u32]) {
-        let mut tried = vec![0u8; level.len()];
-        let mut path: Vec<(usize, usize)> = vec![];
-        for source in (0..level.len()).filter(|i| level[*i] == 0) {
-            let mut node = source;
-            path.clear();
-            while self.terminal[source] > 0 {
-                if self.terminal[node] < 0 {
-                    let fits = path.iter().map(|(node, d)| i64::from(self.edges[*node][*d])).min().unwrap_or(i64::MAX);
-                    let flow = fits.min(self.terminal[source]).min(-self.terminal[node]);
-                    self.terminal[source] -= flow;
-                    self.terminal[node] += flow;
-                    let mut back = None;
-                    for (i, &(from, d)) in path.iter().enumerate() {
-                        let to = self.neighbour(from, d).expect("the path is in the picture");
-                        // A flow is at most the least capacity of its path.
-                        self.edges[from][d] -= flow as i32;
-                        self.edges[to][N - 1 - d] += flow as i32;
-                        if self.edges[from][d] == 0 && back.is_none() {
-                            back = Some(i);
-                        }
-                    }
-                    // Goes on from the first edge that is full now.
-                    if let Some(i) = back {
-                        node = path[i].0;
-                        path.truncate(i);
-                    }
-                    continue;
-                }
-                let onward = (usize::from(tried[node])..N).find_map(|d| {
-                    let next = self.neighbour(node, d)?;
-                    (self.edges[node][d] > 0 && level[next] == level[node] + 1).then_some((d, next))
-                });
-                match onward {
-                    Some((d, next)) => {
-                        tried[node] = d as u8;
-                        path.push((node, d));
-                        node = next;
-                    }
-                    None => {
-                        tried[node] = N as u8;
-                        let Some((before, _)) = path.pop() else { break };
-                        tried[before] += 1;
-                        node = before;
-                    }
-                }
-            }
-        }
-    }
 }
 
 // ---------------------------------------------------------------- colour models
@@ -515,50 +379,6 @@ mod tests {
         assert!(count(&both, 15) > 380 && count(&both, 65) > 380, "alike without a box");
         let one = from_strokes_in_box(&picture, &strokes, [5, 10, 48, 52]);
         assert!(count(&one, 15) > 380 && count(&one, 65) == 0, "{} {}", count(&one, 15), count(&one, 65));
-    }
-
-    /// All labellings of a small grid, by their cost.
-    fn cheapest(size: [usize; 2], terminals: &[[i64; 2]], edges: &[(usize, usize, i32)]) -> (i64, Vec<u32>) {
-        let n = size[0] * size[1];
-        let cost = |labels: u32| {
-            let on = |i: usize| labels >> i & 1 == 1;
-            let own: i64 = (0..n).map(|i| terminals[i][usize::from(on(i))]).sum();
-            own + edges.iter().filter(|(i, j, _)| on(*i) && !on(*j)).map(|e| i64::from(e.2)).sum::<i64>()
-        };
-        let least = (0..1u32 << n).map(cost).min().unwrap();
-        (least, (0..1 << n).filter(|l| cost(*l) == least).collect())
-    }
-
-    /// Random grids of 3 x 4 against every one of their 4,096 labellings; every other with edges that cost one way alone.
-    #[test]
-    fn the_cut_is_the_cheapest_labelling() {
-        let mut rng = Pcg64::new(5, 5);
-        let size = [3, 4];
-        for round in 0..400 {
-            let mut grid = Grid::new(size, &SHIFTS);
-            let (mut terminals, mut edges) = (vec![], vec![]);
-            for i in 0..12 {
-                // Of background and of object.
-                let costs = [rng.random_range(0..9i64), rng.random_range(0..9i64)];
-                grid.set_terminals(i, costs[0], costs[1]);
-                terminals.push(costs);
-                for d in 4..8 {
-                    let cost = rng.random_range(0..6);
-                    if let Some(j) = grid.neighbour(i, d) {
-                        if round % 2 == 0 {
-                            grid.set_edge(i, d, cost);
-                            edges.push((j, i, cost));
-                        } else {
-                            grid.set_arc(i, d, cost);
-                        }
-                        edges.push((i, j, cost));
-                    }
-                }
-            }
-            let (_, best) = cheapest(size, &terminals, &edges);
-            let labels = grid.cut().iter().enumerate().map(|(i, on)| u32::from(*on) << i).sum::<u32>();
-            assert!(best.contains(&labels), "{labels:b} is not among {best:?}");
-        }
     }
 
     /// A textured disc on a textured ground, boxed loosely.

@@ -7,6 +7,7 @@ pub mod graph_cut;
 pub mod hole;
 pub mod lens;
 pub mod masks;
+mod min_cut;
 pub mod network;
 mod object;
 pub mod outline;

@@ -9,7 +9,7 @@
 use rand::RngExt;
 use rand_pcg::Pcg64;
 
-use super::graph_cut::Grid;
+use super::min_cut::Grid;
 
 /// Planes that are looked for.
 const PLANES: usize = 6;

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use super::Ground;
 use super::border::{Amounts, amounts};
 use super::mixture::{Color, Mixture, brightened, channels, color};
-use crate::prepare::graph_cut::Grid;
+use crate::prepare::min_cut::Grid;
 use crate::prepare::planes::neighbours;
 
 /// Directions of the light around the object, and how far a place one high is moved.
