@@ -61,7 +61,7 @@ fn moments() -> u32 {
 /// The scene, its photographs alone, a model, and settings under which a run has three checkpoints.
 fn place() -> Place {
     let mut settings = common::settings(12);
-    (settings.train.checkpoint_interval, settings.train.save_interval) = (4, 5);
+    (settings.train.checkpoint_interval, settings.train.eval_interval) = (4, 5);
     settings.train.log_interval = 3;
     let place = Place::new(&settings);
     for part in ["images", "sparse/0"] {

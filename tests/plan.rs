@@ -7,7 +7,7 @@ use gscream_vk::config::{Settings, Source};
 use gscream_vk::gpu::form::without_form;
 use gscream_vk::gpu::{Entry, Gpu, Options, Schedule, testing};
 use gscream_vk::losses::{depth_gradient, depth_l1};
-use gscream_vk::scene::{self, Scene};
+use gscream_vk::scene::Scene;
 use gscream_vk::stage;
 use gscream_vk::train::forecast::{self, Forecast, Question, Survey};
 use gscream_vk::train::plan::Plan;
@@ -41,7 +41,7 @@ impl Wanted {
     fn settings(self) -> Settings {
         let mut settings = common::settings(15);
         let Self { masks, priors, reference, attention, growth, .. } = self;
-        settings.scene = scene::Config { masks, priors, reference, ..Default::default() };
+        settings.scene = common::reads(masks, priors, reference);
         settings.model.attention.enabled = attention;
         settings.densify.enabled = growth;
         settings
@@ -216,7 +216,6 @@ fn depth_is_for_views_that_have_losses_of_it() {
     let scene = common::tiny();
     let mut settings = Wanted::EVERYTHING.settings();
     settings.losses.depth.other_weight = 0.0;
-    settings.losses.depth.gradient.other_weight = 0.0;
     let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
     assert!(run.step().plan.left_out.iter().any(|l| l.what == "depth of views other than the reference"));
     assert_eq!(alive(&gpu)["prior"].0, 1, "the reference view's alone");
@@ -228,9 +227,9 @@ fn depth_is_for_views_that_have_losses_of_it() {
     }
     // And the other way round.
     settings.losses.depth = Default::default();
-    settings.losses.depth.reference_weight = 0.0;
-    settings.losses.depth.reference_inside_weight = 0.0;
     settings.losses.depth.gradient.weight = 0.0;
+    let mut scene = scene;
+    scene.references[0].prior = None;
     let plan = Plan::new(&scene, &settings);
     assert!(plan.depth && !plan.reference_depth.any() && plan.other_depth.any());
     settings.losses.depth.other_weight = 0.0;
@@ -435,7 +434,6 @@ fn points_far_apart_are_rehearsed() {
     let scene = common::tiny();
     let mut settings = common::settings(14);
     settings.model.voxel = 1e-3;
-    settings.densify.levels = 3;
     let verdict = forecast::forecast(&gpu, &scene, &settings, Question::default()).expect("a forecast");
     let forecast = verdict.forecast.expect("it fits a binding");
     assert!(forecast.anchors > forecast.survey.anchors, "{} anchors", forecast.anchors);

@@ -24,7 +24,7 @@ fn settings() -> Settings {
     let mut settings = common::settings(36);
     let train = &mut settings.train;
     train.view_order = ViewOrder::Shuffled;
-    (train.log_interval, train.eval_interval, train.save_interval, train.checkpoint_interval) = (5, 12, 9, 3);
+    (train.log_interval, train.eval_interval, train.checkpoint_interval) = (5, 12, 3);
     settings
 }
 

@@ -416,10 +416,10 @@ fn switches_leave_things_out() {
     assert!(scene.references.is_empty() && scene.train.iter().all(|v| v.mask.is_none() && v.prior.is_some()));
     assert!(scene.test[0].mask.is_some(), "test masks are for the figures, not for training");
     assert_note!(scene, "the train masks are ignored, as configured");
-    let scene = with(Config { priors: false, ..Config::default() });
+    let scene = with(Config { prior_folder: "none".into(), ..Config::default() });
     assert!(scene.train.iter().all(|v| v.mask.is_some() && v.prior.is_none()));
     assert!(scene.references.first().unwrap().prior.is_none());
-    let scene = with(Config { reference: false, ..Config::default() });
+    let scene = with(Config { reference_file: "none".into(), ..Config::default() });
     assert!(scene.references.is_empty());
     assert_note!(scene, "the reference view is ignored, as configured");
     assert!(refusal_with(&dir, &Config { downscale: 0, ..Config::default() }).contains("downscale is 0"));
@@ -492,7 +492,8 @@ fn a_clean_test_view_can_be_the_reference() {
     let dilated = scene::load(dir.path(), &Config { dilate_masks: 2, ..with("t", "") }).unwrap();
     assert_eq!(dilated.train[3].mask, dilated.train[0].mask);
     // Without a reference the same views are tested.
-    for config in [Config { reference: false, ..with("t", "") }, Config { masks: false, ..with("t", "") }] {
+    for config in [Config { reference_file: "none".into(), ..with("t", "") }, Config { masks: false, ..with("t", "") }]
+    {
         let scene = scene::load(dir.path(), &config).unwrap();
         assert_eq!((names(&scene.train), names(&scene.test)), ("abc".into(), "u".into()));
         assert!(scene.references.is_empty());
@@ -725,7 +726,7 @@ fn priors_are_read_from_every_format() {
     let [w, h] = SIZE;
     let ramp = |x: u32, y: u32| x + 2 * y;
     let check = |dir: &TempDir, what: &str, value: &dyn Fn(u32) -> f32| {
-        let scene = scene::load(dir.path(), &Config { reference: false, ..Config::default() }).unwrap();
+        let scene = scene::load(dir.path(), &Config { reference_file: "none".into(), ..Config::default() }).unwrap();
         let prior = scene.train[0].prior.as_ref().unwrap();
         assert_eq!(prior.kind, PriorKind::Disparity);
         for (i, v) in prior.values.iter().enumerate() {

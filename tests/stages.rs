@@ -5,7 +5,6 @@ use gscream_vk::config::Settings;
 use gscream_vk::gpu::form::without_form;
 use gscream_vk::gpu::{Entry, Gpu, Options, testing};
 use gscream_vk::render::rasterize::Outputs;
-use gscream_vk::scene;
 use gscream_vk::train::plan::Plan;
 use gscream_vk::train::run::Run;
 
@@ -34,7 +33,7 @@ impl Wanted {
         // Four steps: the fourth is the reference view, with statistics and attention.
         let mut settings = common::settings(5);
         let Self { masks, priors, reference, attention, growth } = self;
-        settings.scene = scene::Config { masks, priors, reference, ..Default::default() };
+        settings.scene = common::reads(masks, priors, reference);
         settings.model.attention.enabled = attention;
         settings.densify.enabled = growth;
         settings

@@ -162,7 +162,7 @@ fn smaller_pictures_come_first() {
     };
     let (full, half) = (scene(1), scene(2));
     let mut settings = common::settings(13);
-    settings.losses.depth.align_to_points = false; // the points fall on other pixels of a prior of another size
+    settings.scene.check_priors = false; // the points fall on other pixels of a prior of another size
     settings.model.attention.patch = 12;
     let small = train(&gpu, &half, &settings, None);
     settings.model.attention.patch = 24;
@@ -275,8 +275,7 @@ fn training_learns_and_what_it_saves_draws_the_same_picture_in_one_form(gpu: &Gp
     let file = files::load(&folder.path().join("model")).expect("a model that was just written");
     assert!(memory == file, "what was saved is what was trained");
     let pictures = |(anchors, weights): &(files::Anchors, files::Weights)| {
-        let mut renderer =
-            Renderer::new(gpu, anchors, weights, &settings.render, [0.0; 3]).expect("the device has room");
+        let mut renderer = Renderer::new(gpu, anchors, weights, &settings.render).expect("the device has room");
         let views = scene.test.iter().chain(&scene.train);
         views.map(|view| renderer.render(&view.camera).expect("a picture")).collect::<Vec<_>>()
     };
@@ -296,9 +295,8 @@ fn what_is_inside_the_mask_counts_on_the_reference_alone() {
     let scene = scene_without_tests();
     let [reference] = scene.references.as_slice() else { panic!("one reference") };
     assert_eq!(reference.view, 3, "it is seen in step 4");
-    let losses = |scene: &Scene, inside: f64| -> Vec<u32> {
-        let mut settings = common::settings(6);
-        settings.losses.reference_inside_weight = inside;
+    let losses = |scene: &Scene| -> Vec<u32> {
+        let settings = common::settings(6);
         train(&gpu, scene, &settings, None).watch.steps.iter().map(|p| p.loss.to_bits()).collect()
     };
     let inverted = |picture: &mut image::RgbImage, mask: &image::GrayImage| {
@@ -311,14 +309,12 @@ fn what_is_inside_the_mask_counts_on_the_reference_alone() {
         assert!(mask.pixels().any(|m| m.0[0] != 0), "view {i} shows the object");
         inverted(&mut view.image, mask);
     }
-    assert_eq!(losses(&others, 20.0), losses(&scene, 20.0), "other views are compared inside their masks");
+    assert_eq!(losses(&others), losses(&scene), "other views are compared inside their masks");
     let mut painted = scene.clone();
     inverted(&mut painted.references[0].image, scene.train[3].mask.as_ref().expect("a mask"));
-    let (weighed, weighed_painted) = (losses(&scene, 20.0), losses(&painted, 20.0));
+    let (weighed, weighed_painted) = (losses(&scene), losses(&painted));
     assert_eq!(weighed[..3], weighed_painted[..3]);
     assert_ne!(weighed[3], weighed_painted[3], "the reference is not compared inside its hole");
-    // SSIM knows no weight between none and one: where colours weigh nothing, it weighs nothing either.
-    assert_eq!(losses(&scene, 0.0)[3], losses(&painted, 0.0)[3], "a weight of 0 counts");
 }
 
 /// The weights of the depth losses, one by one: what is twice as large, to the bit, and what stays.
@@ -333,9 +329,7 @@ fn depth_weighs_on_each_view_what_its_settings_say() {
         let mut settings = common::settings(4);
         // Powers of two make doubling exact.
         let depth = &mut settings.losses.depth;
-        (depth.reference_weight, depth.reference_inside_weight, depth.other_weight) = (1.0, 7.0, 0.125);
-        let gradient = &mut depth.gradient;
-        (gradient.weight, gradient.other_weight) = (0.5, 0.125);
+        (depth.other_weight, depth.gradient.weight) = (0.125, 0.5);
         change(depth);
         let named = |p: &gscream_vk::train::run::Progress, wanted: &str| {
             p.losses.iter().find(|(name, _)| *name == wanted).expect("a depth loss").1
@@ -349,16 +343,14 @@ fn depth_weighs_on_each_view_what_its_settings_say() {
     // was changed.
     let [first, fourth] = [plain[0], plain[3]];
     let twice = losses(&scene, |d| d.other_weight *= 2.0);
-    assert_eq!(twice[0], [2.0 * first[0], first[1]], "the other views' L1");
-    let twice = losses(&scene, |d| d.gradient.other_weight *= 2.0);
+    assert_eq!(twice[0], first.map(|loss| 2.0 * loss), "the other views' losses");
+    let twice = losses(&scene, |d| d.gradient.weight *= 2.0);
     assert_eq!(twice[0], [first[0], 2.0 * first[1]], "the other views' gradient");
-    let twice = losses(&scene, |d| (d.reference_weight, d.reference_inside_weight) = (2.0, 14.0));
-    assert_eq!((&twice[..3], twice[3]), (&plain[..3], [2.0 * fourth[0], fourth[1]]), "the reference's L1");
-    let twice = losses(&scene, |d| (d.gradient.weight, d.gradient.other_weight) = (1.0, 0.0625));
-    assert_eq!((&twice[..3], twice[3]), (&plain[..3], [fourth[0], 2.0 * fourth[1]]), "the reference's gradient");
-    let inside = losses(&scene, |d| d.reference_inside_weight = 0.0);
-    assert_eq!(inside[..3], plain[..3]);
-    assert!(inside[3][0] < fourth[0] && inside[3][1] == fourth[1], "{inside:?}: less weight inside than {plain:?}");
+    let mut alone = scene.clone();
+    alone.train.iter_mut().for_each(|view| view.prior = None);
+    let [once, twice] = [|_: &mut _| {}, |d: &mut gscream_vk::losses::config::Depth| d.gradient.weight *= 2.0]
+        .map(|change| losses(&alone, change)[3]);
+    assert_eq!(twice, [once[0], 2.0 * once[1]], "the reference's gradient");
 
     // A prior whose values inside the mask have changed places has the same range.
     let shuffled = |prior: &mut Option<scene::Prior>, mask: &image::GrayImage| {

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use super::folders::Origin;
 use super::next;
 use super::shared::{self, DeviceArgs};
-use crate::config::{Settings, Source};
+use crate::config::Source;
 use crate::export::{self, Cloud, Export, Observer, Options, low_pass, measure, up};
 use crate::folder::{self, Lock};
 use crate::formats::{gltf, ply, sog, splat, spz};
@@ -193,6 +193,9 @@ impl Pose {
     }
 }
 
+/// The background that [`BACKGROUND`](crate::render::config::BACKGROUND) is, for pages.
+const BLACK: [f64; 3] = [0.0; 3];
+
 /// What `view` reads of export.json.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct Cameras {
@@ -206,11 +209,11 @@ pub(super) struct Cameras {
 
 impl Cameras {
     /// Those of a scene's train views, in the scene's axes.
-    pub(super) fn of(scene: &Scene, background: [f64; 3]) -> Self {
+    pub(super) fn of(scene: &Scene) -> Self {
         let cameras: Vec<Camera> = scene.train.iter().map(|view| view.camera).collect();
         let focus = path::focus(&cameras, &[]).unwrap_or_default();
         let cameras = scene.train.iter().map(|view| Pose::new(&view.name, &view.camera)).collect();
-        Self { background, focus, cameras }
+        Self { background: BLACK, focus, cameras }
     }
 }
 
@@ -391,16 +394,15 @@ pub(super) fn export(
         let mut written = vec![];
         for format in &args.formats() {
             let bytes = format.encode(&made.cloud, args.spz_version)?;
-            let background = settings.train.background.map(|channel| channel as f32);
             let read_back = format.decode(&bytes)?;
             let times = low_pass::measured(made.larger);
-            let loss = made.yardstick.of_cloud(gpu, &read_back, times, &settings.render, background)?;
+            let loss = made.yardstick.of_cloud(gpu, &read_back, times, &settings.render)?;
             let name = format.file();
             made.losses.push((format!("{name}, {}", size(bytes.len())), loss));
             written.push((File { name, bytes: bytes.len(), loss }, bytes));
         }
         let (files, contents): (Vec<File>, Vec<Vec<u8>>) = written.into_iter().unzip();
-        let figures = figures(args, gpu.info().name.clone(), &scene, &settings, &made, files, began);
+        let figures = figures(args, gpu.info().name.clone(), &scene, &made, files, began);
         let text = serde_json::to_string_pretty(&figures)? + "\n";
         let named =
             figures.files.iter().zip(&contents).map(|(file, bytes)| (folder.join(&file.name), bytes.as_slice()));
@@ -413,15 +415,7 @@ pub(super) fn export(
     }))
 }
 
-fn figures(
-    args: &Args,
-    device: String,
-    scene: &Scene,
-    settings: &Settings,
-    made: &Export,
-    files: Vec<File>,
-    began: Instant,
-) -> Figures {
+fn figures(args: &Args, device: String, scene: &Scene, made: &Export, files: Vec<File>, began: Instant) -> Figures {
     let command: Vec<String> = std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect();
     let stages = made.losses.iter().take(made.losses.len() - files.len());
     let loss = stages.filter_map(|(name, loss)| Some((name.clone(), serde_json::to_value(loss).ok()?)));
@@ -449,7 +443,7 @@ fn figures(
         seconds: began.elapsed().as_secs_f64(),
         loss: loss.collect(),
         files,
-        cameras: Cameras { background: settings.train.background, focus, cameras: cameras.collect() },
+        cameras: Cameras { background: BLACK, focus, cameras: cameras.collect() },
     }
 }
 

@@ -71,8 +71,7 @@ pub(super) fn measure(
 ) -> anyhow::Result<Measured> {
     let mut model = Stored::load(folder)?;
     model.rescale(1.0 / scene.unit);
-    let background = settings.train.background.map(|channel| channel as f32);
-    let mut renderer = Renderer::of(gpu, &model, &settings.render, background)?;
+    let mut renderer = Renderer::of(gpu, &model, &settings.render)?;
     let style = ProgressStyle::with_template("judging {wide_bar} {pos}/{len} views, {eta} left")?;
     let bar = ProgressBar::new((scene.train.len() + scene.test.len()) as u64).with_style(style);
     let mut draw = |views: &[View]| -> anyhow::Result<Vec<Drawn>> {

@@ -119,7 +119,6 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         bail!("{}: the scene has no {} views; --views names others", scene.display(), args.views.name());
     }
     let out = args.out.clone().unwrap_or_else(|| args.model.join("renders").join(args.views.name()));
-    let background = settings.train.background.map(|channel| channel as f32);
     let _lock = Lock::take(&out)?;
     for (name, _) in &cameras {
         for path in [PICTURE, MAPS].map(|extension| pictures::path(&out, name, extension)) {
@@ -130,7 +129,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         }
     }
     args.device.with_gpu(|gpu| {
-        let mut renderer = Renderer::of(gpu, &model, &settings.render, background)?.larger(larger);
+        let mut renderer = Renderer::of(gpu, &model, &settings.render)?.larger(larger);
         let style = ProgressStyle::with_template("{wide_bar} {pos}/{len} views, {eta} left")?;
         let bar = ProgressBar::new(cameras.len() as u64).with_style(style);
         for (name, camera) in &cameras {

@@ -185,8 +185,7 @@ pub fn compose(gpu: &Gpu, request: &Request, go_on: &(dyn Fn() -> bool + Sync)) 
         downscale: longest.div_ceil(SIDE).max(1),
         test_every: 0,
         masks: false,
-        priors: false,
-        reference: false,
+        prior_folder: scene::NONE.into(),
         ..scene::Config::default()
     };
     let scene = scene::load(&request.into, &config)?;

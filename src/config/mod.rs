@@ -131,7 +131,7 @@ impl Settings {
         let at = |step: u32| (f64::from(step) * share).round() as u32;
         new.train.iterations = iterations;
         new.train.coarse.until = at(self.train.coarse.until);
-        (new.train.eval_interval, new.train.save_interval) = (0, 0);
+        new.train.eval_interval = 0;
         for group in Group::ALL {
             for rate in new.optimizer.learning_rate.of_mut(group) {
                 *rate *= share.powf(-RATE_EXPONENT);

@@ -2,6 +2,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::config::{Invalid, ensure};
 
+/// Grid levels at which anchors grow, coarse to fine (Scaffold-GS). Level i keeps a candidate with probability
+/// 1 - 0.5^(i + 1).
+pub const LEVELS: u32 = 3;
+
 /// Growing and pruning of anchors (Scaffold-GS, section 3.3).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default, expecting = "a table")]
@@ -19,9 +23,7 @@ pub struct Config {
     /// Mean screen-space gradient (in normalised device coordinates) from which a Gaussian asks for a new anchor at
     /// the coarsest level; doubled at each finer level.
     pub gradient_threshold: f64,
-    /// Grid levels, coarse to fine. Level i keeps a candidate with probability 1 - 0.5^(i + 1).
-    pub levels: u32,
-    /// Cell of the coarsest level, in voxels; each finer level divides it by 4 (16, 4, 1).
+    /// Cell of the coarsest of the [`LEVELS`], in voxels; each finer level divides it by 4 (16, 4, 1).
     pub coarsest_cell: f64,
     /// Count a step for a Gaussian only where it has a gradient: what only few views train is judged by these views
     /// (GScream: false).
@@ -54,7 +56,6 @@ impl Default for Config {
             every: 100,
             statistics_from: 500,
             gradient_threshold: 0.0002,
-            levels: 3,
             coarsest_cell: 16.0,
             count_touched: true,
             min_slot_visits: 40,
@@ -92,7 +93,6 @@ impl Config {
             self.gradient_threshold,
             "must be positive, at most 1e30",
         )?;
-        ensure((1..=8).contains(&self.levels), "levels", self.levels, "must be between 1 and 8")?;
         let cell = self.coarsest_cell;
         ensure(cell > 0.0 && cell <= 1e9, "coarsest_cell", cell, "must be positive, at most 1e9")?;
         let pixels = self.max_pixels;

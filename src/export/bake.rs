@@ -10,6 +10,7 @@ use crate::gpu::{Buffer, Gpu};
 use crate::math::harmonics::ZEROTH;
 use crate::model::anchors::Anchors;
 use crate::model::files;
+use crate::render::config::BACKGROUND;
 use crate::render::forward::{Capacity, Model};
 use crate::render::rasterize::{self, Backward, Outputs, Picture, PictureGradient};
 use crate::render::session::{Room, Stages};
@@ -51,7 +52,6 @@ impl Sums {
 pub struct Baker {
     gpu: Gpu,
     near: f64,
-    background: [f32; 3],
     session: Session<Shares>,
     anchors: Anchors,
     weights: Buffer<f32>,
@@ -82,12 +82,7 @@ impl Baker {
     ///
     /// # Errors
     /// As [`Gpu::buffer`].
-    pub fn new(
-        gpu: &Gpu,
-        model: (&files::Anchors, &files::Weights),
-        config: &Config,
-        background: [f32; 3],
-    ) -> Result<Self, Error> {
+    pub fn new(gpu: &Gpu, model: (&files::Anchors, &files::Weights), config: &Config) -> Result<Self, Error> {
         let (anchors, weights) = model;
         let each = anchors.offsets_per_anchor;
         let position = (0..anchors.position.len() * each).map(|i| {
@@ -100,7 +95,6 @@ impl Baker {
         Ok(Self {
             gpu: gpu.clone(),
             near: config.near,
-            background,
             session: Session::new(gpu, config, capacity, Shares::new)?,
             anchors: Anchors::upload(gpu, anchors, 0)?,
             weights: gpu.upload("weights", &weights.decoders())?,
@@ -120,10 +114,9 @@ impl Baker {
     /// When the device has no room for it, or is lost.
     pub fn look(&mut self, camera: &Camera) -> Result<image::RgbImage, Error> {
         let model = Model::Anchors { anchors: &self.anchors, weights: &self.weights };
-        let background = self.background;
         let stages = self.session.run(model, camera, |rec, stages, binned| {
             let Stages { room, forward, own: Shares { picture, backward, ones } } = stages;
-            rasterize::forward(rec, room.method, forward.projected(), binned, background, picture);
+            rasterize::forward(rec, room.method, forward.projected(), binned, BACKGROUND, picture);
             let gradient = PictureGradient { rgb: ones, depth: None, transmittance: None };
             backward.record(rec, room.method, forward.projected(), binned, picture, gradient);
         })?;

@@ -136,7 +136,7 @@ impl Drawer {
     }
 
     fn method(&self) -> Method {
-        Method::new(&self.gpu, &self.config).expect("the configured method was taken when the stages were made")
+        Method::new(&self.gpu, &self.config)
     }
 
     fn projected<'s>(&'s self, stages: &'s Stages) -> Projected<'s> {
@@ -215,7 +215,7 @@ impl Drawer {
         }
         if stages.is_none() {
             let n = gaussians.count;
-            let method = Method::new(gpu, config)?;
+            let method = Method::new(gpu, config);
             let project = Project::new(gpu, n, 1)?;
             for parameter in gaussians.parameters_mut() {
                 parameter.make_gradient(gpu)?;

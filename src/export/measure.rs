@@ -11,6 +11,7 @@ use crate::evaluate::{self, Mean, Report, ViewMetrics};
 use crate::gpu::Gpu;
 use crate::model::gaussians::Static;
 use crate::render::Config;
+use crate::render::config::BACKGROUND;
 use crate::render::view::{Renderer, to_rgb8};
 use crate::scene::{Camera, Scene};
 
@@ -100,15 +101,8 @@ impl Yardstick {
     ///
     /// # Errors
     /// When the device has no room, or is lost.
-    pub fn of_cloud(
-        &self,
-        gpu: &Gpu,
-        cloud: &Cloud,
-        times: u32,
-        config: &Config,
-        background: [f32; 3],
-    ) -> Result<Loss, Error> {
-        self.of_drawing(&mut Drawer::new(gpu, Static::upload(gpu, cloud)?, config, background)?, times)
+    pub fn of_cloud(&self, gpu: &Gpu, cloud: &Cloud, times: u32, config: &Config) -> Result<Loss, Error> {
+        self.of_drawing(&mut Drawer::new(gpu, Static::upload(gpu, cloud)?, config, BACKGROUND)?, times)
     }
 
     /// The Gaussians of a drawer as they are now.

@@ -21,6 +21,7 @@ use crate::model::files;
 use crate::model::gaussians::Static;
 pub use crate::model::gaussians::{Cloud, logit, sigmoid};
 use crate::model::stored::Stored;
+use crate::render::config::BACKGROUND;
 use crate::render::view::Renderer;
 use crate::scene::{Camera, Scene};
 use crate::signal::Signal;
@@ -166,7 +167,6 @@ pub fn of_gaussians(
     options: &Options,
     observer: &mut dyn Observer,
 ) -> Result<Export, Error> {
-    let background = settings.train.background.map(|channel| channel as f32);
     let train: Vec<Camera> = scene.train.iter().map(|view| view.camera).collect();
     let turn = if options.upright { up::upright(&train) } else { DMat3::IDENTITY };
     let turned = |camera: &Camera| up::turn_camera(camera, turn);
@@ -174,7 +174,7 @@ pub fn of_gaussians(
     let tests = if scene.test.is_empty() { held_out.len() } else { scene.test.len() };
     observer.begin("drawing the Gaussians to compare with", tests as u64);
     let model = Stored::Gaussians(cloud.clone());
-    let mut renderer = Renderer::of(gpu, &model, &settings.render, background)?;
+    let mut renderer = Renderer::of(gpu, &model, &settings.render)?;
     let yardstick = measure::Yardstick::new(&mut renderer, scene, &held_out, turned, || observer.turn(""))?;
     let losses = vec![("Gaussians".to_owned(), yardstick.of_anchors()?)];
     let mut cloud = cloud.clone();
@@ -205,7 +205,6 @@ pub fn make(
     options: &Options,
     observer: &mut dyn Observer,
 ) -> Result<Export, Error> {
-    let background = settings.train.background.map(|channel| channel as f32);
     let train: Vec<Camera> = scene.train.iter().map(|view| view.camera).collect();
     let turn = if options.upright { up::upright(&train) } else { DMat3::IDENTITY };
     let turned = |camera: &Camera| up::turn_camera(camera, turn);
@@ -216,13 +215,13 @@ pub fn make(
     let held_out = poses::virtual_views(&train, HELD_OUT, !options.seed);
     let tests = if scene.test.is_empty() { held_out.len() } else { scene.test.len() };
     observer.begin("drawing the anchors to compare with", tests as u64);
-    let mut renderer = Renderer::new(gpu, model.0, model.1, &settings.render, background)?;
+    let mut renderer = Renderer::new(gpu, model.0, model.1, &settings.render)?;
     let yardstick = measure::Yardstick::new(&mut renderer, scene, &held_out, turned, || observer.turn(""))?;
     drop(renderer);
     let mut losses = vec![("anchors".to_owned(), yardstick.of_anchors()?)];
 
     observer.begin("baking", cameras.len() as u64);
-    let mut baker = bake::Baker::new(gpu, model, &settings.render, background)?;
+    let mut baker = bake::Baker::new(gpu, model, &settings.render)?;
     let mut views = vec![];
     for camera in &cameras {
         views.push((turned(camera), baker.look(camera)?));
@@ -238,8 +237,7 @@ pub fn make(
         cloud.harmonics.iter().flat_map(|h| std::iter::once(*h).chain(vec![[0.0; 3]; each - 1])).collect();
     cloud.degree = options.degree;
 
-    let gaussian_config = &settings.render;
-    let mut drawer = draw::Drawer::new(gpu, Static::upload(gpu, &cloud)?, gaussian_config, background)?;
+    let mut drawer = draw::Drawer::new(gpu, Static::upload(gpu, &cloud)?, &settings.render, BACKGROUND)?;
     losses.push(("baked".to_owned(), yardstick.of_drawer(&mut drawer)?));
     observer.begin("refining", options.steps.into());
     let config = refine::Config { steps: options.steps, seed: options.seed, radius: scene.radius.into() };

@@ -10,7 +10,6 @@ pub type Choice = (&'static str, &'static [&'static str]);
 pub const KERNELS: &[Choice] = &[
     ("as set", &[]),
     ("no culling", &["render.cull=false"]),
-    ("wide tiles", &["render.tiles=\"wide\""]),
     ("alpha from 1/1000", &["render.alpha_threshold=0.001"]),
     ("alpha from 1/64", &["render.alpha_threshold=0.015625"]),
     ("no early stop", &["render.transmittance_threshold=0.0"]),

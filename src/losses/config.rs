@@ -2,6 +2,16 @@ use serde::{Deserialize, Serialize};
 
 use crate::config::{Invalid, ensure};
 
+/// Colour weight of the reference view's pixels inside the mask (GScream's release). Outside the mask every view weighs 1;
+/// inside the mask other views weigh 0.
+pub const REFERENCE_COLOR_INSIDE: f64 = 20.0;
+
+/// L1 weight of the reference view's depth outside the mask (GScream's release).
+pub const REFERENCE_DEPTH: f64 = 1.0;
+
+/// L1 weight of the reference view's depth inside the mask (GScream's release adds 99).
+pub const REFERENCE_DEPTH_INSIDE: f64 = 100.0;
+
 /// Weights of the losses (GScream, equations 3 to 7). A weight of zero removes its term from the step.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default, expecting = "a table")]
@@ -11,9 +21,6 @@ pub struct Config {
     /// Let SSIM's windows beside the mask compare what other views show inside it, the object, as GScream's release does
     /// by weighting the finished map; otherwise nothing inside their masks has a gradient.
     pub ssim_across_masks: bool,
-    /// Colour weight of the reference view's pixels inside the mask (GScream's release: 20). Outside the mask every
-    /// view weighs 1; inside the mask other views weigh 0.
-    pub reference_inside_weight: f64,
     /// The losses against depth priors.
     pub depth: Depth,
 }
@@ -24,15 +31,7 @@ pub struct Config {
 pub struct Depth {
     /// Whether depth priors are used at all.
     pub enabled: bool,
-    /// L1 weight on every pixel of the reference view.
-    pub reference_weight: f64,
-    /// L1 weight added to `reference_weight` inside the mask.
-    pub reference_inside_weight: f64,
-    /// The reference's prior is brought to the scene's depth by the points of the model, once; `false` fits the rendered
-    /// depth to it in every step (GScream, equation 4). Rendered depth is nearer than the surface where something thin hangs
-    /// in front of it, and a fit hands that error on to the hole.
-    pub align_to_points: bool,
-    /// L1 weight outside the mask on the other views.
+    /// L1 weight outside the mask on the other views, and the share of the gradient's weight that they have there.
     pub other_weight: f64,
     /// The multi-scale gradient of the depth difference.
     pub gradient: DepthGradient,
@@ -42,36 +41,27 @@ pub struct Depth {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default, expecting = "a table")]
 pub struct DepthGradient {
-    /// Its weight on the reference view, all pixels.
+    /// Its weight on the reference view, all pixels; other views have [`Depth::other_weight`] of it.
     pub weight: f64,
-    /// The share of it on the other views, outside the mask.
-    pub other_weight: f64,
     /// Number of scales: scale s takes every 2^s-th pixel.
     pub scales: u32,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        Self { ssim_weight: 0.2, ssim_across_masks: false, reference_inside_weight: 20.0, depth: Depth::default() }
+        Self { ssim_weight: 0.2, ssim_across_masks: false, depth: Depth::default() }
     }
 }
 
 impl Default for Depth {
     fn default() -> Self {
-        Self {
-            enabled: true,
-            reference_weight: 1.0,
-            reference_inside_weight: 99.0,
-            align_to_points: true,
-            other_weight: 0.1,
-            gradient: DepthGradient::default(),
-        }
+        Self { enabled: true, other_weight: 0.1, gradient: DepthGradient::default() }
     }
 }
 
 impl Default for DepthGradient {
     fn default() -> Self {
-        Self { weight: 0.5, other_weight: 0.1, scales: 4 }
+        Self { weight: 0.5, scales: 4 }
     }
 }
 
@@ -79,14 +69,8 @@ impl Config {
     /// Refuses values that no run could use.
     pub fn validate(&self) -> Result<(), Invalid> {
         ensure((0.0..=1.0).contains(&self.ssim_weight), "ssim_weight", self.ssim_weight, "must be between 0 and 1")?;
-        let weights = [
-            ("reference_inside_weight", self.reference_inside_weight),
-            ("depth.reference_weight", self.depth.reference_weight),
-            ("depth.reference_inside_weight", self.depth.reference_inside_weight),
-            ("depth.other_weight", self.depth.other_weight),
-            ("depth.gradient.weight", self.depth.gradient.weight),
-            ("depth.gradient.other_weight", self.depth.gradient.other_weight),
-        ];
+        let weights =
+            [("depth.other_weight", self.depth.other_weight), ("depth.gradient.weight", self.depth.gradient.weight)];
         for (key, weight) in weights {
             // Beyond, a loss leaves float32.
             ensure((0.0..=1e30).contains(&weight), key, weight, "must be zero or a positive number, at most 1e30")?;

@@ -48,11 +48,9 @@ pub struct Config {
     pub voxel_factor: f64,
     /// Gaussians per anchor (Scaffold-GS: 10).
     pub offsets: u32,
-    /// The first three features of an anchor begin as the mean colour of its points, from -1 to 1 times this; 0: all
-    /// features begin as 0 (Scaffold-GS).
+    /// The first three features of an anchor begin as the mean colour of its points, from -1 to 1 times this, and its offsets
+    /// uniformly in +- half of this, in units of its scaling; 0: all begin as 0 (Scaffold-GS).
     pub color_features: f64,
-    /// Offsets begin uniformly in +- this, in units of the anchor's scaling; 0: all begin as 0 (Scaffold-GS).
-    pub spread: f64,
     /// Opacity that the decoder's last bias gives all Gaussians to begin with; 0: that bias is random as PyTorch's, and
     /// many Gaussians never exist (Scaffold-GS). Plain Gaussians begin with it, too, and with 0.1 where it is 0 (3DGS).
     pub opacity: f64,
@@ -94,7 +92,6 @@ impl Default for Config {
             voxel_factor: 1.0,
             offsets: 10,
             color_features: 0.0,
-            spread: 0.0,
             opacity: 0.0,
             attention: Attention::default(),
         }
@@ -138,8 +135,7 @@ impl Config {
         ensure(factor.is_finite() && factor > 0.0, "voxel_factor", factor, "must be positive")?;
         ensure((1..=32).contains(&self.offsets), "offsets", self.offsets, "must be between 1 and 32")?;
         let gain = self.color_features;
-        ensure((0.0..=100.0).contains(&gain), "color_features", gain, "must be between 0 and 100")?;
-        ensure((0.0..=10.0).contains(&self.spread), "spread", self.spread, "must be between 0 and 10")?;
+        ensure((0.0..=20.0).contains(&gain), "color_features", gain, "must be between 0 and 20")?;
         ensure((0.0..=0.9).contains(&self.opacity), "opacity", self.opacity, "must be between 0 and 0.9")?;
         let attention = &self.attention;
         ensure(attention.patch > 0, "attention.patch", attention.patch, "must be at least 1 pixel")?;

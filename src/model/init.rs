@@ -97,7 +97,7 @@ pub fn anchors(points: &[[f32; 3]], voxel: f64, offsets_per_anchor: usize) -> Re
 /// Anchors for these points at the voxel that the settings name, or at the one derived from the points times its factor.
 ///
 /// The first three features are the mean colour of the anchor's points, from -1 to 1 times `color_features`; the offsets
-/// are uniform in +-`spread`, drawn from `seed`. Both settings are 0 for Scaffold-GS's zeros.
+/// are uniform in +- half of it, drawn from `seed`. 0 gives Scaffold-GS's zeros.
 ///
 /// # Errors
 /// As [`anchors`].
@@ -113,10 +113,8 @@ pub fn from_points(points: &[Point], config: &super::Config, seed: u64) -> Resul
                 *feature = (config.color_features * (color / 127.5 - 1.0)) as f32;
             }
         }
-    }
-    if config.spread > 0.0 {
         let mut generator = Pcg64::new(u128::from(seed), OFFSETS_STREAM);
-        let spread = config.spread as f32;
+        let spread = (0.5 * config.color_features) as f32;
         let uniform = Uniform::new_inclusive(-spread, spread).expect("the bound is positive and finite");
         initial.anchors.offset.fill_with(|| uniform.sample(&mut generator));
     }
@@ -425,13 +423,13 @@ mod tests {
             point([9.0, 0.0, 0.0], [0, 255, 0]),
             point([-0.1, 0.0, 0.0], [0, 0, 204]),
         ];
-        let config = crate::model::Config { voxel: 1.0, color_features: 2.0, spread: 0.25, ..Default::default() };
+        let config = crate::model::Config { voxel: 1.0, color_features: 2.0, ..Default::default() };
         let made = |points: &[Point], seed| from_points(points, &config, seed).expect("points").anchors;
         let anchors = made(&points, 1);
         assert_eq!(anchors.feature[0][..4], [0.0, -2.0, 0.0, 0.0]);
         assert_eq!(anchors.feature[1][..4], [-2.0, 2.0, -2.0, 0.0]);
-        assert!(anchors.offset.iter().all(|v| v.abs() <= 0.25));
-        assert!(anchors.offset.iter().any(|v| *v > 0.15) && anchors.offset.iter().any(|v| *v < -0.15));
+        assert!(anchors.offset.iter().all(|v| v.abs() <= 1.0));
+        assert!(anchors.offset.iter().any(|v| *v > 0.6) && anchors.offset.iter().any(|v| *v < -0.6));
         let backwards: Vec<Point> = points.iter().rev().cloned().collect();
         assert_eq!(made(&backwards, 1), anchors, "the order of the points does not matter");
         assert_ne!(made(&points, 2).offset, anchors.offset, "another seed, other offsets");

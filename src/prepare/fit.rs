@@ -36,7 +36,7 @@ pub fn settings(request: &Request, points: usize) -> Settings {
     train.iterations = steps;
     train.seed = request.seed;
     train.log_interval = part(0.1);
-    (train.eval_interval, train.save_interval, train.checkpoint_interval) = (0, 0, 0);
+    (train.eval_interval, train.checkpoint_interval) = (0, 0);
     settings.model.voxel = 0.0;
     settings.model.voxel_factor = (points as f64 / POINTS).sqrt().clamp(1.0, 6.0);
     settings.model.attention.enabled = false;

@@ -442,9 +442,8 @@ impl Preparation<'_> {
         let config = scene::Config {
             downscale,
             masks: false,
-            priors: false,
+            prior_folder: scene::NONE.into(),
             relight,
-            reference: false,
             ..scene::Config::default()
         };
         let mut scene = scene::load(self.folder.root(), &config)?;

@@ -8,6 +8,9 @@ pub const ALPHA_MIN: f64 = 1.0 / 255.0;
 /// A pixel is finished before its transmittance falls below this, unless the settings say otherwise.
 pub const TRANSMITTANCE_MIN: f64 = 1e-4;
 
+/// What shines through where nothing covers a pixel: black (GScream).
+pub const BACKGROUND: [f32; 3] = [0.0; 3];
+
 /// How anchors become a picture. The low-pass (0.3 px^2) and the largest alpha (0.99) define the picture and are not
 /// settings.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -23,31 +26,11 @@ pub struct Config {
     /// A pixel is finished before the Gaussian that would bring its transmittance below this (3DGS: 1e-4); 0 never
     /// finishes early.
     pub transmittance_threshold: f64,
-    /// Shape of the rasteriser's tiles. Changes the time only.
-    pub tiles: Tiles,
-}
-
-/// Shape of the rasteriser's tiles.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Tiles {
-    /// The better one for the device.
-    Auto,
-    /// 16 x 16 pixels, 64 threads.
-    Wide,
-    /// 8 x 8 pixels, 8 threads: only where subgroups have 8 threads (CPU drivers).
-    Narrow,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        Self {
-            near: 0.2,
-            cull: true,
-            alpha_threshold: ALPHA_MIN,
-            transmittance_threshold: TRANSMITTANCE_MIN,
-            tiles: Tiles::Auto,
-        }
+        Self { near: 0.2, cull: true, alpha_threshold: ALPHA_MIN, transmittance_threshold: TRANSMITTANCE_MIN }
     }
 }
 

@@ -1,8 +1,8 @@
 //! How a picture is computed on a device: the choices of [`super::Config`] that trade accuracy for time, resolved.
 
-use super::config::{Config, Tiles};
+use super::config::Config;
 use super::tiling::Tiling;
-use crate::gpu::{Error, Gpu};
+use crate::gpu::Gpu;
 
 /// What binning and blending are specialised for. Forward and backward passes of a picture must agree on it.
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -19,23 +19,8 @@ pub struct Method {
 
 impl Method {
     /// The configured method on this device.
-    ///
-    /// # Errors
-    /// [`Error::Missing`] when the device cannot run the tiles asked for.
-    pub fn new(gpu: &Gpu, config: &Config) -> Result<Self, Error> {
-        let tiling = match config.tiles {
-            Tiles::Auto => Tiling::of(gpu),
-            Tiles::Wide => Tiling::Wide,
-            Tiles::Narrow if gpu.runs_lanes() => Tiling::Narrow,
-            Tiles::Narrow => {
-                return Err(Error::Missing {
-                    device: gpu.info().name.clone(),
-                    feature: "subgroups of 8 threads, for render.tiles = \"narrow\" (\"auto\" takes what it has)"
-                        .into(),
-                });
-            }
-        };
-        Ok(Self::of(tiling, config))
+    pub fn new(gpu: &Gpu, config: &Config) -> Self {
+        Self::of(Tiling::of(gpu), config)
     }
 
     fn of(tiling: Tiling, config: &Config) -> Self {

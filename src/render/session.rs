@@ -65,7 +65,7 @@ impl<S> Session<S> {
     ) -> Result<Self, Error> {
         Ok(Self {
             gpu: gpu.clone(),
-            method: Method::new(gpu, config)?,
+            method: Method::new(gpu, config),
             near: config.near as f32,
             cull: config.cull,
             larger: 1.0,

@@ -1,5 +1,6 @@
 //! One picture from a finished model, for files and figures.
 
+use super::config::BACKGROUND;
 use super::forward::{Capacity, Model};
 use super::rasterize::{self, Outputs, Picture};
 use super::session::{Room, Session, Stages};
@@ -62,7 +63,6 @@ pub fn to_rgb8([width, height]: [u32; 2], rgb: &[[f32; 3]]) -> image::RgbImage {
 /// Draws views of a model.
 pub struct Painter {
     session: Session<Picture>,
-    background: [f32; 3],
 }
 
 impl Painter {
@@ -70,15 +70,15 @@ impl Painter {
     ///
     /// # Errors
     /// As [`Session::new`].
-    pub fn new(gpu: &Gpu, config: &super::Config, background: [f32; 3], capacity: Capacity) -> Result<Self, Error> {
+    pub fn new(gpu: &Gpu, config: &super::Config, capacity: Capacity) -> Result<Self, Error> {
         let picture = |gpu: &Gpu, room: Room| Picture::new(gpu, room.size, room.pixels(), Outputs::Transmittance);
-        Ok(Self { session: Session::new(gpu, config, capacity, picture)?, background })
+        Ok(Self { session: Session::new(gpu, config, capacity, picture)? })
     }
 
     /// For pictures `larger` times as large as those of the training.
     #[must_use]
     pub fn larger(self, larger: f64) -> Self {
-        Self { session: self.session.larger(larger), ..self }
+        Self { session: self.session.larger(larger) }
     }
 
     /// Renders one view; buffers grow as it needs.
@@ -100,10 +100,10 @@ impl Painter {
     /// # Panics
     /// As [`Session::run`].
     pub fn render_within(&mut self, model: Model<'_>, camera: &Camera, most: u32) -> Result<Option<Rendered>, Error> {
-        let (gpu, background) = (self.session.gpu().clone(), self.background);
+        let gpu = self.session.gpu().clone();
         let drawn = self.session.run_within(model, camera, most, |rec, stages, binned| {
             let Stages { room, forward, own: picture } = stages;
-            rasterize::forward(rec, room.method, forward.projected(), binned, background, picture);
+            rasterize::forward(rec, room.method, forward.projected(), binned, BACKGROUND, picture);
         })?;
         drawn.map(|stages| Rendered::read(&gpu, &stages.own)).transpose()
     }
@@ -174,11 +174,10 @@ impl Renderer {
         anchors: &files::Anchors,
         weights: &files::Weights,
         config: &super::Config,
-        background: [f32; 3],
     ) -> Result<Self, Error> {
         let weights = gpu.upload("weights", &weights.decoders())?;
         let anchors = Anchors::upload(gpu, anchors, 0)?;
-        let painter = Painter::new(gpu, config, background, Capacity::guess(anchors.count))?;
+        let painter = Painter::new(gpu, config, Capacity::guess(anchors.count))?;
         Ok(Self { painter, model: Finished::Anchors(anchors, weights) })
     }
 
@@ -186,9 +185,9 @@ impl Renderer {
     ///
     /// # Errors
     /// When the device has no room for it.
-    pub fn of(gpu: &Gpu, model: &Stored, config: &super::Config, background: [f32; 3]) -> Result<Self, Error> {
+    pub fn of(gpu: &Gpu, model: &Stored, config: &super::Config) -> Result<Self, Error> {
         let model = Finished::upload(gpu, model)?;
-        let painter = Painter::new(gpu, config, background, Capacity::guess(model.count()))?;
+        let painter = Painter::new(gpu, config, Capacity::guess(model.count()))?;
         Ok(Self { painter, model })
     }
 

@@ -21,49 +21,38 @@ pub struct Config {
     pub leave_out: Vec<String>,
     /// Use the train masks; `false` trains on every pixel, the object included. Without masks there is no reference either.
     pub masks: bool,
-    /// Use the depth priors.
-    pub priors: bool,
     /// Take the object's shadow out of the photographs, where `prepare` has found it (`relight/`).
     pub relight: bool,
     /// Train the other views on their holes as `prepare` has filled them (`hole/`), instead of on nothing there (GScream: off).
     pub fill_holes: bool,
-    /// Use the inpainted reference view.
-    pub reference: bool,
     /// Length of the model's that counts as one wherever a setting means a length; 0 takes a third of the median depth of
     /// the points, so that the unit of the capture changes nothing (GScream: 1).
     pub unit: f64,
     /// Divide each photograph by its exposure and white balance over the others', by what they show of the same points, where
     /// these differ (GScream: off).
     pub even_exposures: bool,
-    /// Leave out points that fall into the mask in more than this share of the views that have them in the picture: they
-    /// stand on the object. 1 keeps all (GScream).
-    pub object_point_share: f64,
-    /// Hold each prior against the points of the model: one that does not follow them is not used, and disparity is
-    /// turned into depth.
+    /// Hold each prior against the points of the model: one that does not follow them is not used, disparity is turned into
+    /// depth, and a reference picture without prior gets a guess from the points around its hole. The reference's prior has
+    /// its depth from the points, once; `false` fits the rendered depth to it in every step (GScream, equation 4). Rendered
+    /// depth is nearer than the surface where something thin hangs in front of it, and a fit hands that error on to the hole.
     pub check_priors: bool,
-    /// Guess the depth of a reference picture without prior from the points around its hole.
-    pub guess_reference_prior: bool,
-    /// Add points in the hole, at the depth of the reference's prior, and behind its depth edges, where other train
-    /// cameras see what neither the reference nor any photograph shows.
+    /// Leave out the points that stand on the object, and add points in the hole, at the depth of the reference's prior, and
+    /// behind its depth edges, where other train cameras see what neither the reference nor any photograph shows (GScream:
+    /// off).
     pub seed_hole: bool,
     /// Add points where the photographs agree on a depth and the model has none, and on planes around what stays unknown:
     /// floors, walls and what is far off get anchors, too. A view in which hardly anything agrees with the others is left
     /// out (GScream: off).
     pub dense: bool,
-    /// Let the train masks grow by as many pixels as an inpainted picture was repainted beyond its own: the object's shadow
-    /// goes with it, and what the photographs show there. A picture that is the photograph outside its mask changes nothing.
-    pub grow_masks: bool,
     /// Let the train masks fall off over so many pixels around the object, at the training size: its antialiased edge and
     /// shadow reach beyond the mask. 0: masks are hard (GScream).
     pub rim: u32,
     /// Hold the pixels around the train masks against the other views: what disagrees with them and hangs together with the
     /// mask counts less, or not at all. Masks that are too tight, reflections (GScream: off).
     pub judge_rim: bool,
-    /// Use the inpainted picture outside its hole too (GScream), instead of the photograph.
+    /// Let the inpainted picture count everywhere alike (GScream). Otherwise the photograph takes its place outside its hole,
+    /// and in the hole other views that see past the object outrank it.
     pub whole_reference: bool,
-    /// So many other views that see a part of the hole past the object outrank the painted picture there, fewer in
-    /// proportion; 0: the painted picture counts everywhere alike (GScream).
-    pub outrank_guess: u32,
     /// Name of a test view, which shows the place without the object, to train on as the reference in place of the
     /// delivered one: what was inpainted is then the truth. Its hole is its test mask. Empty for the delivered reference.
     pub truth_reference: String,
@@ -72,14 +61,21 @@ pub struct Config {
     /// measured over the other test views, by [`condition`](super::condition).
     pub truth_prior: String,
     /// Depth priors in place of the scene's own: a folder, in the scene's unless the path is absolute. Its name says
-    /// `disparity`, or it is depth; `reference/` in it has the inpainted picture's. Empty for the scene's own.
+    /// `disparity`, or it is depth; `reference/` in it has the inpainted picture's. Empty for the scene's own, `none` for
+    /// none.
     pub prior_folder: String,
     /// Inpainted picture in place of the delivered one: a file, in the scene's folder unless the path is absolute. It is
-    /// that of the train view whose name it has, or of the delivered picture's view. Empty for the delivered one.
+    /// that of the train view whose name it has, or of the delivered picture's view. Empty for the delivered one, `none` for
+    /// no reference view.
     pub reference_file: String,
 }
 
 impl Config {
+    /// Whether the scene's reference view takes part.
+    pub(super) fn has_reference(&self) -> bool {
+        self.masks && self.reference_file != NONE
+    }
+
     /// Refuses values that no scene could be read with.
     pub fn validate(&self) -> Result<(), Invalid> {
         ensure(self.downscale > 0, "downscale", self.downscale, "must be at least 1")?;
@@ -92,13 +88,6 @@ impl Config {
             unit,
             "must be a positive length, or 0 to find it",
         )?;
-        let share = self.object_point_share;
-        ensure(
-            (0.0..=1.0).contains(&share),
-            "object_point_share",
-            share,
-            "must be between 0 and 1 (1 keeps all points)",
-        )?;
         ensure(self.rim <= 64, "rim", self.rim, "must be at most 64 pixels")
     }
 }
@@ -106,8 +95,9 @@ impl Config {
 /// Largest [`Config::dilate_masks`]: a mask that needs more is none of the object.
 const MOST_DILATION: u32 = 1024;
 
-/// What [`Config::truth_prior`] says for no prior.
-pub(super) const NO_PRIOR: &str = "none";
+/// What a setting of files says for leaving out what they would hold: [`Config::prior_folder`], [`Config::reference_file`]
+/// and [`Config::truth_prior`].
+pub const NONE: &str = "none";
 /// What [`Config::truth_prior`] says for depth measured over the other test views.
 pub(super) const STEREO_PRIOR: &str = "stereo";
 
@@ -120,22 +110,16 @@ impl Default for Config {
             test_every: 0,
             leave_out: vec![],
             masks: true,
-            priors: true,
             relight: true,
             fill_holes: true,
-            reference: true,
             unit: 0.0,
             even_exposures: true,
-            object_point_share: 0.9,
             check_priors: true,
-            guess_reference_prior: true,
             seed_hole: true,
             dense: true,
-            grow_masks: false,
             rim: 1,
             judge_rim: true,
             whole_reference: false,
-            outrank_guess: 5,
             truth_reference: String::new(),
             truth_prior: String::new(),
             prior_folder: String::new(),

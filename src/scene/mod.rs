@@ -51,8 +51,8 @@ use rayon::prelude::*;
 pub use camera::{Camera, distort, undistort};
 pub use condition::{condition, footprint};
 pub(crate) use condition::{on_object, samples};
-pub use config::Config;
-use config::{NO_PRIOR, STEREO_PRIOR};
+use config::STEREO_PRIOR;
+pub use config::{Config, NONE};
 pub use error::Error;
 pub(crate) use exposure::even_out;
 pub use hole::{HOLE, Hole, MADE_WITH};
@@ -170,10 +170,11 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     }
     let no_masks = layout.train.iter().all(|e| e.mask.is_none());
     let clean_views = !layout.test.is_empty();
-    if !config.prior_folder.is_empty() {
+    let no_priors_wanted = config.prior_folder == NONE;
+    if !config.prior_folder.is_empty() && !no_priors_wanted {
         take_priors(dir, config, &mut layout, &mut notes)?;
     }
-    if !config.reference_file.is_empty() {
+    if !config.reference_file.is_empty() && config.reference_file != NONE {
         take_reference(dir, config, &mut layout, &mut notes)?;
     }
     let mut truth = None;
@@ -191,8 +192,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
         notes.push(format!("{file} is not used: without masks there is no hole to fill"));
         references.clear();
     }
-    let wanted = config.masks && config.reference;
-    if !wanted && !references.is_empty() {
+    if !config.has_reference() && !references.is_empty() {
         references.clear();
         notes.push("the reference view is ignored, as configured");
     }
@@ -211,7 +211,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
         notes.push("the train masks are ignored, as configured: every pixel is trained on, the object included");
     }
     let no_priors = layout.train.iter().all(|e| e.prior.is_none());
-    if !config.priors {
+    if no_priors_wanted {
         let any = !no_priors || references.iter().any(|r| r.prior.is_some());
         layout.train.iter_mut().for_each(|e| e.prior = None);
         references.iter_mut().for_each(|r| r.prior = None);
@@ -463,7 +463,7 @@ fn take_truth(dir: &Path, config: &Config, layout: &mut layout::Layout, notes: &
             let exact = entry.depth.clone().map(|path| (path, PriorKind::Depth));
             entry.prior.clone().or(exact).map(|(path, kind)| layout::ReferencePrior { path, kind: Some(kind) })
         }
-        NO_PRIOR | STEREO_PRIOR => None,
+        NONE | STEREO_PRIOR => None,
         file => {
             let path = dir.join(file);
             let kind = layout::said_kind(&path);
@@ -573,9 +573,10 @@ fn summarise(
     }
     let priors = train.iter().filter(|v| v.prior.is_some()).count();
     let reference_prior = references.iter().any(|r| r.prior.is_some());
-    if config.priors && priors == 0 && !reference_prior {
+    let wanted = config.prior_folder != NONE;
+    if wanted && priors == 0 && !reference_prior {
         notes.push("no depth priors: the depth losses are off");
-    } else if config.priors && (priors < train.len() || !references.is_empty() && !reference_prior) {
+    } else if wanted && (priors < train.len() || !references.is_empty() && !reference_prior) {
         let without = train.len() - priors;
         let hole = if !references.is_empty() && !reference_prior { ", nor has the inpainted picture" } else { "" };
         notes.push(format!("{without} of {} train views have no depth prior{hole}: no depth loss there", train.len()));
@@ -722,7 +723,7 @@ fn read_holes(
     if filled.is_empty() {
         return Ok(vec![]);
     }
-    if !(config.masks && config.reference && config.fill_holes) {
+    if !(config.has_reference() && config.fill_holes) {
         notes.push(format!("{HOLE}/ is ignored, as configured: the other views' holes are not trained on"));
         return Ok(vec![]);
     }

@@ -167,7 +167,7 @@ impl<'a> Artist<'a> {
     pub fn new(gpu: &'a Gpu, cloud: &'a Cloud, config: &Config) -> Result<Self, Error> {
         fits(gpu, cloud.len())?;
         let whole = if cloud.len() <= Static::most(gpu, cloud.degree) as usize {
-            Some(Renderer::of(gpu, &Stored::Gaussians(cloud.clone()), config, [0.0; 3])?)
+            Some(Renderer::of(gpu, &Stored::Gaussians(cloud.clone()), config)?)
         } else {
             None
         };
@@ -183,7 +183,7 @@ impl<'a> Artist<'a> {
             return Ok(whole.render(camera)?);
         }
         let model = Stored::Gaussians(toward(self.cloud, camera));
-        Ok(Renderer::of(self.gpu, &model, &self.config, [0.0; 3])?.render(camera)?)
+        Ok(Renderer::of(self.gpu, &model, &self.config)?.render(camera)?)
     }
 }
 

@@ -15,14 +15,11 @@ pub struct Config {
     /// Share of the steps that see the reference view, evenly spread; 0 visits it as often as any other view (GScream).
     /// What only it shows is trained in its steps alone.
     pub reference_share: f64,
-    /// Colour behind the scene, RGB in \[0, 1\] (GScream: black).
-    pub background: [f64; 3],
     /// Steps between two lines of the JSON log.
     pub log_interval: u32,
-    /// Steps between two evaluations on the test views; 0 evaluates only at the end.
+    /// Steps between two saves of the model, each in place of the one before and evaluated on the test views; 0 saves and
+    /// evaluates only at the end.
     pub eval_interval: u32,
-    /// Steps between two saves of the model, each in place of the one before; 0 saves only at the end.
-    pub save_interval: u32,
     /// Steps between two checkpoints, of which the last two are kept; 0 writes one only when a run ends early. A run
     /// that has ended well keeps none.
     pub checkpoint_interval: u32,
@@ -71,10 +68,8 @@ impl Default for Config {
             seed: 0,
             view_order: ViewOrder::Shuffled,
             reference_share: 0.18,
-            background: [0.0; 3],
             log_interval: 100,
             eval_interval: 5_000,
-            save_interval: 5_000,
             checkpoint_interval: 1_000,
             sentinel_interval: 50,
             corrections: vec![],
@@ -92,12 +87,6 @@ impl Config {
             "seed",
             self.seed,
             "must be below 2^63, the largest integer a TOML file holds",
-        )?;
-        ensure(
-            self.background.iter().all(|channel| (0.0..=1.0).contains(channel)),
-            "background",
-            format_args!("{:?}", self.background),
-            "must be three numbers between 0 and 1",
         )?;
         let share = self.reference_share;
         ensure((0.0..=0.9).contains(&share), "reference_share", share, "must be between 0 and 0.9")?;

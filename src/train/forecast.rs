@@ -16,6 +16,7 @@ use super::photographs;
 use super::plan::Plan;
 use super::step::{Rates, Step};
 use crate::config::Settings;
+use crate::densify::config::LEVELS;
 use crate::gpu::{self, Gpu, Schedule, Used};
 use crate::model::anchors::Anchors;
 use crate::model::config::Form;
@@ -137,7 +138,7 @@ fn survey_of(
     cameras: Vec<&Camera>,
 ) -> Result<Survey, gpu::Error> {
     let size = cameras.iter().fold([1, 1], |a, c| [a[0].max(c.size[0]), a[1].max(c.size[1])]);
-    let method = Method::new(gpu, &settings.render)?;
+    let method = Method::new(gpu, &settings.render);
     let limits = Limits::new(gpu)?;
     let near = settings.render.near as f32;
     // Pairs are counted whether they fit or not.
@@ -190,7 +191,7 @@ pub fn expected_anchors(gpu: &Gpu, plan: &Plan, settings: &Settings, initial: &B
     let cells: BTreeSet<[i64; 3]> =
         initial.anchors.position.iter().map(|p| p.map(|x| (f64::from(x) / side).round_ties_even() as i64)).collect();
     let rounds = f64::from((rounds.last - rounds.first) / config.every + 1);
-    let per_cell = 16f64.powi(config.levels as i32 - 1) / 5.0;
+    let per_cell = 16f64.powi(LEVELS as i32 - 1) / 5.0;
     let grown = cells.len() as f64 * per_cell * rounds / (rounds + 8.0);
     (f64::from(count) + grown).min(f64::from(most_anchors(gpu, settings, count))) as u32
 }
@@ -352,12 +353,12 @@ pub fn rehearse(
         } else if step.changes_anchors(number) && number <= iterations {
             let round = rounds.partition_point(|&r| r <= number);
             let target = f64::from(survey.anchors) + grown * share(round) / share(rounds.len());
-            let more = (target as u32).saturating_sub(step.learnt.count()).div_ceil(settings.densify.levels);
+            let more = (target as u32).saturating_sub(step.learnt.count()).div_ceil(LEVELS);
             let room = most_anchors(&gpu, settings, survey.anchors);
             // A level has a candidate for every Gaussian at most, and no more free cells than candidates.
             let candidates = more.saturating_mul(4).min(step.learnt.count().saturating_mul(settings.model.offsets));
             let free = more.min(candidates);
-            let kept = (step.learnt.count() + free * settings.densify.levels).min(room.max(step.learnt.count()));
+            let kept = (step.learnt.count() + free * LEVELS).min(room.max(step.learnt.count()));
             for (buffer, word) in [("candidate_count", candidates), ("free_count", free), ("kept_count", kept)] {
                 gpu.answer(buffer, word);
             }

@@ -113,16 +113,10 @@ pub struct Plan {
     pub left_out: Vec<LeftOut>,
 }
 
-/// The losses that have a weight on the depth of a view. Without masks nothing is inside one.
-fn depth_losses(config: &losses::config::Depth, reference: bool, masks: bool) -> DepthLosses {
-    let gradient = &config.gradient;
-    let (l1, factor) = if reference {
-        let inside = if masks { config.reference_inside_weight } else { 0.0 };
-        (config.reference_weight + inside, 1.0)
-    } else {
-        (config.other_weight, gradient.other_weight)
-    };
-    DepthLosses { l1: config.enabled && l1 > 0.0, gradient: config.enabled && gradient.weight * factor > 0.0 }
+/// The losses that have a weight on the depth of a view.
+fn depth_losses(config: &losses::config::Depth, reference: bool) -> DepthLosses {
+    let share = if reference { 1.0 } else { config.other_weight };
+    DepthLosses { l1: config.enabled && share > 0.0, gradient: config.enabled && config.gradient.weight * share > 0.0 }
 }
 
 /// The rounds of growing and pruning that come to pass; none behind the last step, whose anchors nobody would train.
@@ -155,7 +149,7 @@ impl Plan {
         let reference_prior = scene.references.iter().any(|r| r.prior.is_some());
         let other_priors = scene.train.iter().enumerate().any(|(i, v)| !references.contains(&i) && v.prior.is_some());
         let of = |prior, is_reference| {
-            if prior { depth_losses(config, is_reference, masks) } else { DepthLosses::default() }
+            if prior { depth_losses(config, is_reference) } else { DepthLosses::default() }
         };
         let (reference_depth, other_depth) = (of(reference_prior, true), of(other_priors, false));
         let depth = reference_depth.any() || other_depth.any();
@@ -170,8 +164,7 @@ impl Plan {
             let why = if other_priors { "their weights are zero" } else { "they have no prior" };
             leave("depth of views other than the reference", why);
         } else if !reference_depth.any() && !references.is_empty() {
-            let why = if reference_prior { "its weights are zero" } else { "it has no prior" };
-            leave("depth of the reference view", why);
+            leave("depth of the reference view", "it has no prior");
         }
         let depth_gradient = reference_depth.gradient || other_depth.gradient;
         if depth && !depth_gradient {
@@ -251,7 +244,7 @@ impl Plan {
             depth,
             depth_gradient,
             reference_depth,
-            align_to_points: settings.losses.depth.align_to_points,
+            align_to_points: settings.scene.check_priors,
             other_depth,
             attention,
             form,

@@ -88,7 +88,7 @@ impl Loaded {
     pub fn ready(mut self, gpu: &Gpu) -> anyhow::Result<Ready> {
         while self.settings.scene.dense {
             let Self { scene, settings, .. } = &mut self;
-            let found = multiview::look(gpu, scene, settings.scene.object_point_share)?;
+            let found = multiview::look(gpu, scene)?;
             let views = scene.train.len() + scene.test.len();
             if found.wrong.is_empty() || views - found.wrong.len() < FEWEST_VIEWS {
                 eprintln!("scene: {}", found.note);

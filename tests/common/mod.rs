@@ -22,6 +22,13 @@ pub fn load(folder: &TempDir, config: &scene::Config) -> Scene {
     scene::load(&folder.path().join("scene"), config).expect("a scene that was just written")
 }
 
+/// How a scene is read with these parts of it.
+pub fn reads(masks: bool, priors: bool, reference: bool) -> scene::Config {
+    let [prior_folder, reference_file] =
+        [priors, reference].map(|wanted| if wanted { "" } else { scene::NONE }.to_owned());
+    scene::Config { masks, prior_folder, reference_file, ..Default::default() }
+}
+
 /// The tiny scene with everything it has.
 pub fn tiny() -> Scene {
     load(&folder(), &scene::Config::default())

@@ -34,7 +34,7 @@ fn small() -> Scene {
 fn settings() -> Settings {
     let mut settings = common::settings(STEPS);
     settings.train.log_interval = 100;
-    settings.train.save_interval = STEPS / 4;
+    settings.train.eval_interval = STEPS / 4;
     settings.model.voxel_factor = 2.5;
     settings.model.offsets = 4;
     settings.model.attention.enabled = false; // 98,000 weights in every step: half of the time

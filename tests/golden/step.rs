@@ -1,7 +1,7 @@
 //! Golden cases of kind `step`: gradients of the whole step by name, then ten steps' losses. A case with `settings` is
 //! trained from photographs, with culling, attention, growing and pruning; others have all arrays given, and none of these.
 
-use gscream_vk::config::Settings;
+use gscream_vk::config::{Settings, without_removed};
 use gscream_vk::gpu::{Check, Gpu, testing};
 use gscream_vk::losses::{self, DepthView, NO_PRIOR, Quantity, Weights};
 use gscream_vk::model::files;
@@ -78,7 +78,7 @@ fn step_from_photographs() {
 
 /// As a run takes its steps.
 fn whole(gpu: &Gpu, case: &Case) {
-    let settings: Settings = toml::from_str(&case.text("settings")).unwrap();
+    let settings: Settings = toml::from_str(&without_removed(&case.text("settings"))).unwrap();
     settings.validate().unwrap();
     let cameras = [camera(case, 0), camera(case, 1)];
     let size = cameras[0].size;

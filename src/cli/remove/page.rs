@@ -200,8 +200,7 @@ fn draw(
             let origin = Origin::find(&job.places.run)?;
             let mut settings = origin.settings(vec![])?;
             let scene = shared::load_scene_of_model(&job.places.scene, &mut settings)?;
-            let background = settings.train.background.map(|channel| channel as f32);
-            let renderer = Renderer::of(gpu, &Stored::load(&origin.model())?, &settings.render, background)?;
+            let renderer = Renderer::of(gpu, &Stored::load(&origin.model())?, &settings.render)?;
             let cameras = scene.train.into_iter().map(|view| (view.name, view.camera)).collect();
             after.insert((renderer, cameras))
         }

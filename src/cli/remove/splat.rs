@@ -165,7 +165,7 @@ impl Job<'_> {
             added_range: [count, count + added.len()],
         };
         let joined = source.splat.joined(&kept, &added);
-        let cameras = Cameras::of(&scene, [0.0; 3]);
+        let cameras = Cameras::of(&scene);
         let mut files = vec![
             (root.join(format!("{STEM}.ply")), source.splat.spliced(&kept, &added)),
             (root.join(OBJECT), source.splat.spliced(&gone, &Cloud::default())),

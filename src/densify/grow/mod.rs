@@ -9,6 +9,7 @@
 mod tests;
 mod twins;
 
+use super::config::LEVELS;
 use super::{Config, Statistics};
 use crate::gpu::kernels::densify::{
     grow_append, grow_candidates, grow_cells, grow_heads, grow_keys, grow_lots, grow_occupied, grow_reset, grow_words,
@@ -245,13 +246,24 @@ pub fn run(
     config: &Config,
     round: Round,
 ) -> Result<Grown, Error> {
+    run_levels(gpu, anchors, statistics, config, round, LEVELS)
+}
+
+fn run_levels(
+    gpu: &Gpu,
+    anchors: &mut Anchors,
+    statistics: &mut Statistics,
+    config: &Config,
+    round: Round,
+    levels: u32,
+) -> Result<Grown, Error> {
     let mut grown = Grown::default();
     let judged = anchors.count;
     let most = match config.max_anchors {
         0 => Anchors::most(gpu, anchors.offsets),
         limit => limit.min(Anchors::most(gpu, anchors.offsets)),
     };
-    for level in 0..config.levels {
+    for level in 0..levels {
         let (cells, beyond) = cells(gpu, anchors, statistics, judged, config, round, level)?;
         grown.beyond += beyond;
         let Some(mut cells) = cells else { continue };

@@ -275,7 +275,7 @@ impl Gathered {
 /// Growing as it is written down, with maps and float64 positions.
 fn grow_plainly(model: &mut files::Anchors, gathered: &mut Gathered, config: &Config, round: Round) -> u32 {
     let (judged, offsets) = (model.position.len(), model.offsets_per_anchor);
-    for level in 0..config.levels {
+    for level in 0..LEVELS {
         let size = f64::from(round.voxel) * config.coarsest_cell / 4f64.powi(level as i32);
         let threshold = config.gradient_threshold * 2f64.powi(level as i32);
         // Anchors lie on voxels, which may be the boundaries of coarser cells: their cell is float32's choice.
@@ -389,7 +389,7 @@ fn cells_far_apart_need_three_words() {
     );
     let mut gathered = Gathered::random(&mut rng, 200, 10);
     let round = Round { voxel: 1.0, seed: 8, step: 1600 };
-    let config = Config { levels: 1, coarsest_cell: 1.0, ..Config::default() };
+    let config = Config::default();
     let mut anchors = Anchors::upload(&gpu, &model, 0).unwrap();
     let mut statistics = gathered.upload(&gpu, anchors.capacity, 10);
     let grown = run(&gpu, &mut anchors, &mut statistics, &config, round).unwrap();
@@ -409,8 +409,8 @@ fn growing_stops_where_there_is_no_room() {
     let grow = |max_anchors| {
         let mut anchors = Anchors::upload(&gpu, &model, 0).unwrap();
         let mut statistics = gathered.upload(&gpu, anchors.capacity, 10);
-        let config = Config { max_anchors, levels: 1, ..Config::default() };
-        let grown = run(&gpu, &mut anchors, &mut statistics, &config, round).unwrap();
+        let config = Config { max_anchors, ..Config::default() };
+        let grown = run_levels(&gpu, &mut anchors, &mut statistics, &config, round, 1).unwrap();
         (anchors.read(&gpu).unwrap(), grown)
     };
     let bits = |anchors: &files::Anchors| -> HashSet<[u32; 3]> {

@@ -180,7 +180,7 @@ fn trace(gpu: &Gpu, bench: &mut Bench, settings: &Settings, view: usize) -> Resu
         size: bench.size(view),
         gradient_scales: settings.losses.depth.gradient.scales,
     };
-    Ok((counts::count(&words, &schedule, Method::new(gpu, &settings.render)?, known), schedule))
+    Ok((counts::count(&words, &schedule, Method::new(gpu, &settings.render), known), schedule))
 }
 
 /// Measures the step on its views in rounds; the one before the first counted one warms up. `ceilings` has a round of its

@@ -74,8 +74,7 @@ pub(crate) fn judge<E: From<Error>>(
     let scene = truth::load_reduced(set, settings.scene.downscale)?;
     let mut model = Stored::load(model).map_err(Error::from)?;
     model.rescale(1.0 / unit);
-    let background = settings.train.background.map(|channel| channel as f32);
-    let mut renderer = Renderer::of(gpu, &model, &settings.render, background).map_err(Error::from)?;
+    let mut renderer = Renderer::of(gpu, &model, &settings.render).map_err(Error::from)?;
     let shadows = set.join(SHADOWS);
     let shadows = if shadows.is_dir() { scene::pictures(&shadows).map_err(Error::from)? } else { BTreeMap::new() };
     let (mut views, mut drawn) = (vec![], BTreeMap::new());

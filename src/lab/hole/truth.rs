@@ -113,8 +113,8 @@ pub(crate) fn load(set: &Path, side: u32) -> Result<Scene, Error> {
 
 /// The same at 1 / `downscale` of its size.
 pub(crate) fn load_reduced(set: &Path, downscale: u32) -> Result<Scene, Error> {
-    let config =
-        scene::Config { downscale, test_every: 0, priors: false, reference: false, ..scene::Config::default() };
+    let none = || scene::NONE.to_owned();
+    let config = scene::Config { downscale, prior_folder: none(), reference_file: none(), ..scene::Config::default() };
     let scene = scene::load(set, &config)?;
     let shows = |view: &View| view.mask.as_ref().is_some_and(|mask| mask.as_raw().iter().any(|v| *v != 0));
     let what = if !scene.train.iter().any(shows) {
@@ -141,7 +141,7 @@ fn wrong(gpu: &Gpu, set: &Path) -> Result<Vec<String>, Error> {
     let mut scene = bare(&load(set, LOOK_SIDE)?);
     let mut wrong = vec![];
     loop {
-        let found = multiview::look(gpu, &scene, 1.0)?.wrong;
+        let found = multiview::look(gpu, &scene)?.wrong;
         if found.is_empty() || scene.train.len() - found.len() < FEWEST_VIEWS {
             return Ok(wrong);
         }

@@ -229,7 +229,7 @@ pub fn measure<E: From<Error>>(
         let other = other.map(|other| Scene { test: scene.test.clone(), ..other });
         let scene = other.as_ref().unwrap_or(scene);
         let mut settings = settings;
-        (settings.train.eval_interval, settings.train.save_interval) = (0, 0);
+        settings.train.eval_interval = 0;
         compile(gpu, scene, &settings)?;
         let mut runs = vec![];
         for seed in (base.train.seed..).take(options.seeds as usize) {

@@ -291,7 +291,7 @@ mod tests {
         for mask in tight.train.iter_mut().filter_map(|v| v.mask.as_mut()) {
             *mask = eroded(mask, 3);
         }
-        super::super::points::drop_object(&mut tight, 0.9);
+        super::super::points::drop_object(&mut tight);
         [scene, tight]
     }
 

@@ -5,7 +5,7 @@
 //! - [`exposure`]: photographs that are brighter, darker or of another tint than the others are brought to the same exposure.
 //! - [`sparse`]: each prior is held against the points of the sparse model. One that does not follow them is not used, and
 //!   disparity becomes depth.
-//! - [`rim`]: masks grow, if asked for, by what the inpainted picture was repainted beyond them, and fall off around the object.
+//! - [`rim`]: masks fall off around the object, and a note says by how much the inpainted picture was repainted beyond them.
 //! - [`judge`]: pixels around the masks that other views do not confirm are the object's too.
 //! - [`points`]: points on the object are left out, and the hole gets points from the reference view's prior, behind its
 //!   depth edges too.
@@ -35,15 +35,15 @@ pub fn condition(scene: &mut Scene, config: &Config) {
     if config.even_exposures {
         exposure::even_out(scene);
     }
-    rim::grow_masks(scene, config.grow_masks);
-    points::drop_object(scene, config.object_point_share);
+    rim::note_repainted(scene);
+    if config.seed_hole {
+        points::drop_object(scene);
+    }
     if config.truth_prior == STEREO_PRIOR {
         stereo::measure_prior(scene);
     }
     if config.check_priors {
         sparse::check_priors(scene);
-    }
-    if config.guess_reference_prior {
         reference::guess_priors(scene);
     }
     let depths = reference::hole_depths(scene);
@@ -58,8 +58,6 @@ pub fn condition(scene: &mut Scene, config: &Config) {
     }
     if !config.whole_reference {
         reference::composite(scene);
-    }
-    if config.outrank_guess > 0 {
-        reference::outrank(scene, &depths, config.outrank_guess);
+        reference::outrank(scene, &depths);
     }
 }

@@ -4,11 +4,13 @@ use rayon::prelude::*;
 
 use crate::scene::{Camera, Point, Scene, View};
 
+/// A point that falls into the mask in more than this share of the views that have it in the picture stands on the object.
+const OBJECT_SHARE: f64 = 0.9;
 /// Fewest views that must have a point in the picture for it to be judged.
 const FEWEST_VIEWS: usize = 2;
 
-/// Whether a point falls into the mask in more than this share of the views that have it in the picture.
-pub(crate) fn on_object(views: &[View], share: f64) -> impl Fn(&Point) -> bool + Sync {
+/// Whether a point falls into the mask in nearly all views that have it in the picture.
+pub(crate) fn on_object(views: &[View]) -> impl Fn(&Point) -> bool + Sync {
     let views: Vec<_> = views.iter().filter_map(|v| Some((&v.camera, v.mask.as_ref()?))).collect();
     move |point| {
         let position = point.position.map(f64::from);
@@ -19,17 +21,16 @@ pub(crate) fn on_object(views: &[View], share: f64) -> impl Fn(&Point) -> bool +
                 inside += usize::from(mask.as_raw()[pixel] != 0);
             }
         }
-        seen >= FEWEST_VIEWS && inside as f64 > share * seen as f64
+        seen >= FEWEST_VIEWS && inside as f64 > OBJECT_SHARE * seen as f64
     }
 }
 
-/// Leaves out the points that fall into the mask in more than this share of the views that have them in the picture: they
-/// stand on the object, and anchors there would have to fade against views that cannot see them fade. With 1 all stay.
-pub(super) fn drop_object(scene: &mut Scene, share: f64) {
-    if share >= 1.0 || scene.train.iter().all(|v| v.mask.is_none()) {
+/// Leaves out the points that stand on the object: anchors there would have to fade against views that cannot see them fade.
+pub(super) fn drop_object(scene: &mut Scene) {
+    if scene.train.iter().all(|v| v.mask.is_none()) {
         return;
     }
-    let on_object = on_object(&scene.train, share);
+    let on_object = on_object(&scene.train);
     let dropped: Vec<bool> = scene.points.par_iter().map(on_object).collect();
     let count = dropped.iter().filter(|d| **d).count();
     if count == 0 {
@@ -44,9 +45,7 @@ pub(super) fn drop_object(scene: &mut Scene, share: f64) {
     }
     let mut at = dropped.iter();
     scene.points.retain(|_| !at.next().is_some_and(|d| *d));
-    scene
-        .notes
-        .push(format!("{count} of {all} points stand on the object and are left out (scene.object_point_share)"));
+    scene.notes.push(format!("{count} of {all} points stand on the object and are left out (scene.seed_hole)"));
 }
 
 /// Adds a point for every pixel of the references' holes, at their depths (\[pixel\], NaN outside the hole). What an earlier
@@ -144,9 +143,7 @@ mod tests {
         synthetic::write(&dir, &synthetic::Options::default()).expect("a scene");
         let read = load(&dir, &Config::default()).expect("it loads");
         let mut scene = read.clone();
-        drop_object(&mut scene, 1.0);
-        assert_eq!(scene.points.len(), read.points.len());
-        drop_object(&mut scene, 0.9);
+        drop_object(&mut scene);
         let dropped = read.points.len() - scene.points.len();
         assert!((100..1000).contains(&dropped), "{dropped}");
         let left = scene.points.len();
@@ -169,11 +166,11 @@ mod tests {
         // Without masks, or with masks on everything, points stay.
         let mut bare = read.clone();
         bare.train.iter_mut().for_each(|v| v.mask = None);
-        drop_object(&mut bare, 0.9);
+        drop_object(&mut bare);
         assert_eq!(bare.points.len(), read.points.len());
         let mut full = read.clone();
         full.train.iter_mut().for_each(|v| v.mask.as_mut().expect("one").fill(255));
-        drop_object(&mut full, 0.9);
+        drop_object(&mut full);
         assert_eq!(full.points.len(), read.points.len());
         assert!(full.notes.last().expect("a note").contains("inverted"));
     }

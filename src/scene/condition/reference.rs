@@ -204,21 +204,24 @@ pub(super) fn composite(scene: &mut Scene) {
     }
 }
 
-/// Lowers the weight of a reference's view where other views see past the object: with n of `enough` views by n / `enough`,
-/// so that what was photographed outranks what was painted. Inside the mask it stays above 0.
-pub(super) fn outrank(scene: &mut Scene, depths: &[Option<Vec<f32>>], enough: u32) {
+/// So many views that see a part of the hole past the object outrank the painted picture there, fewer in proportion.
+const OUTRANKING_VIEWS: usize = 5;
+
+/// Lowers the weight of a reference's view where other views see past the object: with n of [`OUTRANKING_VIEWS`] in
+/// proportion, so that what was photographed outranks what was painted. Inside the mask it stays above 0.
+pub(super) fn outrank(scene: &mut Scene, depths: &[Option<Vec<f32>>]) {
     let lowered: Vec<_> = scene
         .references
         .iter()
         .zip(depths)
-        .filter_map(|(reference, depth)| Some((reference.view, outranked(scene, reference, depth.as_ref()?, enough)?)))
+        .filter_map(|(reference, depth)| Some((reference.view, outranked(scene, reference, depth.as_ref()?)?)))
         .collect();
     for (view, (weight, share)) in lowered {
         scene.train[view].weight = Some(weight);
         if share > 0.0 {
             scene.notes.push(format!(
-                "{:.0} % of the hole of reference {} is seen past the object by {enough} views or more, which outrank the \
-                 painted picture there (scene.outrank_guess)",
+                "{:.0} % of the hole of reference {} is seen past the object by {OUTRANKING_VIEWS} views or more, which \
+                 outrank the painted picture there (scene.whole_reference)",
                 100.0 * share,
                 scene.train[view].name
             ));
@@ -227,7 +230,7 @@ pub(super) fn outrank(scene: &mut Scene, depths: &[Option<Vec<f32>>], enough: u3
 }
 
 /// The lowered weight, and the share of the hole that enough views see.
-fn outranked(scene: &Scene, reference: &Reference, depth: &[f32], enough: u32) -> Option<(GrayImage, f64)> {
+fn outranked(scene: &Scene, reference: &Reference, depth: &[f32]) -> Option<(GrayImage, f64)> {
     let view = &scene.train[reference.view];
     let weight = view.blend()?;
     // What another reference shows of the hole was painted too.
@@ -245,11 +248,11 @@ fn outranked(scene: &Scene, reference: &Reference, depth: &[f32], enough: u32) -
     };
     let counted: Vec<usize> = (0..depth.len()).into_par_iter().map(views).collect();
     let lowered = |m: u8, n: usize| {
-        let left = 1.0 - (n as f64 / f64::from(enough)).min(1.0);
+        let left = 1.0 - (n as f64 / OUTRANKING_VIEWS as f64).min(1.0);
         if m == 0 { 0 } else { (f64::from(m) * left).round().max(1.0) as u8 }
     };
     let hole = weight.as_raw().iter().filter(|w| **w == 255).count();
-    let seen = weight.as_raw().iter().zip(&counted).filter(|(w, n)| **w == 255 && **n >= enough as usize).count();
+    let seen = weight.as_raw().iter().zip(&counted).filter(|(w, n)| **w == 255 && **n >= OUTRANKING_VIEWS).count();
     let mut new = GrayImage::new(weight.width(), weight.height());
     for ((to, m), n) in new.pixels_mut().zip(weight.as_raw()).zip(&counted) {
         *to = Luma([lowered(*m, *n)]);

@@ -15,30 +15,21 @@ const LEVEL: f64 = 1.0;
 /// A single ring is what resampling mixes at a mask's edge.
 const FEWEST: u32 = 2;
 
-/// Says by how many pixels an inpainted picture was repainted beyond its mask, and lets all train masks `grow` by as much if
-/// asked for. Who inpaints takes the object's shadow along, in a wider mask than the one delivered; the photographs still
-/// show it there. What else they show there is lost with it.
-pub(super) fn grow_masks(scene: &mut Scene, grow: bool) {
+/// Says by how many pixels an inpainted picture was repainted beyond its mask. Who inpaints takes the object's shadow along, in
+/// a wider mask than the one delivered; the photographs still show it there. Masks as wide would lose what else they show.
+pub(super) fn note_repainted(scene: &mut Scene) {
     let radius = |reference: &crate::scene::Reference| {
         let view = &scene.train[reference.view];
         Some((repainted(&reference.image, &view.image, view.mask.as_ref()?), view.name.clone()))
     };
     let inpainted = scene.references.iter().filter(|reference| !reference.truth);
     let Some((radius, name)) = inpainted.filter_map(radius).max_by_key(|(radius, _)| *radius) else { return };
-    if radius < FEWEST {
-        return;
+    if radius >= FEWEST {
+        scene.notes.push(format!(
+            "reference {name} is repainted up to {radius} pixels beyond its mask; should a shadow stay around the hole, \
+             --set scene.dilate_masks={radius} removes it"
+        ));
     }
-    let found = format!("reference {name} is repainted up to {radius} pixels beyond its mask");
-    if !grow {
-        scene
-            .notes
-            .push(format!("{found}; should a shadow stay around the hole, --set scene.grow_masks=true removes it"));
-        return;
-    }
-    for mask in scene.train.iter_mut().filter_map(|v| v.mask.as_mut()) {
-        *mask = resample::dilate(mask, radius);
-    }
-    scene.notes.push(format!("{found}: all masks grow by as much (scene.grow_masks)"));
 }
 
 /// Rings around the mask, a pixel wide each, that differ from the photograph; counted up to the first that does not.
@@ -157,9 +148,8 @@ mod tests {
     }
 
     #[test]
-    fn masks_grow_by_what_was_repainted() {
+    fn it_is_said_how_far_beyond_the_mask_was_repainted() {
         let mut scene = scene();
-        let masks: Vec<GrayImage> = scene.train.iter().map(|v| v.mask.clone().expect("a mask")).collect();
         // The built-in reference is the photograph outside its hole.
         let own = {
             let reference = &scene.references[0];
@@ -167,23 +157,15 @@ mod tests {
             repainted(&reference.image, &view.image, view.mask.as_ref().expect("a mask"))
         };
         assert_eq!(own, 0, "nothing was repainted");
-        grow_masks(&mut scene, true);
-        assert!(
-            scene.train.iter().zip(&masks).all(|(v, m)| v.mask.as_ref() == Some(m))
-                && scene.notes.iter().all(|n| !n.contains("grow"))
-        );
+        note_repainted(&mut scene);
+        assert!(scene.notes.iter().all(|n| !n.contains("beyond its mask")));
 
         // A network leaves noise everywhere, and another colour up to three pixels beyond the mask.
         painted(&mut scene, 1000, |i, p| Rgb(p.0.map(|v| v.saturating_add((i * 7 % 5) as u8))));
         painted(&mut scene, 3, |_, p| Rgb(p.0.map(|v| 255 - v)));
-        grow_masks(&mut scene, false);
-        assert!(scene.train.iter().zip(&masks).all(|(v, m)| v.mask.as_ref() == Some(m)), "not unless asked for");
-        assert!(scene.notes.last().is_some_and(|n| n.contains("3 pixels beyond its mask; should a shadow stay")));
-        grow_masks(&mut scene, true);
-        for (view, mask) in scene.train.iter().zip(&masks) {
-            assert_eq!(view.mask, Some(resample::dilate(mask, 3)), "{}", view.name);
-        }
-        assert!(scene.notes.last().expect("a note").contains("3 pixels beyond its mask"), "{:?}", scene.notes.last());
+        note_repainted(&mut scene);
+        let note = scene.notes.last().expect("a note");
+        assert!(note.contains("3 pixels beyond its mask") && note.contains("--set scene.dilate_masks=3"), "{note}");
     }
 
     /// Not what a network left, but the place itself at another time.
@@ -192,9 +174,8 @@ mod tests {
         let mut scene = scene();
         painted(&mut scene, 3, |_, p| Rgb(p.0.map(|v| 255 - v)));
         scene.references[0].truth = true;
-        let before = scene.train[0].mask.clone();
-        grow_masks(&mut scene, true);
-        assert_eq!(scene.train[0].mask, before);
+        note_repainted(&mut scene);
+        assert!(scene.notes.iter().all(|n| !n.contains("beyond its mask")));
     }
 
     #[test]

@@ -706,11 +706,11 @@ impl<'a> Run<'a> {
     }
 
     fn evaluates(&self, step: u32) -> bool {
-        self.every(self.settings.train.eval_interval, step) || self.samples.contains(&step)
+        self.saves(step) || self.samples.contains(&step)
     }
 
     fn saves(&self, step: u32) -> bool {
-        self.every(self.settings.train.save_interval, step)
+        self.every(self.settings.train.eval_interval, step)
     }
 
     fn checkpoints(&self, step: u32) -> bool {
@@ -721,7 +721,7 @@ impl<'a> Run<'a> {
     fn pauses_behind(&self, step: u32) -> bool {
         let coarse = self.settings.train.coarse;
         let resizes = coarse.reduction(step) != coarse.reduction(step + 1);
-        self.step.changes_anchors(step) || resizes || self.evaluates(step) || self.saves(step) || self.checkpoints(step)
+        self.step.changes_anchors(step) || resizes || self.evaluates(step) || self.checkpoints(step)
     }
 
     /// Whose the checkpoints of this run are.

@@ -22,6 +22,7 @@ use crate::model::parameter::{DECODERS, Parameter, Part, WEIGHTS};
 use crate::optimizer::{BETAS, Group, adam};
 use crate::primitives::limit::{Counter, Limits};
 use crate::render::activate::{self, Activate, DrawnGradients};
+use crate::render::config::BACKGROUND;
 use crate::render::decode::{self, Decode, DecodeBackward, GaussianGradients, WantedGradients};
 use crate::render::forward::{Capacity, Forward, Front, Model};
 use crate::render::project::{ProjectBackward, SplatGradients};
@@ -47,7 +48,7 @@ struct Stages {
 impl Stages {
     fn new(gpu: &Gpu, plan: &Plan, capacity: Capacity, model: Model<'_>, config: &Config) -> Result<Self, Error> {
         let [feature, decoders] = [&[Group::Feature][..], &DECODERS].map(|groups| plan.trained.any(groups.to_vec()));
-        let method = Method::new(gpu, config)?;
+        let method = Method::new(gpu, config);
         let forward = Forward::of(gpu, capacity, model, method, plan.largest(), config.cull)?;
         let slots = match model {
             Model::Anchors { anchors, .. } => (capacity.visible * anchors.offsets) as usize,
@@ -146,7 +147,6 @@ pub struct Step {
     config: Settings,
     adam: adam::Config,
     near: f32,
-    background: [f32; 3],
 }
 
 impl Step {
@@ -211,7 +211,6 @@ impl Step {
             attention_weights,
             adam: adam::Config { beta1: BETAS[0], beta2: BETAS[1], epsilon: settings.optimizer.epsilon },
             near: settings.render.near as f32,
-            background: settings.train.background.map(|c| c as f32),
             config: settings.clone(),
             plan,
         };
@@ -393,7 +392,7 @@ impl Step {
         rec.stage(stage::BIN);
         let binned = forward.bin.record(rec, forward.projected(), camera.size, limits);
         rec.stage(stage::RASTERIZE);
-        rasterize::forward(rec, forward.method(), forward.projected(), binned, self.background, picture);
+        rasterize::forward(rec, forward.method(), forward.projected(), binned, BACKGROUND, picture);
 
         if let Some((_, view)) = photographed {
             canvas.losses.expand(rec, view);

@@ -26,7 +26,7 @@ impl Step {
         self.release();
         let gpu = self.gpu.clone();
         gpu.stage(stage::EVALUATION, || {
-            let mut painter = Painter::new(&gpu, &self.config.render, self.background, self.capacity)?;
+            let mut painter = Painter::new(&gpu, &self.config.render, self.capacity)?;
             let model = self.model_view();
             cameras.into_iter().enumerate().try_for_each(|(i, camera)| look(i, painter.render(model, camera)?))
         })?;
@@ -44,7 +44,7 @@ impl Step {
             let capacity = Capacity { anchors: self.learnt.capacity(), ..self.capacity };
             let longest = |size: &[u32; 2]| f64::from(size[0].max(size[1]));
             let trained = self.plan.sizes.iter().map(longest).fold(1.0, f64::max);
-            let painter = Painter::new(&self.gpu, &self.config.render, self.background, capacity)?;
+            let painter = Painter::new(&self.gpu, &self.config.render, capacity)?;
             let mut painter = painter.larger(longest(&camera.size) / trained);
             let model = self.model_view();
             painter.render_within(model, camera, capacity.pairs.max(1 << 20).saturating_mul(4))
