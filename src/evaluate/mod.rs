@@ -18,7 +18,7 @@ mod report;
 mod seen;
 mod ssim;
 
-use image::{GrayImage, ImageBuffer, Pixel, Rgb32FImage, RgbImage};
+use image::{GrayImage, RgbImage};
 use serde::{Deserialize, Serialize};
 
 use crate::scene::resample;
@@ -47,16 +47,6 @@ pub enum Error {
     /// Images without pixels.
     #[error("an image without pixels cannot be compared")]
     Empty,
-    /// A NaN or an infinity in a float image.
-    #[error("pixel ({x}, {y}) of the {what} is not finite")]
-    NotFinite {
-        /// "photograph" or "rendered image".
-        what: &'static str,
-        /// Column.
-        x: u32,
-        /// Row.
-        y: u32,
-    },
     /// A report that cannot be written.
     #[error("{}: cannot write the report: {source}", path.display())]
     Write {
@@ -253,32 +243,9 @@ fn measure(
     Ok(metrics(rendered.dimensions(), [&unit(rendered), &unit(truth)], &flip, mask, seen, protocol))
 }
 
-/// Compares float images with values in \[0, 1\]. PSNR and SSIM see the values as they are; FLIP sees them clamped and
-/// rounded to 8 bits, which is what its implementation takes.
-///
-/// # Errors
-/// Images or mask of different sizes, or without pixels; values that are not finite.
-pub fn compare_float(rendered: &Rgb32FImage, truth: &Rgb32FImage, mask: Option<&GrayImage>) -> Result<Metrics, Error> {
-    check_sizes(rendered, truth, mask, None)?;
-    for (what, image) in [("rendered image", rendered), ("photograph", truth)] {
-        let broken = image.enumerate_pixels().find(|(_, _, pixel)| pixel.0.iter().any(|v| !v.is_finite()));
-        if let Some((x, y, _)) = broken {
-            return Err(Error::NotFinite { what, x, y });
-        }
-    }
-    let wide = |image: &Rgb32FImage| image.as_raw().iter().map(|v| f64::from(*v)).collect::<Vec<_>>();
-    let flip = flip_map(&to_bytes(rendered), &to_bytes(truth));
-    Ok(metrics(rendered.dimensions(), [&wide(rendered), &wide(truth)], &flip, mask, None, Protocol::Plain))
-}
-
-fn to_bytes(image: &Rgb32FImage) -> RgbImage {
-    let bytes = image.as_raw().iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-    RgbImage::from_raw(image.width(), image.height(), bytes).expect("as many bytes as floats")
-}
-
-fn check_sizes<P: Pixel>(
-    rendered: &ImageBuffer<P, Vec<P::Subpixel>>,
-    truth: &ImageBuffer<P, Vec<P::Subpixel>>,
+fn check_sizes(
+    rendered: &RgbImage,
+    truth: &RgbImage,
     mask: Option<&GrayImage>,
     seen: Option<&GrayImage>,
 ) -> Result<(), Error> {

@@ -31,11 +31,6 @@ impl Timings {
         }
     }
 
-    /// Submissions added.
-    pub fn submissions(&self) -> u64 {
-        self.submissions
-    }
-
     /// `(pass, calls, milliseconds per submission)`, the costliest first.
     pub fn per_submission(&self) -> Vec<(&'static str, u64, f64)> {
         let n = self.submissions.max(1) as f64;

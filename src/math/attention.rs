@@ -1,4 +1,7 @@
-//! Bidirectional cross-attention in float64, dense: what the fused kernels must give (GScream, equation 8).
+//! Bidirectional cross-attention in float64 (GScream, equation 8): its weights, and what the kernels' twins share.
+
+#[cfg(test)]
+pub mod exact;
 
 /// Heads of the attention.
 pub const HEADS: usize = 8;
@@ -20,7 +23,8 @@ pub const TENSORS: [(&str, [usize; 2], usize); 8] = [
     ("context_to_out.weight", [FEATURE, INNER], 5 * MATRIX + FEATURE),
     ("context_to_out.bias", [FEATURE, 1], 6 * MATRIX + FEATURE),
 ];
-const MATRIX: usize = INNER * FEATURE;
+/// Weights of a matrix.
+pub const MATRIX: usize = INNER * FEATURE;
 /// Number of all weights.
 pub const WEIGHTS: usize = 6 * MATRIX + 2 * FEATURE;
 
@@ -44,10 +48,6 @@ pub const SIDES: [Offsets; 2] = [
 /// Scalar product.
 pub fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
-}
-
-fn add(to: &mut [f64], factor: f64, x: &[f64]) {
-    to.iter_mut().zip(x).for_each(|(to, x)| *to += factor * x);
 }
 
 /// `x` (n, columns) times the transpose of `w` (rows, columns).
@@ -84,115 +84,10 @@ pub fn head(x: &[f64], token: usize, head: usize) -> &[f64] {
     &x[token * INNER + head * HEAD..][..HEAD]
 }
 
-fn head_mut(x: &mut [f64], token: usize, head: usize) -> &mut [f64] {
-    &mut x[token * INNER + head * HEAD..][..HEAD]
-}
-
 /// Largest logit and inverse sum of exponentials of a row.
 pub fn softmax_row(logits: &[f64]) -> (f64, f64) {
     let top = logits.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     (top, 1.0 / logits.iter().map(|s| (s - top).exp()).sum::<f64>())
-}
-
-/// What [`forward`] keeps for [`backward`].
-#[derive(Clone, Debug, Default)]
-pub struct Forward {
-    qk: [Vec<f64>; 2],
-    value: [Vec<f64>; 2],
-    /// Per head, direction and own token: attention to every token of the other side.
-    share: Vec<[Vec<f64>; 2]>,
-    mixed: [Vec<f64>; 2],
-    /// Attended features of both sides.
-    pub updated: [Vec<f64>; 2],
-}
-
-/// Attended features of both sides (n, 32) and (m, 32); empty where a side is empty.
-pub fn forward(features: [&[f64]; 2], weights: &[f64]) -> Forward {
-    let n = features.map(|f| f.len() / FEATURE);
-    if n.contains(&0) {
-        return Forward::default();
-    }
-    let matrix = |at: usize| &weights[at..at + MATRIX];
-    let project = |at: [usize; 2]| [0, 1].map(|side| linear(features[side], matrix(at[side]), FEATURE));
-    let qk = project(SIDES.map(|s| s.to_qk));
-    let value = project(SIDES.map(|s| s.to_v));
-    let mut mixed = n.map(|n| vec![0.0; n * INNER]);
-    let mut share = vec![];
-    for h in 0..HEADS {
-        let mut of_head = n.map(|own| Vec::with_capacity(own * n[0] * n[1] / own));
-        for (own, share) in of_head.iter_mut().enumerate() {
-            let other = 1 - own;
-            for i in 0..n[own] {
-                let logits: Vec<f64> =
-                    (0..n[other]).map(|j| dot(head(&qk[own], i, h), head(&qk[other], j, h)) / 8.0).collect();
-                let (top, inverse) = softmax_row(&logits);
-                let row: Vec<f64> = logits.iter().map(|s| (s - top).exp() * inverse).collect();
-                let mix = head_mut(&mut mixed[own], i, h);
-                for (j, p) in row.iter().enumerate() {
-                    mix.iter_mut().zip(head(&value[other], j, h)).for_each(|(m, v)| *m += p * v);
-                }
-                share.extend(row);
-            }
-        }
-        share.push(of_head);
-    }
-    let updated = [0, 1].map(|side| {
-        let mut y = linear(&mixed[side], matrix(SIDES[side].to_out), INNER);
-        let bias = &weights[SIDES[side].to_out + MATRIX..][..FEATURE];
-        y.chunks_mut(FEATURE).for_each(|y| y.iter_mut().zip(bias).for_each(|(y, b)| *y += b));
-        y
-    });
-    Forward { qk, value, share, mixed, updated }
-}
-
-/// Gradients of both sides' features and of all weights, given those of the attended features.
-pub fn backward(
-    features: [&[f64]; 2],
-    weights: &[f64],
-    forward: &Forward,
-    grad_updated: [&[f64]; 2],
-) -> ([Vec<f64>; 2], Vec<f64>) {
-    let n = features.map(|f| f.len() / FEATURE);
-    let mut grad_weights = vec![0.0; WEIGHTS];
-    if n.contains(&0) {
-        return (n.map(|n| vec![0.0; n * FEATURE]), grad_weights);
-    }
-    let Forward { qk, value, share, mixed, .. } = forward;
-    let matrix = |at: usize| &weights[at..at + MATRIX];
-    let grad_mixed = [0, 1].map(|s| times(grad_updated[s], matrix(SIDES[s].to_out), FEATURE, INNER));
-    let mut grad_qk = n.map(|n| vec![0.0; n * INNER]);
-    let mut grad_value = grad_qk.clone();
-    for (h, share) in share.iter().enumerate() {
-        for own in 0..2 {
-            let other = 1 - own;
-            for i in 0..n[own] {
-                let row = &share[own][i * n[other]..][..n[other]];
-                let grad = head(&grad_mixed[own], i, h);
-                let product = dot(grad, head(&mixed[own], i, h));
-                for (j, p) in row.iter().enumerate() {
-                    let s = p * (dot(grad, head(&value[other], j, h)) - product) / 8.0;
-                    add(head_mut(&mut grad_value[other], j, h), *p, grad);
-                    add(head_mut(&mut grad_qk[own], i, h), s, head(&qk[other], j, h));
-                    add(head_mut(&mut grad_qk[other], j, h), s, head(&qk[own], i, h));
-                }
-            }
-        }
-    }
-    let grad_features = [0, 1].map(|s| {
-        let a = times(&grad_qk[s], matrix(SIDES[s].to_qk), INNER, FEATURE);
-        let b = times(&grad_value[s], matrix(SIDES[s].to_v), INNER, FEATURE);
-        a.iter().zip(&b).map(|(a, b)| a + b).collect()
-    });
-    for s in 0..2 {
-        let Offsets { to_qk, to_v, to_out } = SIDES[s];
-        grad_weights[to_qk..][..MATRIX].copy_from_slice(&outer(&grad_qk[s], INNER, features[s], FEATURE));
-        grad_weights[to_v..][..MATRIX].copy_from_slice(&outer(&grad_value[s], INNER, features[s], FEATURE));
-        grad_weights[to_out..][..MATRIX].copy_from_slice(&outer(grad_updated[s], FEATURE, &mixed[s], INNER));
-        for g in grad_updated[s].chunks(FEATURE) {
-            grad_weights[to_out + MATRIX..][..FEATURE].iter_mut().zip(g).for_each(|(b, g)| *b += g);
-        }
-    }
-    (grad_features, grad_weights)
 }
 
 #[cfg(test)]
@@ -200,6 +95,7 @@ mod tests {
     use rand::{RngExt, SeedableRng};
     use rand_pcg::Pcg64Mcg;
 
+    use super::exact::{backward, forward};
     use super::*;
 
     /// Central differences of a scalar over every 997th weight and some features: error O(h^2) of 1e-9 and rounding of

@@ -21,7 +21,6 @@ impl Reference for compact::Kernel {
 /// Compaction of at most `capacity` flags.
 #[derive(Debug)]
 pub struct Compact {
-    capacity: u32,
     blocks: Blocks,
     sums: Buffer<u32>,
     before: Buffer<u32>,
@@ -35,16 +34,10 @@ impl Compact {
     pub fn new(gpu: &Gpu, capacity: u32) -> Result<Self, Error> {
         let entries = capacity.div_ceil(BLOCK) as usize;
         Ok(Self {
-            capacity,
             blocks: Blocks::new(gpu, capacity, 64, BLOCK)?,
             sums: gpu.buffer("compact_sums", entries)?,
             before: gpu.buffer("compact_before", entries)?,
         })
-    }
-
-    /// Flags there is room for.
-    pub fn capacity(&self) -> u32 {
-        self.capacity
     }
 
     /// Writes the indices of the flags that are not zero to `indices`, ascending, and their number to `found[0]`.

@@ -86,11 +86,6 @@ impl Scan {
         Ok(Self { capacity, levels, blocks })
     }
 
-    /// Terms there is room for.
-    pub fn capacity(&self) -> u32 {
-        self.capacity
-    }
-
     /// `prefix[i] = terms[0] + ... + terms[i-1]` modulo 2^32 for every i below the count, and `total[0]` the sum of all,
     /// or 2^32 - 1 if it is more. Terms are below 2^22.
     ///

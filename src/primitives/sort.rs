@@ -96,7 +96,6 @@ pub struct Pairs<'a> {
 /// Sort of at most `capacity` pairs.
 #[derive(Debug)]
 pub struct Sort {
-    capacity: u32,
     tuning: Tuning,
     stride: u32,
     blocks: Blocks,
@@ -119,7 +118,6 @@ impl Sort {
         let block = GROUP * tuning.items;
         let stride = capacity.div_ceil(block).max(1);
         Ok(Self {
-            capacity,
             tuning,
             stride,
             blocks: Blocks::new(gpu, capacity, GROUP, block)?,
@@ -128,11 +126,6 @@ impl Sort {
             counts: gpu.buffer("sort_counts", (stride << tuning.digit_bits) as usize)?,
             totals: gpu.buffer("sort_totals", 1 << tuning.digit_bits)?,
         })
-    }
-
-    /// Pairs there is room for.
-    pub fn capacity(&self) -> u32 {
-        self.capacity
     }
 
     /// Bits of a digit and number of passes for so many bits of a key.

@@ -17,7 +17,7 @@ use super::plan::Plan;
 use super::step::{Rates, Step};
 use crate::config::Settings;
 use crate::densify::config::LEVELS;
-use crate::gpu::{self, Gpu, Schedule, Used};
+use crate::gpu::{self, Gpu, Used};
 use crate::model::anchors::Anchors;
 use crate::model::config::Form;
 use crate::model::gaussians::{Cloud, Static};
@@ -239,8 +239,6 @@ pub struct Forecast {
     pub used: BTreeMap<&'static str, Used>,
     /// The kernels that are compiled.
     pub pipelines: Vec<&'static str>,
-    /// Steps as recorded, by step and view (an index into the training views).
-    pub schedules: BTreeMap<(u32, usize), Schedule>,
 }
 
 impl Forecast {
@@ -315,7 +313,6 @@ pub fn rehearse(
     at.extend((coarse.until > 0).then_some(coarse.until + 1));
     at.retain(|&s| s <= iterations || Some(s) == also);
     let kinds = kinds(scene);
-    let mut schedules = BTreeMap::new();
     let grown = f64::from(anchors.saturating_sub(survey.anchors));
     let share = |r: usize| r as f64 / (r as f64 + 8.0);
     for number in at {
@@ -333,9 +330,7 @@ pub fn rehearse(
                 let mut rec = gpu.recorder()?;
                 let rates = Rates::at(settings, f64::from(scene.radius), number);
                 step.record(&mut rec, &photographs[view], number, rates);
-                let submission = rec.submit()?;
-                schedules.insert((number, view), submission.schedule.clone());
-                submission.wait()?;
+                rec.submit()?.wait()?;
             }
         }
         if Some(number) == counted.map(|c| c.first) {
@@ -381,18 +376,7 @@ pub fn rehearse(
     note("the model is saved", iterations, step.learnt.count());
     let (used, pipelines, peak) = (gpu.used(), gpu.pipelines(), gpu.memory().1);
     let anchors = step.learnt.count();
-    Ok(Forecast {
-        survey,
-        capacity,
-        form: settings.model.form,
-        anchors,
-        start,
-        peak,
-        moments,
-        used,
-        pipelines,
-        schedules,
-    })
+    Ok(Forecast { survey, capacity, form: settings.model.form, anchors, start, peak, moments, used, pipelines })
 }
 
 /// A change of settings under which a run would fit.

@@ -1,12 +1,15 @@
 //! Attention between saturated, single, equal and absent tokens.
 
 use gscream_vk::gpu::{Gpu, testing::UNWRITTEN};
-use gscream_vk::math::attention::{self as exact, FEATURE, HEADS, INNER, SIDES, WEIGHTS, dot};
+use gscream_vk::math::attention::*;
 use gscream_vk::model::attention::{Attention, Pair};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use super::Case;
+
+#[path = "../../src/math/attention/exact.rs"]
+mod exact;
 
 /// One float32 rounding.
 const U: f64 = 1.0 / (1 << 24) as f64;
@@ -150,9 +153,9 @@ impl Inputs {
         let matrix = |at: usize| &weights[at..][..INNER * FEATURE];
         let absolute = |v: &[f64]| v.iter().map(|v| v.abs()).collect::<Vec<f64>>();
         [
-            exact::linear(&features, matrix(SIDES[side].to_qk), FEATURE),
-            exact::linear(&features, matrix(SIDES[side].to_v), FEATURE),
-            exact::linear(&absolute(&features), &absolute(matrix(SIDES[side].to_qk)), FEATURE),
+            linear(&features, matrix(SIDES[side].to_qk), FEATURE),
+            linear(&features, matrix(SIDES[side].to_v), FEATURE),
+            linear(&absolute(&features), &absolute(matrix(SIDES[side].to_qk)), FEATURE),
         ]
     }
 }
@@ -160,7 +163,7 @@ impl Inputs {
 fn largest_logit(inputs: &Inputs) -> f64 {
     let [q, k] = [0, 1].map(|side| inputs.projected(side)[0].clone());
     (0..inputs.n[0] * inputs.n[1])
-        .map(|at| dot(exact::head(&q, at / inputs.n[1], 0), exact::head(&k, at % inputs.n[1], 0)).abs() / 8.0)
+        .map(|at| dot(head(&q, at / inputs.n[1], 0), head(&k, at % inputs.n[1], 0)).abs() / 8.0)
         .fold(0.0, f64::max)
 }
 
@@ -210,18 +213,15 @@ fn enormous(gpu: &Gpu) {
             for i in 0..n[side] {
                 let mut moved = vec![0.0; INNER];
                 for h in 0..HEADS {
-                    let logits: Vec<f64> =
-                        (0..n[1 - side]).map(|j| dot(exact::head(q, i, h), exact::head(k, j, h)) / 8.0).collect();
-                    let magnitude = (0..n[1 - side])
-                        .map(|j| dot(exact::head(qa, i, h), exact::head(ka, j, h)) / 8.0)
-                        .fold(0.0, f64::max);
-                    let (top, inverse) = exact::softmax_row(&logits);
+                    let logits: Vec<f64> = (0..n[1 - side]).map(|j| dot(head(q, i, h), head(k, j, h)) / 8.0).collect();
+                    let magnitude =
+                        (0..n[1 - side]).map(|j| dot(head(qa, i, h), head(ka, j, h)) / 8.0).fold(0.0, f64::max);
+                    let (top, inverse) = softmax_row(&logits);
                     let shares: Vec<f64> = logits.iter().map(|s| (s - top).exp() * inverse).collect();
                     let e = (2.0 * 50.0 * U * magnitude).exp_m1() + 1e-5;
                     for d in 0..INNER / HEADS {
-                        let mean: f64 = (0..shares.len()).map(|j| shares[j] * exact::head(v, j, h)[d]).sum();
-                        let spread: f64 =
-                            (0..shares.len()).map(|j| shares[j] * (exact::head(v, j, h)[d] - mean).abs()).sum();
+                        let mean: f64 = (0..shares.len()).map(|j| shares[j] * head(v, j, h)[d]).sum();
+                        let spread: f64 = (0..shares.len()).map(|j| shares[j] * (head(v, j, h)[d] - mean).abs()).sum();
                         moved[h * (INNER / HEADS) + d] = e * spread + 1e-5 * (mean.abs() + spread);
                     }
                 }
@@ -323,7 +323,7 @@ fn not_a_number(gpu: &Gpu) {
             assert!(got.updated[1 - side][..n[1 - side] * FEATURE].iter().any(|v| !v.is_finite()), "{poison}: hidden");
             assert!(got.grad_weights.iter().any(|v| !v.is_finite()), "{poison}: hidden from the weights");
         }
-        for (name, _, at) in exact::TENSORS.into_iter().filter(|_| poison != 3e38) {
+        for (name, _, at) in TENSORS.into_iter().filter(|_| poison != 3e38) {
             let mut inputs = Inputs::new(n, 8);
             inputs.weights[at + 7] = poison;
             let got = inputs.run(gpu, 33, counts);

@@ -1,11 +1,14 @@
 //! Golden cases of kind `attention`.
 
 use gscream_vk::gpu::{Check, Difference, Gpu, testing};
-use gscream_vk::math::attention::{self, FEATURE, HEADS, INNER, SIDES, TENSORS, WEIGHTS, dot, head, linear};
+use gscream_vk::math::attention::*;
 use gscream_vk::model::attention::{Attention, Pair};
 
 use super::skip::{Lack, skip};
 use super::support::{Case, cases};
+
+#[path = "../../src/math/attention/exact.rs"]
+mod exact;
 
 /// How far float32 may be, for logits of up to `logit`. With u = 2^-24, the unit roundoff:
 ///
@@ -141,9 +144,9 @@ fn very_large_logits_in_one_form(gpu: &Gpu) {
         let inputs = Inputs::of(&case, gain);
         let (features, upstream, weights) = inputs.double();
         let features = features.each_ref().map(Vec::as_slice);
-        let forward = attention::forward(features, &weights);
+        let forward = exact::forward(features, &weights);
         let (grads, grad_weights) =
-            attention::backward(features, &weights, &forward, upstream.each_ref().map(Vec::as_slice));
+            exact::backward(features, &weights, &forward, upstream.each_ref().map(Vec::as_slice));
         let got = inputs.run(gpu);
         let logit = inputs.largest_logit();
         let compare = |what: &str, got: &[f32], want: &[f64]| {

@@ -226,7 +226,7 @@ mod tests {
 
     use super::*;
     use crate::gpu::{Check, Difference, testing};
-    use crate::math::attention as exact;
+    use crate::math::attention::exact;
     use crate::model::attention::WEIGHTS;
 
     const BLEND: f64 = 0.25;

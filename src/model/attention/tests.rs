@@ -5,7 +5,7 @@ use super::twins::head_of;
 use super::*;
 use crate::gpu::Check;
 use crate::gpu::{Options, Submission, Timings, testing};
-use crate::math::attention::{self as exact, dot};
+use crate::math::attention::{dot, exact, linear};
 
 struct Run {
     updated: [Vec<f32>; 2],
@@ -200,7 +200,7 @@ fn enormous_logits() {
         inputs.weights[..2 * INNER * FEATURE].iter_mut().for_each(|w| *w *= 120.0);
         let features = inputs.features.each_ref().map(|f| widen_all(f));
         let weights = widen_all(&inputs.weights);
-        let qk = [0, 1].map(|s| exact::linear(&features[s], &weights[SIDES[s].to_qk..][..INNER * FEATURE], FEATURE));
+        let qk = [0, 1].map(|s| linear(&features[s], &weights[SIDES[s].to_qk..][..INNER * FEATURE], FEATURE));
         let largest = (0..n[0] * n[1])
             .map(|k| dot(head_of(&qk[0], k / n[1], 0), head_of(&qk[1], k % n[1], 0)).abs() / 8.0)
             .fold(0.0, f64::max);

@@ -62,12 +62,8 @@ pub struct Shadow {
     pub lit: Vec<bool>,
     /// `[cell]` the brightness that the cell's material has in light, a logarithm.
     pub expected: Vec<f32>,
-    /// How far along the surface a place one high is moved.
-    pub shift: [f64; 2],
     /// What the region and what the object would cast have in common, of both.
     pub alike: f64,
-    /// Gain per cell in the logarithm of the likelihood.
-    pub gain: f64,
 }
 
 /// What was found.
@@ -315,7 +311,7 @@ fn closely(ground: &Ground<'_>, best: &Hypothesis) -> Verdict {
         return nothing("what is darker around it has another colour");
     }
     let lit: Cells = (0..seen.len()).map(|i| seen[i] && near[i] && !rim[i] && !band[i]).collect();
-    Verdict::Found(Box::new(Shadow { ratio, amount, region, lit, expected, shift: best.shift, alike, gain }))
+    Verdict::Found(Box::new(Shadow { ratio, amount, region, lit, expected, alike }))
 }
 
 /// The drop that makes colours with so much shadow on them likeliest, by expectation and maximisation.

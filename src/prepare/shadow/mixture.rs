@@ -135,12 +135,6 @@ impl Mixture {
         (self.parts.iter().map(|part| part.density(x)).sum::<f64>() + OTHER).ln()
     }
 
-    /// The material nearest in likelihood.
-    pub fn material(&self, x: Color) -> usize {
-        let densities = self.parts.iter().map(|part| part.density(x));
-        densities.enumerate().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(0, |(i, _)| i)
-    }
-
     /// What the colour would be on the whole; nothing for a colour that no material has.
     pub fn expected(&self, x: Color) -> Option<Expected> {
         let own: Vec<f64> = self.parts.iter().map(|part| part.density(x)).collect();

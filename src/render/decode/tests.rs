@@ -433,7 +433,7 @@ fn stages_match_the_decoder() {
                 }
             }
             let upstream: Vec<Gaussian> = (0..offsets).map(|k| got.upstream[k * count + v]).collect();
-            let g = decoder::decode_backward(layout, &weights, &x, at, &o, ls, &upstream, &mut grad_weights);
+            let g = decoder::exact::decode_backward(layout, &weights, &x, at, &o, ls, &upstream, &mut grad_weights);
             for (k, _) in gaussians.iter().enumerate().filter(|(_, g)| g.opacity > f64::from(above)) {
                 offset[3 * (a * offsets + k)..][..3].copy_from_slice(&g.offset[k]);
             }
