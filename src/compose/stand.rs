@@ -1,10 +1,9 @@
 //! Where an object stands: the surface at a pixel and the plane through it.
 
-use glam::{DMat3, DVec3};
-use rand::RngExt as _;
+use glam::DVec3;
 use rand_pcg::Pcg64;
 
-use crate::multiview::DepthGrid;
+use crate::multiview::{DepthGrid, plane};
 use crate::scene::Camera;
 use crate::statistics::median;
 
@@ -79,7 +78,7 @@ pub fn find(
     let every = around.len().div_ceil(MOST).max(1);
     around = around.into_iter().step_by(every).collect();
     let on = (ON * height).max(ON_DEPTH * z);
-    let fitted = plane(&around, seen, on, common_up, seed);
+    let fitted = level_plane(&around, seen, on, common_up, seed);
     let toward = |normal: DVec3| if normal.dot(eye - seen) < 0.0 { -normal } else { normal };
     let (through, normal) = fitted.map_or((seen, toward(common_up)), |(p, n)| (p, toward(n)));
     let steep = normal.dot(common_up) < STEEP;
@@ -94,51 +93,25 @@ pub fn find(
 }
 
 /// The plane near a point that most points are on, those that lie level first: a point of it and its normal.
-fn plane(points: &[DVec3], near: DVec3, on: f64, up: DVec3, seed: u64) -> Option<(DVec3, DVec3)> {
+fn level_plane(points: &[DVec3], near: DVec3, on: f64, up: DVec3, seed: u64) -> Option<(DVec3, DVec3)> {
     if points.len() < 12 {
         return None;
     }
-    let mut rng = Pcg64::new(seed.into(), 17);
-    let mut best: Option<(f64, DVec3, DVec3)> = None;
-    for _ in 0..DRAWS {
-        let [a, b, c] = std::array::from_fn(|_| points[rng.random_range(0..points.len())]);
-        let Some(normal) = (b - a).cross(c - a).try_normalize() else { continue };
-        if (near - a).dot(normal).abs() > 2.0 * on {
-            continue;
+    let drawn = plane::drawn(points, DRAWS, &mut Pcg64::new(seed.into(), 17), |(through, normal)| {
+        if plane::distance((through, normal), near) > 2.0 * on {
+            return None;
         }
-        let count = points.iter().filter(|p| (**p - a).dot(normal).abs() <= on).count() as f64;
+        let count = points.iter().filter(|p| plane::distance((through, normal), **p) <= on).count() as f64;
         let level = if normal.dot(up).abs() >= STEEP { 1.0 } else { 0.5 };
-        if best.is_none_or(|(most, ..)| count * level > most) {
-            best = Some((count * level, a, normal));
-        }
-    }
-    let (_, mut through, mut normal) = best?;
-    for _ in 0..3 {
-        let inliers: Vec<DVec3> = points.iter().copied().filter(|p| (*p - through).dot(normal).abs() <= on).collect();
-        if inliers.len() < 12 {
-            break;
-        }
-        through = inliers.iter().sum::<DVec3>() / inliers.len() as f64;
-        let outer = |d: DVec3| DMat3::from_cols(d * d.x, d * d.y, d * d.z);
-        let spread = inliers.iter().fold(DMat3::ZERO, |sum, p| sum + outer(*p - through));
-        normal = thinnest(spread, normal);
-    }
-    Some((through, normal))
-}
-
-/// The direction of least spread, by inverse iteration from a direction near it.
-fn thinnest(spread: DMat3, from: DVec3) -> DVec3 {
-    let size = spread.x_axis.x + spread.y_axis.y + spread.z_axis.z;
-    let inverse = (spread + DMat3::from_diagonal(DVec3::splat(1e-9 * size.max(f64::MIN_POSITIVE)))).inverse();
-    let mut normal = from;
-    for _ in 0..30 {
-        normal = (inverse * normal).try_normalize().unwrap_or(normal);
-    }
-    if normal.dot(from) < 0.0 { -normal } else { normal }
+        Some((count * level, (through, normal)))
+    })?;
+    Some(plane::refined(points, drawn, on, |_| 1.0, |_| true))
 }
 
 #[cfg(test)]
 mod tests {
+    use rand::RngExt as _;
+
     use super::*;
     use glam::dvec3;
 
@@ -154,10 +127,10 @@ mod tests {
             points.push(dvec3(a, b, 0.1 * a + wobble));
             points.push(dvec3(a, 1.0 + wobble, 1.0 + b));
         }
-        let (through, normal) = plane(&points, dvec3(0.0, 0.2, 0.0), 0.02, DVec3::Z, 3).expect("a plane");
+        let (through, normal) = level_plane(&points, dvec3(0.0, 0.2, 0.0), 0.02, DVec3::Z, 3).expect("a plane");
         let truth = dvec3(-0.1, 0.0, 1.0).normalize();
         assert!(normal.dot(truth).abs() > 0.9999, "{normal}");
         assert!(through.dot(truth).abs() < 0.002, "{through}");
-        assert!(plane(&points[..5], DVec3::ZERO, 0.02, DVec3::Z, 3).is_none());
+        assert!(level_plane(&points[..5], DVec3::ZERO, 0.02, DVec3::Z, 3).is_none());
     }
 }

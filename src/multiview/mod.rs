@@ -22,6 +22,7 @@ mod fuse;
 mod grid;
 mod neighbors;
 mod picture;
+pub mod plane;
 mod propose;
 mod score;
 

@@ -1,9 +1,10 @@
 //! The surface that the object stands on: a plane through what is seen around the object, which the object rests on.
 
-use crate::statistics::{median, quantile};
-use glam::{DMat3, DVec3};
-use rand::RngExt as _;
+use glam::DVec3;
 use rand_pcg::Pcg64;
+
+use crate::multiview::plane::{self, Plane};
+use crate::statistics::{median, quantile};
 
 /// Planes drawn.
 const DRAWS: usize = 600;
@@ -75,38 +76,19 @@ pub fn find(around: &[DVec3], object: &[DVec3], up: DVec3, seed: u64) -> Option<
     }
     let on = ON * size;
     let weight = |p: &DVec3| 1.0 / (1.0 + (*p - middle).length_squared() / (size * size));
-    let rests = |through: DVec3, normal: DVec3| {
+    let rests = |(through, normal): Plane| {
         let heights: Vec<f64> = object.iter().map(|p| (*p - through).dot(normal)).collect();
         let above = heights.iter().filter(|h| **h > -ON * size).count() as f64 / heights.len() as f64;
         above >= ABOVE && quantile(heights, LOWEST).is_some_and(|lowest| lowest.abs() <= GAP * size)
     };
-    let mut rng = Pcg64::new(seed.into(), 61);
-    let mut best: Option<(f64, DVec3, DVec3)> = None;
-    for _ in 0..DRAWS {
-        let [a, b, c] = std::array::from_fn(|_| around[rng.random_range(0..around.len())]);
-        let Some(normal) = (b - a).cross(c - a).try_normalize() else { continue };
-        let normal = if (middle - a).dot(normal) < 0.0 { -normal } else { normal };
-        if !rests(a, normal) {
-            continue;
-        }
+    let drawn = plane::drawn(around, DRAWS, &mut Pcg64::new(seed.into(), 61), |(through, normal)| {
+        let normal = if (middle - through).dot(normal) < 0.0 { -normal } else { normal };
+        let plane = (through, normal);
         let level = if normal.dot(up) >= STEEP { 1.0 } else { 0.5 };
-        let count: f64 = around.iter().filter(|p| (**p - a).dot(normal).abs() <= on).map(weight).sum();
-        if best.is_none_or(|(most, ..)| count * level > most) {
-            best = Some((count * level, a, normal));
-        }
-    }
-    let (_, mut through, mut normal) = best?;
-    for _ in 0..3 {
-        let inliers: Vec<DVec3> = around.iter().copied().filter(|p| (*p - through).dot(normal).abs() <= on).collect();
-        if inliers.len() < 12 {
-            break;
-        }
-        let (mean, fitted) = least_squares(&inliers, weight, normal);
-        if !rests(mean, fitted) {
-            break;
-        }
-        (through, normal) = (mean, fitted);
-    }
+        let count = || around.iter().filter(|p| plane::distance(plane, **p) <= on).map(weight).sum::<f64>();
+        rests(plane).then(|| (count() * level, plane))
+    })?;
+    let (through, normal) = plane::refined(around, drawn, on, weight, rests);
     let foot = middle - normal * (middle - through).dot(normal);
     let (x, y) = normal.any_orthonormal_pair();
     let support = Support { foot, up: normal, along: [x, y], height: 0.0, radius: 0.0 };
@@ -116,25 +98,11 @@ pub fn find(around: &[DVec3], object: &[DVec3], up: DVec3, seed: u64) -> Option<
     (height > 0.0).then_some(Support { height, radius, ..support })
 }
 
-/// The plane of least squares: its mean and its normal, on the side of `near`.
-fn least_squares(points: &[DVec3], weight: impl Fn(&DVec3) -> f64, near: DVec3) -> (DVec3, DVec3) {
-    let sum: f64 = points.iter().map(&weight).sum();
-    let mean = points.iter().map(|p| *p * weight(p)).sum::<DVec3>() / sum;
-    let outer = |d: DVec3| DMat3::from_cols(d * d.x, d * d.y, d * d.z);
-    let spread = points.iter().fold(DMat3::ZERO, |all, p| all + outer(*p - mean) * weight(p));
-    let trace = spread.x_axis.x + spread.y_axis.y + spread.z_axis.z;
-    // Inverse iteration finds the direction of least spread.
-    let inverse = (spread + DMat3::from_diagonal(DVec3::splat(1e-9 * trace.max(f64::MIN_POSITIVE)))).inverse();
-    let mut normal = near;
-    for _ in 0..30 {
-        normal = (inverse * normal).try_normalize().unwrap_or(normal);
-    }
-    (mean, if normal.dot(near) < 0.0 { -normal } else { normal })
-}
-
 #[cfg(test)]
 mod tests {
     use glam::dvec3;
+
+    use rand::RngExt as _;
 
     use super::*;
 
