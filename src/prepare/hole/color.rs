@@ -235,7 +235,9 @@ pub fn repaint(
 
 /// Whether two colours of one place differ in brightness alone.
 fn alike(one: [f32; 3], other: [f32; 3]) -> bool {
-    (0..3).all(|c| (one[c] - other[c]).abs() <= BRIGHTER)
+    let dot = |a: [f32; 3], b: [f32; 3]| (0..3).map(|c| a[c] * b[c]).sum::<f32>();
+    let gain = dot(one, other) / dot(other, other).max(1e-6);
+    (0..3).all(|c| (one[c] - other[c]).abs() <= BRIGHTER && (one[c] - gain * other[c]).abs() <= OF_ANOTHER_HUE)
 }
 
 /// What photographs tell of the colours of a view's hole.
@@ -321,6 +323,8 @@ fn difference(one: &[Shown], other: &[Shown]) -> [f32; 3] {
 const RING: u32 = 2;
 /// Differences beyond this are of something else than brightness.
 const BRIGHTER: f32 = 0.12;
+/// The same of what is left when brightness is the same: pixels at another thing's border are mixed with its colour.
+const OF_ANOTHER_HUE: f32 = 0.035;
 
 #[cfg(test)]
 mod tests {

@@ -1,6 +1,8 @@
 //! The scene without the object: one surface behind it, filled once, for every view.
 //!
+//! - `front`: what stands before the object stays.
 //! - `flat`: what is bare lies on the planes around it.
+//! - `residue`: what is left of a shadow that was taken out goes with the object.
 //! - `surface`: the depth of what is behind the object, in all views.
 //! - `color`: what photographs show of it, and what views that were filled before show of it.
 //! - `guess`: what nobody shows is filled with pieces of the same surface, seen straight on (`texture`), or by a network.
@@ -10,8 +12,10 @@
 
 mod color;
 mod flat;
+mod front;
 mod gradient;
 mod guess;
+mod residue;
 mod shade;
 mod support;
 mod surface;
@@ -45,7 +49,7 @@ const LEAST_HOLE: f64 = 0.4;
 /// Views whose pictures are filled at once: each is held as float32.
 const AT_ONCE: usize = 16;
 /// Name of the way in which holes are filled: a scene that was filled in another way is filled anew.
-pub const METHOD: &str = "one surface, and what is bare lies on its planes";
+pub const METHOD: &str = "one surface, and what stands before the object stays";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 
@@ -82,10 +86,14 @@ pub fn reference_path(view: &str) -> String {
     format!("reference/{view}.png")
 }
 
+/// Pixels that are this part of a mask's longer side.
+fn radius(mask: &GrayImage, part: f64) -> u32 {
+    (part * f64::from(mask.width().max(mask.height()))).ceil() as u32
+}
+
 /// Masks enlarged by a part of the longer side.
 fn enlarged(masks: &[GrayImage], part: f64) -> Vec<GrayImage> {
-    let radius = |mask: &GrayImage| (part * f64::from(mask.width().max(mask.height()))).ceil() as u32;
-    masks.par_iter().map(|mask| resample::dilate(mask, radius(mask))).collect()
+    masks.par_iter().map(|mask| resample::dilate(mask, radius(mask, part))).collect()
 }
 
 /// Makes the reference picture, its depth if asked for, the filled holes of all other views, and the map of where the
@@ -115,7 +123,12 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
         ));
     }
     let wide = enlarged(&masks, BLEEDING);
-    let masks = enlarged(&masks, MARGIN);
+    let pictures: Vec<&RgbImage> = task.fine.train.iter().map(|view| &view.image).collect();
+    let views = front::Views { grids: &grids, cameras: &cameras, pictures: &pictures, masks: &masks };
+    let mut masks = front::kept(&views, enlarged(&masks, MARGIN), |mask| radius(mask, MARGIN));
+    if task.shade {
+        residue::add(task.root, task.fine.train.iter().map(|view| view.name.as_str()), &mut masks)?;
+    }
     let with_holes: Vec<usize> = (0..masks.len()).filter(|i| masks[*i].as_raw().iter().any(|v| *v != 0)).collect();
     if with_holes.is_empty() {
         return Err(Error::Request(
@@ -130,7 +143,6 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
         views.map(|(view, hole)| Photograph { camera: view.camera, picture: &view.image, hole: hole.clone() }).collect()
     };
     let mut photographs = photographed(&masks);
-    let mut masks = masks;
     if task.shade {
         sights.solve(of, task.seed);
         let found = shade::add(&sights, &photographs, of, &mut masks);

@@ -18,7 +18,7 @@ use crate::scene::Camera;
 /// Relative difference up to which two depths are of one surface.
 pub(super) const SAME: f64 = 0.03;
 /// Relative difference from which on the nearer of two surfaces hides the farther one.
-const APART: f64 = 0.06;
+pub(super) const APART: f64 = 0.06;
 /// Sum of the weights of the views that must claim a depth behind the object.
 const ENOUGH: f64 = 2.0;
 /// Weight of a depth that no other view has confirmed. A confirmed one weighs 1.
@@ -257,7 +257,7 @@ impl Sight {
 }
 
 /// Whether a mask as large as a camera's picture covers a site.
-fn covers(mask: &GrayImage, camera: &Camera, grid: &DepthGrid, site: usize) -> bool {
+pub(super) fn covers(mask: &GrayImage, camera: &Camera, grid: &DepthGrid, site: usize) -> bool {
     let at = [site as u32 % grid.columns, site as u32 / grid.columns];
     let point = camera.along(grid.ray(at), 1.0);
     let Some([x, y]) = camera.project(point) else { return false };
@@ -268,6 +268,8 @@ fn covers(mask: &GrayImage, camera: &Camera, grid: &DepthGrid, site: usize) -> b
 const WITHIN: i64 = 2;
 /// Share of the views with a point of the object in the picture whose masks must cover it.
 const SHARED: f64 = 0.7;
+/// Difference, 8-bit levels in the mean of the channels, up to which a point of the object looks like itself in another view.
+const LIKE_ITSELF: u32 = 24;
 /// Points of the object that must fall into a site for it to be the object's.
 const FEWEST_POINTS: u32 = 2;
 
@@ -289,7 +291,7 @@ pub fn complete(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage]
         let (framed, covered) = framing.fold((0, 0), |(n, k), inside| (n + 1, k + usize::from(inside)));
         framed >= HULL_VIEWS && covered as f64 >= SHARED * framed as f64
     };
-    let points: Vec<[f64; 3]> = (grids.par_iter().zip(&inside))
+    let points: Vec<([f64; 3], [u8; 3])> = (grids.par_iter().zip(&inside))
         .flat_map_iter(|(grid, inside)| {
             let deep = |site: usize| {
                 let (x, y) = ((site as u32 % grid.columns) as i64, (site as u32 / grid.columns) as i64);
@@ -298,18 +300,25 @@ pub fn complete(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage]
             };
             let known = sites(grid).filter(|site| inside[*site] && grid.confirmed[*site]).filter(|site| deep(*site));
             known
-                .filter_map(|site| Some(grid.point(site)?.to_array()))
-                .filter(|point| on_object(*point))
+                .filter_map(|site| Some((grid.point(site)?.to_array(), grid.colors[site])))
+                .filter(|(point, _)| on_object(*point))
                 .collect::<Vec<_>>()
         })
         .collect();
     let added: Vec<Vec<usize>> = (grids.par_iter().zip(&inside))
         .map(|(grid, inside)| {
             let mut count = vec![0u32; grid.depth.len()];
-            for (site, z) in points.iter().filter_map(|point| see(grid, *point)) {
-                // What stands before the object hides it.
+            // Where something else stands before the object, known to or by what it looks like, the object does not show.
+            let looks = |site: usize, color: [u8; 3]| {
+                let apart =
+                    |at: usize| grid.colors[at].iter().zip(color).map(|(a, b)| u32::from(a.abs_diff(b))).sum::<u32>();
+                let (x, y) = ((site as u32 % grid.columns) as i64, (site as u32 / grid.columns) as i64);
+                let mut near = (-1..=1).flat_map(|dy| (-1..=1).filter_map(move |dx| grid.site(x + dx, y + dy)));
+                near.any(|at| apart(at) <= 3 * LIKE_ITSELF)
+            };
+            for (site, z, color) in points.iter().filter_map(|(point, c)| see(grid, *point).map(|(s, z)| (s, z, *c))) {
                 let hidden = grid.confirmed[site] && z > (1.0 + APART) * grid.depth[site];
-                count[site] += u32::from(!inside[site] && !hidden);
+                count[site] += u32::from(!inside[site] && !hidden && looks(site, color));
             }
             sites(grid).filter(|site| count[*site] >= FEWEST_POINTS).collect()
         })

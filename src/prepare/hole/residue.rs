@@ -1,0 +1,89 @@
+//! What is left of the object's shadow where it was taken out of the photographs.
+//!
+//! A shadow is divided by one ratio ([`shadow`](crate::prepare::shadow)). Along its border, where light comes back over a
+//! pixel or two, a seam is left, and between shadow and object, where the map begins too late, a dark wedge. Both are of
+//! the hole: else they are copied into it.
+
+use std::path::Path;
+
+use image::{GrayImage, Luma, RgbImage};
+
+use crate::prepare::Error;
+use crate::prepare::shadow::relight;
+use crate::scene::{self, resample};
+
+/// Half the width of the seam, as a part of the picture's longer side.
+const SEAM: f64 = 0.008;
+/// Half the width of a wedge between shadow and object at most, as the same part.
+const WEDGE: f64 = 0.025;
+/// A map that takes less of the light than this has no shadow.
+const LEAST: f64 = 0.08;
+
+/// Adds the residue to the masks of views with these names, from their maps in the scene's folder.
+///
+/// # Errors
+/// A map that cannot be read.
+pub fn add<'a>(root: &Path, names: impl Iterator<Item = &'a str>, masks: &mut [GrayImage]) -> Result<(), Error> {
+    for (name, mask) in names.zip(masks) {
+        let path = root.join(relight::path(name));
+        if !path.is_file() {
+            continue;
+        }
+        let map = resample::photograph(&scene::photograph(&path, 1)?, [mask.width(), mask.height()]);
+        if let Some(residue) = of(&map, mask) {
+            mask.iter_mut().zip(residue.as_raw()).for_each(|(mask, more)| *mask = (*mask).max(*more));
+        }
+    }
+    Ok(())
+}
+
+/// The residue beside a mask, by the map of what is left of the light, of 255; nothing without a shadow.
+fn of(map: &RgbImage, mask: &GrayImage) -> Option<GrayImage> {
+    let (w, h) = map.dimensions();
+    let radius = |part: f64| (part * f64::from(w.max(h))).ceil() as u32;
+    let picture = |on: &dyn Fn(usize) -> bool| {
+        GrayImage::from_fn(w, h, |x, y| Luma([if on((y * w + x) as usize) { 255 } else { 0 }]))
+    };
+    let not = |image: &GrayImage| picture(&|i| image.as_raw()[i] == 0);
+    let closed = |image: &GrayImage| {
+        let large = resample::dilate(image, radius(WEDGE));
+        not(&resample::dilate(&not(&large), radius(WEDGE)))
+    };
+    let taken: Vec<f64> =
+        map.pixels().map(|left| 1.0 - left.0.iter().map(|v| f64::from(*v)).sum::<f64>() / 765.0).collect();
+    let most = taken.iter().copied().fold(0.0, f64::max);
+    if most < LEAST {
+        return None;
+    }
+    let shadow = picture(&|i| taken[i] > 0.5 * most);
+    let [inside, outside] = [&shadow, &not(&shadow)].map(|side| resample::dilate(side, radius(SEAM)));
+    let [object, both] = [mask.clone(), picture(&|i| mask.as_raw()[i].max(shadow.as_raw()[i]) != 0)];
+    let [object, both] = [&object, &both].map(closed);
+    Some(picture(&|i| {
+        let seam = inside.as_raw()[i] != 0 && outside.as_raw()[i] != 0;
+        seam || both.as_raw()[i] != 0 && object.as_raw()[i] == 0 && shadow.as_raw()[i] == 0
+    }))
+}
+
+#[cfg(test)]
+mod tests {
+    use image::Rgb;
+
+    use super::*;
+
+    /// A shadow of 40 pixels beside an object, which begins four pixels beside it: border and gap are of the hole, the middle
+    /// of the shadow and what is far from it are not. A map that takes nothing adds nothing.
+    #[test]
+    fn border_and_gap_are_added() {
+        let object = |x: u32, y: u32| (40..60).contains(&x) && (40..60).contains(&y);
+        let shadow = |x: u32, y: u32| (64..104).contains(&x) && (40..60).contains(&y);
+        let map = RgbImage::from_fn(200, 100, |x, y| Rgb([if shadow(x, y) { 130 } else { 255 }; 3]));
+        let mask = GrayImage::from_fn(200, 100, |x, y| Luma([if object(x, y) { 255 } else { 0 }]));
+        let residue = of(&map, &mask).expect("there is a shadow");
+        let on = |x: u32, y: u32| residue.get_pixel(x, y).0[0] != 0;
+        assert!((60..64).all(|x| on(x, 50)), "the gap");
+        assert!(on(104, 50) && on(103, 50) && on(80, 40) && on(80, 59), "the border");
+        assert!(!on(80, 50) && !on(120, 50) && !on(30, 50) && !on(50, 50), "the rest");
+        assert!(of(&RgbImage::from_pixel(200, 100, Rgb([250; 3])), &mask).is_none());
+    }
+}
