@@ -98,12 +98,18 @@ fn candidates(sights: &Sights, of: usize) -> Vec<Vec<(usize, f64)>> {
         let point = own.point(site, own.depth[site]);
         let (to, distance) = ((point - eye).normalize(), point.distance(eye));
         let mut found: Vec<(usize, f64, [u8; 3])> = vec![];
+        let mut confirmed = false;
         for (view, sight) in sights.0.iter().enumerate().filter(|(view, sight)| *view != of && sight.grid.trusted) {
             let Some(there) = sight.shows(point, 1.5 * SAME) else { continue };
             let from = DVec3::from(sight.grid.camera.center());
             let angle = to.dot((point - from).normalize()).clamp(-1.0, 1.0).acos();
             let finer = (mean_focal(sight) * distance / (mean_focal(own) * point.distance(from))).ln();
             found.push((view, ANGLE * angle + COARSER * (-finer).max(0.0), sight.grid.colors[there]));
+            confirmed |= sight.grid.confirmed[there];
+        }
+        // One view may be wrong about what it shows.
+        if found.len() == 1 && !confirmed {
+            return vec![];
         }
         let middle: [f64; 3] = std::array::from_fn(|c| {
             let mut values: Vec<u8> = found.iter().map(|(_, _, color)| color[c]).collect();
@@ -365,6 +371,27 @@ mod tests {
             let (found, truth) = (filling.rgb[i], pattern(&cameras[1], i));
             assert!((0..3).all(|c| (found[c] - truth[c]).abs() < 0.03), "{i}: {found:?}, {truth:?}");
         }
+    }
+
+    /// What one view alone shows is believed where another confirms its depth; what two show is believed.
+    #[test]
+    fn one_view_is_no_witness_unless_confirmed() {
+        use super::super::surface::tests::views;
+        let asked = |sure: bool, others: usize| {
+            let (mut grids, cameras, masks) = views(0.2);
+            for (view, grid) in grids.iter_mut().enumerate() {
+                grid.trusted = view == 2 || view >= 5 - others;
+            }
+            let mut sights = Sights::new(grids, &cameras, &masks, &masks);
+            sights.solve(2, 1);
+            sights.0.iter_mut().for_each(|sight| {
+                sight.depth.fill(4.0);
+                sight.grid.confirmed.fill(sure);
+            });
+            candidates(&sights, 2).iter().filter(|found| !found.is_empty()).count()
+        };
+        assert_eq!(asked(false, 1), 0);
+        assert!(asked(true, 1) > 20 && asked(false, 2) > 20);
     }
 
     /// Next to a pixel without a colour the others' count alone, and nothing of it is mixed in.

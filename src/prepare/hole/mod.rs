@@ -49,7 +49,7 @@ const LEAST_HOLE: f64 = 0.4;
 /// Views whose pictures are filled at once: each is held as float32.
 const AT_ONCE: usize = 16;
 /// Name of the way in which holes are filled: a scene that was filled in another way is filled anew.
-pub const METHOD: &str = "one surface, and what stands before the object stays";
+pub const METHOD: &str = "one surface, and what stands before the object stays whole";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 

@@ -269,9 +269,26 @@ const WITHIN: i64 = 2;
 /// Share of the views with a point of the object in the picture whose masks must cover it.
 const SHARED: f64 = 0.7;
 /// Difference, 8-bit levels in the mean of the channels, up to which a point of the object looks like itself in another view.
-const LIKE_ITSELF: u32 = 24;
+const LIKE_ITSELF: u32 = 12;
 /// Points of the object that must fall into a site for it to be the object's.
 const FEWEST_POINTS: u32 = 2;
+
+/// The sites of which this is said that hang together with what is inside.
+fn beside(grid: &DepthGrid, inside: &[bool], of: impl Fn(usize) -> bool) -> Vec<usize> {
+    let mut found = vec![false; inside.len()];
+    let mut open: Vec<usize> = (0..inside.len()).filter(|site| inside[*site]).collect();
+    while let Some(site) = open.pop() {
+        let (x, y) = ((site as u32 % grid.columns) as i64, (site as u32 / grid.columns) as i64);
+        let near = (-WITHIN..=WITHIN).flat_map(|dy| (-WITHIN..=WITHIN).map(move |dx| (x + dx, y + dy)));
+        for at in near.filter_map(|(x, y)| grid.site(x, y)) {
+            if !inside[at] && !found[at] && of(at) {
+                found[at] = true;
+                open.push(at);
+            }
+        }
+    }
+    (0..found.len()).filter(|site| found[*site]).collect()
+}
 
 /// Adds to the masks (as large as the pictures of these cameras) where points of the object fall that most other masks cover:
 /// a mask that stops short of the object is completed by what all views know of it. Returns the views whose masks grew.
@@ -307,20 +324,23 @@ pub fn complete(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage]
         .collect();
     let added: Vec<Vec<usize>> = (grids.par_iter().zip(&inside))
         .map(|(grid, inside)| {
-            let mut count = vec![0u32; grid.depth.len()];
+            // Points of the object that fall into a site, and those that it looks like.
+            let mut count = vec![[0u32; 2]; grid.depth.len()];
             // Where something else stands before the object, known to or by what it looks like, the object does not show.
             let looks = |site: usize, color: [u8; 3]| {
                 let apart =
                     |at: usize| grid.colors[at].iter().zip(color).map(|(a, b)| u32::from(a.abs_diff(b))).sum::<u32>();
                 let (x, y) = ((site as u32 % grid.columns) as i64, (site as u32 / grid.columns) as i64);
                 let mut near = (-1..=1).flat_map(|dy| (-1..=1).filter_map(move |dx| grid.site(x + dx, y + dy)));
-                near.any(|at| apart(at) <= 3 * LIKE_ITSELF)
+                near.any(|at| !inside[at] && apart(at) <= 3 * LIKE_ITSELF)
             };
             for (site, z, color) in points.iter().filter_map(|(point, c)| see(grid, *point).map(|(s, z)| (s, z, *c))) {
                 let hidden = grid.confirmed[site] && z > (1.0 + APART) * grid.depth[site];
-                count[site] += u32::from(!inside[site] && !hidden && looks(site, color));
+                let shows = !inside[site] && !hidden;
+                count[site] = [count[site][0] + 1, count[site][1] + u32::from(shows && looks(site, color))];
             }
-            sites(grid).filter(|site| count[*site] >= FEWEST_POINTS).collect()
+            let object = |site: usize| count[site][1] >= FEWEST_POINTS && 2 * count[site][1] >= count[site][0];
+            beside(grid, inside, object)
         })
         .collect();
     let mut grown = vec![];
@@ -794,5 +814,24 @@ pub(super) mod tests {
         // Its rim is left, where no point of the object is deep enough in the others' masks.
         assert!(left.count() * 2 < missing, "of {missing}");
         assert!(masks.iter().zip(&whole).enumerate().all(|(view, (now, whole))| view == 3 || now == whole));
+    }
+
+    /// Where the object is hidden by something of another colour, whose depth nobody knows, its mask is complete.
+    #[test]
+    fn what_hides_the_object_is_no_part_of_it() {
+        let (mut grids, cameras, whole) = views(0.4);
+        let mut masks = whole.clone();
+        for (grid, mask) in grids.iter_mut().zip(&whole) {
+            let red = |on: &u8| if *on != 0 { [200, 40, 40] } else { [90; 3] };
+            grid.colors = mask.as_raw().iter().map(red).collect();
+        }
+        for i in (0..whole[3].as_raw().len()).filter(|i| (*i as u32) % SIZE[0] < 18) {
+            masks[3].as_mut()[i] = 0;
+            (grids[3].colors[i], grids[3].confirmed[i]) = ([40, 160, 60], false);
+        }
+        assert_eq!(complete(&grids, &cameras, &mut masks), [0usize; 0]);
+        // Were it of the object's colour, it would be a part of it.
+        grids[3].colors.fill([200, 40, 40]);
+        assert_eq!(complete(&grids, &cameras, &mut masks), [3]);
     }
 }
