@@ -127,7 +127,7 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
     let views = front::Views { grids: &grids, cameras: &cameras, pictures: &pictures, masks: &masks };
     let mut masks = front::kept(&views, enlarged(&masks, MARGIN), |mask| radius(mask, MARGIN));
     if task.shade {
-        residue::add(task.root, task.fine.train.iter().map(|view| view.name.as_str()), &mut masks)?;
+        residue::add(task.root, &task.fine.train, &mut masks)?;
     }
     let with_holes: Vec<usize> = (0..masks.len()).filter(|i| masks[*i].as_raw().iter().any(|v| *v != 0)).collect();
     if with_holes.is_empty() {

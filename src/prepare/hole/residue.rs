@@ -10,41 +10,59 @@ use image::{GrayImage, Luma, RgbImage};
 
 use crate::prepare::Error;
 use crate::prepare::shadow::relight;
-use crate::scene::{self, resample};
+use crate::scene::{self, View, resample};
 
 /// Half the width of the seam, as a part of the picture's longer side.
 const SEAM: f64 = 0.008;
 /// Half the width of a wedge between shadow and object at most, as the same part.
 const WEDGE: f64 = 0.025;
+/// Difference of logarithms of channels, less their mean, within which two pixels have one hue.
+const HUE: f32 = 0.2;
 /// A map that takes less of the light than this has no shadow.
 const LEAST: f64 = 0.08;
 
-/// Adds the residue to the masks of views with these names, from their maps in the scene's folder.
+/// Adds the residue to the masks of views, whose pictures are without the shadow, from their maps in the scene's folder.
 ///
 /// # Errors
 /// A map that cannot be read.
-pub fn add<'a>(root: &Path, names: impl Iterator<Item = &'a str>, masks: &mut [GrayImage]) -> Result<(), Error> {
-    for (name, mask) in names.zip(masks) {
+pub fn add(root: &Path, views: &[View], masks: &mut [GrayImage]) -> Result<(), Error> {
+    for (View { name, image, .. }, mask) in views.iter().zip(masks) {
         let path = root.join(relight::path(name));
         if !path.is_file() {
             continue;
         }
         let map = resample::photograph(&scene::photograph(&path, 1)?, [mask.width(), mask.height()]);
-        if let Some(residue) = of(&map, mask) {
+        if let Some(residue) = of(&map, image, mask) {
             mask.iter_mut().zip(residue.as_raw()).for_each(|(mask, more)| *mask = (*mask).max(*more));
         }
     }
     Ok(())
 }
 
-/// The residue beside a mask, by the map of what is left of the light, of 255; nothing without a shadow.
-fn of(map: &RgbImage, mask: &GrayImage) -> Option<GrayImage> {
+/// Whether a pixel of a picture has the hue of one of a shadow's pixels within `reach` of it: of the same surface. What stands
+/// before the shadow ends it, too, and there is no seam.
+fn is_its(picture: &RgbImage, shadow: &GrayImage, [x, y]: [u32; 2], reach: u32) -> bool {
+    let hue = |x: u32, y: u32| {
+        let log = picture.get_pixel(x, y).0.map(|v| f32::from(v.max(4)).ln());
+        let mean = log.iter().sum::<f32>() / 3.0;
+        log.map(|v| v - mean)
+    };
+    let own = hue(x, y);
+    let like = |u: u32, v: u32| hue(u, v).iter().zip(own).all(|(a, b)| (a - b).abs() <= HUE);
+    let [rows, columns] = [y, x].map(|at| at.saturating_sub(reach)..=at + reach);
+    let mut near = rows.flat_map(|v| columns.clone().map(move |u| (u, v)));
+    near.any(|(u, v)| shadow.get_pixel_checked(u, v).is_some_and(|on| on.0[0] != 0) && like(u, v))
+}
+
+/// The residue beside a mask, by the map of what is left of the light, of 255; nothing without a shadow. `picture` is without
+/// the shadow.
+fn of(map: &RgbImage, picture: &RgbImage, mask: &GrayImage) -> Option<GrayImage> {
     let (w, h) = map.dimensions();
     let radius = |part: f64| (part * f64::from(w.max(h))).ceil() as u32;
-    let picture = |on: &dyn Fn(usize) -> bool| {
+    let drawn = |on: &dyn Fn(usize) -> bool| {
         GrayImage::from_fn(w, h, |x, y| Luma([if on((y * w + x) as usize) { 255 } else { 0 }]))
     };
-    let not = |image: &GrayImage| picture(&|i| image.as_raw()[i] == 0);
+    let not = |image: &GrayImage| drawn(&|i| image.as_raw()[i] == 0);
     let closed = |image: &GrayImage| {
         let large = resample::dilate(image, radius(WEDGE));
         not(&resample::dilate(&not(&large), radius(WEDGE)))
@@ -55,13 +73,15 @@ fn of(map: &RgbImage, mask: &GrayImage) -> Option<GrayImage> {
     if most < LEAST {
         return None;
     }
-    let shadow = picture(&|i| taken[i] > 0.5 * most);
+    let shadow = drawn(&|i| taken[i] > 0.5 * most);
     let [inside, outside] = [&shadow, &not(&shadow)].map(|side| resample::dilate(side, radius(SEAM)));
-    let [object, both] = [mask.clone(), picture(&|i| mask.as_raw()[i].max(shadow.as_raw()[i]) != 0)];
+    let [object, both] = [mask.clone(), drawn(&|i| mask.as_raw()[i].max(shadow.as_raw()[i]) != 0)];
     let [object, both] = [&object, &both].map(closed);
-    Some(picture(&|i| {
-        let seam = inside.as_raw()[i] != 0 && outside.as_raw()[i] != 0;
-        seam || both.as_raw()[i] != 0 && object.as_raw()[i] == 0 && shadow.as_raw()[i] == 0
+    Some(drawn(&|i| {
+        let at = |image: &GrayImage| image.as_raw()[i] != 0;
+        let its = |reach: f64| at(&shadow) || is_its(picture, &shadow, [i as u32 % w, i as u32 / w], radius(reach));
+        let seam = at(&inside) && at(&outside) && its(SEAM);
+        seam || at(&both) && !at(&object) && !at(&shadow) && its(2.0 * WEDGE)
     }))
 }
 
@@ -79,11 +99,15 @@ mod tests {
         let shadow = |x: u32, y: u32| (64..104).contains(&x) && (40..60).contains(&y);
         let map = RgbImage::from_fn(200, 100, |x, y| Rgb([if shadow(x, y) { 130 } else { 255 }; 3]));
         let mask = GrayImage::from_fn(200, 100, |x, y| Luma([if object(x, y) { 255 } else { 0 }]));
-        let residue = of(&map, &mask).expect("there is a shadow");
+        // A red post stands before the shadow's end.
+        let post = |x: u32| x >= 104;
+        let picture = RgbImage::from_fn(200, 100, |x, _| Rgb(if post(x) { [160, 60, 60] } else { [110, 108, 100] }));
+        let residue = of(&map, &picture, &mask).expect("there is a shadow");
         let on = |x: u32, y: u32| residue.get_pixel(x, y).0[0] != 0;
         assert!((60..64).all(|x| on(x, 50)), "the gap");
-        assert!(on(104, 50) && on(103, 50) && on(80, 40) && on(80, 59), "the border");
+        assert!(on(103, 50) && on(80, 39) && on(80, 40) && on(80, 59), "the border");
+        assert!(!on(104, 50), "the post");
         assert!(!on(80, 50) && !on(120, 50) && !on(30, 50) && !on(50, 50), "the rest");
-        assert!(of(&RgbImage::from_pixel(200, 100, Rgb([250; 3])), &mask).is_none());
+        assert!(of(&RgbImage::from_pixel(200, 100, Rgb([250; 3])), &picture, &mask).is_none());
     }
 }

@@ -10,8 +10,11 @@ use super::texture::Photograph;
 /// A pixel shows the surface where the fit is within this share of the object's height from it, and does not from twice
 /// that on.
 const OFF: f64 = 0.12;
-/// Logarithms of channels within which a pixel has the surface's colour.
+/// Logarithms of channels within which a pixel has the surface's colour, and within which it has its hue.
 const SAME: f32 = 0.35;
+const HUE: f32 = 0.2;
+/// Pixels beside the object whose colours are mixed with its own, as a part of the picture's longer side.
+const MIXED: f64 = 0.015;
 /// Less than this share of the light changes nothing.
 const LEAST: f64 = 0.004;
 
@@ -36,6 +39,22 @@ fn left(found: &Found, photograph: &Photograph<'_>, [x, y]: [u32; 2]) -> [u8; 3]
         return [255; 3];
     }
     found.shadow.ratio.map(|ratio| (255.0 * ratio.powf(amount)).round().clamp(1.0, 255.0) as u8)
+}
+
+/// Whether two colours, logarithms of their channels, are of one surface.
+fn is_alike(one: [f32; 3], other: [f32; 3]) -> bool {
+    let apart: [f32; 3] = std::array::from_fn(|c| one[c] - other[c]);
+    let mean = apart.iter().sum::<f32>() / 3.0;
+    apart.iter().all(|v| v.abs() <= SAME && (v - mean).abs() <= HUE)
+}
+
+/// Whether the object is so near that colours are mixed with its own.
+fn is_near(photograph: &Photograph<'_>, pixel: [f64; 2]) -> bool {
+    let [w, h] = photograph.camera.size;
+    let reach = (MIXED * f64::from(w.max(h))).ceil() as u32;
+    let [columns, rows] = pixel.map(|v| (v as u32).saturating_sub(reach)..=v as u32 + reach);
+    let mut near = rows.flat_map(|y| columns.clone().map(move |x| (x, y)));
+    near.any(|(x, y)| photograph.mask.get_pixel_checked(x, y).is_some_and(|on| on.0[0] != 0))
 }
 
 /// How much of the full shadow lies on what a pixel position shows.
@@ -72,15 +91,14 @@ fn amount(found: &Found, photograph: &Photograph<'_>, pixel: [f64; 2]) -> f64 {
     let small = photograph.depth.camera.size;
     let scaled = std::array::from_fn(|i| pixel[i] * f64::from(small[i]) / f64::from(camera.size[i]));
     let depth = f64::from(photograph.depth.smooth(scaled));
-    if !depth.is_finite() {
-        return amount;
-    }
     // On bare surfaces the fit's depth errs: what has the surface's colour is the surface.
     let nearest = row * texture.side + column;
     let color = photograph.picture.get_pixel(pixel[0] as u32, pixel[1] as u32).0.map(|v| f32::from(v).max(4.0).ln());
-    let apart = (0..3).map(|c| (color[c] - texture.log[nearest][c]).abs()).fold(0.0, f32::max);
-    if apart <= SAME {
+    if is_alike(color, texture.log[nearest]) {
         return amount;
+    }
+    if !depth.is_finite() {
+        return if is_near(photograph, pixel) { amount } else { 0.0 };
     }
     let height = support.local(eye + ray * depth).z.abs() / support.height;
     amount * (2.0 - height / OFF).clamp(0.0, 1.0)
@@ -142,4 +160,18 @@ fn triple(picture: &RgbImage, map: &RgbImage) -> RgbImage {
         image::imageops::replace(&mut out, part, i64::from(w) * i as i64, 0);
     }
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A joint is darker than its tile, and a red ball in the dark as bright as the shadow.
+    #[test]
+    fn a_surface_is_told_by_its_hue() {
+        let log = |color: [f32; 3]| color.map(f32::ln);
+        assert!(is_alike(log([60.0, 58.0, 54.0]), log([78.0, 76.0, 72.0])));
+        assert!(!is_alike(log([72.0, 42.0, 46.0]), log([60.0, 58.0, 54.0])));
+        assert!(!is_alike(log([120.0, 118.0, 110.0]), log([60.0, 58.0, 54.0])));
+    }
 }
