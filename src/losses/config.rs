@@ -41,7 +41,7 @@ pub struct Depth {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default, expecting = "a table")]
 pub struct DepthGradient {
-    /// Its weight on the reference view, all pixels; other views have [`Depth::other_weight`] of it.
+    /// Weight on the reference view, all pixels; other views have [`Depth::other_weight`] of it.
     pub weight: f64,
     /// Number of scales: scale s takes every 2^s-th pixel.
     pub scales: u32,

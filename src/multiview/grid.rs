@@ -61,6 +61,23 @@ impl DepthGrid {
         inside.then(|| (row * i64::from(self.columns) + column) as usize)
     }
 
+    /// Site, place in sites and depth z of a world point that is in the picture.
+    pub fn see(&self, point: DVec3) -> Option<(usize, [f64; 2], f64)> {
+        let [x, y, z] = self.camera.to_camera(point.to_array());
+        if z <= 0.0 {
+            return None;
+        }
+        let place = self.place([x / z, y / z]);
+        let [column, row] = place.map(f64::floor);
+        self.site(column as i64, row as i64).map(|site| (site, place, z))
+    }
+
+    /// The sites within `reach` columns and rows of one, itself included.
+    pub fn around(&self, site: usize, reach: i64) -> impl Iterator<Item = usize> + '_ {
+        let (x, y) = ((site as u32 % self.columns) as i64, (site as u32 / self.columns) as i64);
+        (-reach..=reach).flat_map(move |dy| (-reach..=reach).filter_map(move |dx| self.site(x + dx, y + dy)))
+    }
+
     /// The world point that a site shows; nothing where its depth is not known.
     pub fn point(&self, site: usize) -> Option<DVec3> {
         let z = self.depth[site];

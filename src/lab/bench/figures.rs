@@ -1,4 +1,4 @@
-//! What is drawn: passes against their floors.
+//! Figures of the passes against their floors.
 
 use super::step::StepFigures;
 use crate::lab::plots::{Axis, Figure, Mark, Panel, Scale, Series};

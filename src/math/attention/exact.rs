@@ -10,7 +10,7 @@ fn head_mut(x: &mut [f64], token: usize, head: usize) -> &mut [f64] {
     &mut x[token * INNER + head * HEAD..][..HEAD]
 }
 
-/// What [`forward`] keeps for [`backward`].
+/// Values that [`forward`] keeps for [`backward`].
 #[derive(Clone, Debug, Default)]
 pub struct Forward {
     qk: [Vec<f64>; 2],

@@ -9,7 +9,7 @@ pub struct AnchorGradient {
     pub offset: Vec<[f64; 3]>,
     /// Offsets 3, Gaussians 3.
     pub log_scaling: [f64; 6],
-    /// Of the feature.
+    /// Gradient of the feature.
     pub feature: [f64; FEATURE],
 }
 

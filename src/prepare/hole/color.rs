@@ -337,7 +337,7 @@ fn difference(one: &[Shown], other: &[Shown]) -> [f32; 3] {
 const RING: u32 = 2;
 /// Differences beyond this are of something else than brightness.
 const BRIGHTER: f32 = 0.12;
-/// The same of what is left when brightness is the same: pixels at another thing's border are mixed with its colour.
+/// Differences beyond this once brightness is the same are of another hue: pixels at another thing's border are mixed with its colour.
 const OF_ANOTHER_HUE: f32 = 0.035;
 
 #[cfg(test)]

@@ -8,9 +8,9 @@ use glam::DVec3;
 use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 
-use super::surface::{APART, covers};
+use super::surface::{self, APART};
 use crate::multiview::DepthGrid;
-use crate::scene::Camera;
+use crate::scene::{Camera, View};
 use crate::statistics::median;
 
 /// The object's depth beside a site is that of the mask's sites within this part of the view's longer side, and so many sites.
@@ -23,31 +23,21 @@ const COVERED: f64 = 0.3;
 
 /// Difference of colours, 8-bit levels in the mean of the channels, up to which a pixel goes on with what is beside it.
 const GOES_ON: u32 = 8;
-/// The same up to which it looks like the object.
+/// Such a difference up to which it looks like the object.
 const OBJECTS: u32 = 24;
 
-/// `[view][site]` what the photographs confirm to stand before the object, beside its masks (as large as the pictures of these
-/// cameras).
-fn before(grids: &[DepthGrid], cameras: &[Camera], masks: &[GrayImage]) -> Vec<Vec<bool>> {
-    let inside: Vec<Vec<bool>> = (grids.par_iter().zip(cameras).zip(masks))
-        .map(|((grid, camera), mask)| (0..grid.depth.len()).map(|site| covers(mask, camera, grid, site)).collect())
-        .collect();
+/// `[view][site]` what the photographs confirm to stand before the object, beside the masks of its views.
+fn before(grids: &[DepthGrid], views: &[View], masks: &[GrayImage]) -> Vec<Vec<bool>> {
+    let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
+    let inside = surface::inside(grids, &cameras, masks);
     let is_objects = |point: DVec3| {
-        let framing = grids.iter().zip(&inside).filter(|(grid, _)| grid.trusted).filter_map(|(grid, inside)| {
-            let [x, y, z] = grid.camera.to_camera(point.to_array());
-            let [column, row] = grid.place([x / z, y / z]).map(f64::floor);
-            let site = (z > 0.0).then(|| grid.site(column as i64, row as i64)).flatten()?;
-            Some(inside[site])
-        });
-        let (framed, covered) = framing.fold((0u32, 0u32), |(n, k), inside| (n + 1, k + u32::from(inside)));
-        f64::from(covered) > COVERED * f64::from(framed)
+        let (framed, covered) = surface::framing(grids.iter(), &inside, point);
+        covered as f64 > COVERED * framed as f64
     };
     let of = |(grid, inside): (&DepthGrid, &Vec<bool>)| -> Vec<bool> {
         let reach = ((REACH * f64::from(grid.columns.max(grid.rows))).ceil() as i64).max(LEAST_REACH);
         let object = |site: usize| {
-            let (x, y) = ((site as u32 % grid.columns) as i64, (site as u32 / grid.columns) as i64);
-            let near = (-reach..=reach).flat_map(|dy| (-reach..=reach).map(move |dx| (x + dx, y + dy)));
-            let sites = near.filter_map(|(x, y)| grid.site(x, y)).filter(|at| inside[*at] && grid.confirmed[*at]);
+            let sites = grid.around(site, reach).filter(|at| inside[*at] && grid.confirmed[*at]);
             let depths: Vec<f64> = sites.map(|at| grid.depth[at]).collect();
             (depths.len() >= FEWEST).then(|| median(depths)).flatten()
         };
@@ -87,25 +77,12 @@ fn unlike_object(picture: &RgbImage, mask: &GrayImage, enlarged: &GrayImage, i: 
     beside.is_some_and(|(_, apart)| apart <= 3 * GOES_ON)
 }
 
-/// The views that masks are of.
-pub struct Views<'a> {
-    /// `[view]` depth.
-    pub grids: &'a [DepthGrid],
-    /// `[view]` camera of the picture.
-    pub cameras: &'a [Camera],
-    /// `[view]` picture.
-    pub pictures: &'a [&'a RgbImage],
-    /// `[view]` mask, as large as the picture.
-    pub masks: &'a [GrayImage],
-}
-
-/// Masks that were enlarged by some pixels, at most `margin`, without what stands before the object.
-pub fn kept(views: &Views<'_>, enlarged: Vec<GrayImage>, margin: impl Fn(&GrayImage) -> u32 + Sync) -> Vec<GrayImage> {
-    let Views { grids, cameras, pictures, masks } = views;
-    let before = before(grids, cameras, masks);
+/// Masks, as large as the pictures of these views, enlarged by a part of their longer side, without what stands before the object.
+pub fn enlarged(grids: &[DepthGrid], views: &[View], masks: &[GrayImage], part: f64) -> Vec<GrayImage> {
+    let before = before(grids, views, masks);
     let one = |(view, large): (usize, GrayImage)| {
-        let (mask, camera, grid) = (&masks[view], &cameras[view], &grids[view]);
-        let reach = i64::from(2 * margin(mask) + 2);
+        let (mask, View { camera, image, .. }, grid) = (&masks[view], &views[view], &grids[view]);
+        let reach = i64::from(2 * super::radius(mask, part) + 2);
         let stands = |i: usize| {
             let ray = camera.unproject(camera.pixel_center(i))?;
             let [column, row] = grid.place(ray).map(f64::floor);
@@ -113,13 +90,13 @@ pub fn kept(views: &Views<'_>, enlarged: Vec<GrayImage>, margin: impl Fn(&GrayIm
         };
         let mut out = large.clone();
         for (i, value) in out.iter_mut().enumerate().filter(|(i, v)| **v != 0 && mask.as_raw()[*i] == 0) {
-            if stands(i) == Some(true) || unlike_object(pictures[view], mask, &large, i, reach) {
+            if stands(i) == Some(true) || unlike_object(image, mask, &large, i, reach) {
                 *value = 0;
             }
         }
         out
     };
-    enlarged.into_par_iter().enumerate().map(one).collect()
+    super::enlarged(masks, part).into_par_iter().enumerate().map(one).collect()
 }
 
 #[cfg(test)]
@@ -127,6 +104,20 @@ mod tests {
     use super::super::surface::tests::{SIZE, views};
     use super::*;
     use crate::scene::resample;
+
+    /// Views by these cameras that show nothing.
+    fn black(cameras: &[Camera]) -> Vec<View> {
+        let view = |camera: &Camera| View {
+            name: String::new(),
+            camera: *camera,
+            image: RgbImage::new(SIZE[0], SIZE[1]),
+            mask: None,
+            weight: None,
+            prior: None,
+            depth: None,
+        };
+        cameras.iter().map(view).collect()
+    }
 
     /// A post before the square, on its left: the enlarged mask ends at the post, and goes on where the wall is.
     #[test]
@@ -144,10 +135,7 @@ mod tests {
             }
         }
         let plain: Vec<GrayImage> = masks.iter().map(|mask| resample::dilate(mask, 3)).collect();
-        let blank = RgbImage::new(SIZE[0], SIZE[1]);
-        let pictures = [&blank; 5];
-        let views = Views { grids: &grids, cameras: &cameras, pictures: &pictures, masks: &masks };
-        let kept = kept(&views, plain.clone(), |_| 3);
+        let kept = enlarged(&grids, &black(&cameras), &masks, 3.0 / 48.0);
         let (mut post, mut wall) = (0, 0);
         for (view, kept) in kept.iter().enumerate() {
             for i in (0..(SIZE[0] * SIZE[1]) as usize).filter(|i| plain[view].as_raw()[*i] != 0) {
@@ -173,10 +161,7 @@ mod tests {
             }
         }
         let plain: Vec<GrayImage> = masks.iter().map(|mask| resample::dilate(mask, 3)).collect();
-        let blank = RgbImage::new(SIZE[0], SIZE[1]);
-        let pictures = [&blank; 5];
-        let views = Views { grids: &grids, cameras: &cameras, pictures: &pictures, masks: &masks };
-        let kept = kept(&views, plain.clone(), |_| 3);
+        let kept = enlarged(&grids, &black(&cameras), &masks, 3.0 / 48.0);
         assert_eq!(kept[2], plain[2]);
     }
 

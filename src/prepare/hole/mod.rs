@@ -123,9 +123,7 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
         ));
     }
     let wide = enlarged(&masks, BLEEDING);
-    let pictures: Vec<&RgbImage> = task.fine.train.iter().map(|view| &view.image).collect();
-    let views = front::Views { grids: &grids, cameras: &cameras, pictures: &pictures, masks: &masks };
-    let mut masks = front::kept(&views, enlarged(&masks, MARGIN), |mask| radius(mask, MARGIN));
+    let mut masks = front::enlarged(&grids, &task.fine.train, &masks, MARGIN);
     if task.shade {
         residue::add(task.root, &task.fine.train, &mut masks)?;
     }

@@ -7,6 +7,7 @@
 use std::path::Path;
 
 use image::{GrayImage, Luma, RgbImage};
+use rayon::prelude::*;
 
 use crate::prepare::Error;
 use crate::prepare::shadow::relight;
@@ -16,8 +17,6 @@ use crate::scene::{self, View, resample};
 const SEAM: f64 = 0.008;
 /// Half the width of a wedge between shadow and object at most, as the same part.
 const WEDGE: f64 = 0.025;
-/// Difference of logarithms of channels, less their mean, within which two pixels have one hue.
-const HUE: f32 = 0.2;
 /// A map that takes less of the light than this has no shadow.
 const LEAST: f64 = 0.08;
 
@@ -26,39 +25,36 @@ const LEAST: f64 = 0.08;
 /// # Errors
 /// A map that cannot be read.
 pub fn add(root: &Path, views: &[View], masks: &mut [GrayImage]) -> Result<(), Error> {
-    for (View { name, image, .. }, mask) in views.iter().zip(masks) {
+    views.par_iter().zip(masks).try_for_each(|(View { name, image, .. }, mask)| {
         let path = root.join(relight::path(name));
         if !path.is_file() {
-            continue;
+            return Ok(());
         }
         let map = resample::photograph(&scene::photograph(&path, 1)?, [mask.width(), mask.height()]);
         if let Some(residue) = of(&map, image, mask) {
             mask.iter_mut().zip(residue.as_raw()).for_each(|(mask, more)| *mask = (*mask).max(*more));
         }
-    }
-    Ok(())
+        Ok(())
+    })
 }
 
-/// Whether a pixel of a picture has the hue of one of a shadow's pixels within `reach` of it: of the same surface. What stands
-/// before the shadow ends it, too, and there is no seam.
-fn is_its(picture: &RgbImage, shadow: &GrayImage, [x, y]: [u32; 2], reach: u32) -> bool {
-    let hue = |x: u32, y: u32| {
-        let log = picture.get_pixel(x, y).0.map(|v| f32::from(v.max(4)).ln());
-        let mean = log.iter().sum::<f32>() / 3.0;
-        log.map(|v| v - mean)
-    };
-    let own = hue(x, y);
-    let like = |u: u32, v: u32| hue(u, v).iter().zip(own).all(|(a, b)| (a - b).abs() <= HUE);
-    let [rows, columns] = [y, x].map(|at| at.saturating_sub(reach)..=at + reach);
+/// Whether a pixel of a picture (logarithms of its channels) has the hue of one of a shadow's pixels within `reach` of it: of the
+/// same surface. What stands before the shadow ends it, too, and there is no seam.
+fn is_its(log: &[[f32; 3]], shadow: &GrayImage, i: usize, reach: u32) -> bool {
+    let width = shadow.width();
+    let [rows, columns] = [i as u32 / width, i as u32 % width].map(|at| at.saturating_sub(reach)..=at + reach);
     let mut near = rows.flat_map(|v| columns.clone().map(move |u| (u, v)));
-    near.any(|(u, v)| shadow.get_pixel_checked(u, v).is_some_and(|on| on.0[0] != 0) && like(u, v))
+    near.any(|(u, v)| {
+        let is_shadow = shadow.get_pixel_checked(u, v).is_some_and(|on| on.0[0] != 0);
+        is_shadow && relight::has_hue(log[(v * width + u) as usize], log[i])
+    })
 }
 
 /// The residue beside a mask, by the map of what is left of the light, of 255; nothing without a shadow. `picture` is without
 /// the shadow.
 fn of(map: &RgbImage, picture: &RgbImage, mask: &GrayImage) -> Option<GrayImage> {
     let (w, h) = map.dimensions();
-    let radius = |part: f64| (part * f64::from(w.max(h))).ceil() as u32;
+    let radius = |part: f64| super::radius(mask, part);
     let drawn = |on: &dyn Fn(usize) -> bool| {
         GrayImage::from_fn(w, h, |x, y| Luma([if on((y * w + x) as usize) { 255 } else { 0 }]))
     };
@@ -75,11 +71,11 @@ fn of(map: &RgbImage, picture: &RgbImage, mask: &GrayImage) -> Option<GrayImage>
     }
     let shadow = drawn(&|i| taken[i] > 0.5 * most);
     let [inside, outside] = [&shadow, &not(&shadow)].map(|side| resample::dilate(side, radius(SEAM)));
-    let [object, both] = [mask.clone(), drawn(&|i| mask.as_raw()[i].max(shadow.as_raw()[i]) != 0)];
-    let [object, both] = [&object, &both].map(closed);
+    let [object, both] = [mask, &drawn(&|i| mask.as_raw()[i].max(shadow.as_raw()[i]) != 0)].map(closed);
+    let log: Vec<[f32; 3]> = picture.pixels().map(|pixel| relight::log(pixel.0)).collect();
     Some(drawn(&|i| {
         let at = |image: &GrayImage| image.as_raw()[i] != 0;
-        let its = |reach: f64| at(&shadow) || is_its(picture, &shadow, [i as u32 % w, i as u32 / w], radius(reach));
+        let its = |reach: f64| at(&shadow) || is_its(&log, &shadow, i, radius(reach));
         let seam = at(&inside) && at(&outside) && its(SEAM);
         seam || at(&both) && !at(&object) && !at(&shadow) && its(2.0 * WEDGE)
     }))

@@ -113,13 +113,7 @@ impl Sight {
 
     /// The same, with the place in sites.
     pub(super) fn seen(&self, point: DVec3) -> Option<(usize, [f64; 2], f64)> {
-        let [x, y, z] = self.grid.camera.to_camera(point.to_array());
-        if z <= 0.0 {
-            return None;
-        }
-        let place = self.grid.place([x / z, y / z]);
-        let [column, row] = place.map(f64::floor);
-        self.grid.site(column as i64, row as i64).map(|site| (site, place, z))
+        self.grid.see(point)
     }
 
     /// Depth z at a place in sites, linear in its inverse between sites of one surface; NaN where nothing is known.
@@ -251,17 +245,35 @@ impl Sight {
 
     /// The sites within one of this one, itself included.
     fn around(&self, site: usize) -> impl Iterator<Item = usize> + '_ {
-        let (x, y) = ((site as u32 % self.grid.columns) as i64, (site as u32 / self.grid.columns) as i64);
-        (-1..=1).flat_map(move |dy| (-1..=1).filter_map(move |dx| self.grid.site(x + dx, y + dy)))
+        self.grid.around(site, 1)
     }
 }
 
 /// Whether a mask as large as a camera's picture covers a site.
-pub(super) fn covers(mask: &GrayImage, camera: &Camera, grid: &DepthGrid, site: usize) -> bool {
+fn covers(mask: &GrayImage, camera: &Camera, grid: &DepthGrid, site: usize) -> bool {
     let at = [site as u32 % grid.columns, site as u32 / grid.columns];
     let point = camera.along(grid.ray(at), 1.0);
     let Some([x, y]) = camera.project(point) else { return false };
     x >= 0.0 && y >= 0.0 && mask.get_pixel_checked(x as u32, y as u32).is_some_and(|p| p.0[0] != 0)
+}
+
+/// `[view][site]` whether the masks, as large as the pictures of these cameras, cover it.
+pub(super) fn inside(grids: &[DepthGrid], cameras: &[Camera], masks: &[GrayImage]) -> Vec<Vec<bool>> {
+    let views = grids.par_iter().zip(cameras).zip(masks);
+    views
+        .map(|((grid, camera), mask)| (0..grid.depth.len()).map(|site| covers(mask, camera, grid, site)).collect())
+        .collect()
+}
+
+/// How many trusted views have a point in the picture, and in how many of these it is inside.
+pub(super) fn framing<'a>(
+    grids: impl Iterator<Item = &'a DepthGrid>,
+    inside: &[Vec<bool>],
+    point: DVec3,
+) -> (usize, usize) {
+    let trusted = grids.zip(inside).filter(|(grid, _)| grid.trusted);
+    let framing = trusted.filter_map(|(grid, inside)| Some(inside[grid.see(point)?.0]));
+    framing.fold((0, 0), |(n, k), inside| (n + 1, k + usize::from(inside)))
 }
 
 /// Sites from the mask's border from which on what it covers is the object.
@@ -278,9 +290,7 @@ fn beside(grid: &DepthGrid, inside: &[bool], of: impl Fn(usize) -> bool) -> Vec<
     let mut found = vec![false; inside.len()];
     let mut open: Vec<usize> = (0..inside.len()).filter(|site| inside[*site]).collect();
     while let Some(site) = open.pop() {
-        let (x, y) = ((site as u32 % grid.columns) as i64, (site as u32 / grid.columns) as i64);
-        let near = (-WITHIN..=WITHIN).flat_map(|dy| (-WITHIN..=WITHIN).map(move |dx| (x + dx, y + dy)));
-        for at in near.filter_map(|(x, y)| grid.site(x, y)) {
+        for at in grid.around(site, WITHIN) {
             if !inside[at] && !found[at] && of(at) {
                 found[at] = true;
                 open.push(at);
@@ -294,30 +304,20 @@ fn beside(grid: &DepthGrid, inside: &[bool], of: impl Fn(usize) -> bool) -> Vec<
 /// a mask that stops short of the object is completed by what all views know of it. Returns the views whose masks grew.
 pub fn complete(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage]) -> Vec<usize> {
     let sites = |grid: &DepthGrid| 0..grid.depth.len();
-    let inside: Vec<Vec<bool>> = (grids.par_iter().zip(cameras).zip(&*masks))
-        .map(|((grid, camera), mask)| sites(grid).map(|site| covers(mask, camera, grid, site)).collect())
-        .collect();
-    let see = |grid: &DepthGrid, point: [f64; 3]| {
-        let [x, y, z] = grid.camera.to_camera(point);
-        let [column, row] = grid.place([x / z, y / z]).map(f64::floor);
-        (z > 0.0).then(|| grid.site(column as i64, row as i64)).flatten().map(|site| (site, z))
-    };
-    let on_object = |point: [f64; 3]| {
-        let trusted = grids.iter().zip(&inside).filter(|(grid, _)| grid.trusted);
-        let framing = trusted.filter_map(|(grid, inside)| Some(inside[see(grid, point)?.0]));
-        let (framed, covered) = framing.fold((0, 0), |(n, k), inside| (n + 1, k + usize::from(inside)));
+    let inside = inside(grids, cameras, masks);
+    let on_object = |point: DVec3| {
+        let (framed, covered) = framing(grids.iter(), &inside, point);
         framed >= HULL_VIEWS && covered as f64 >= SHARED * framed as f64
     };
-    let points: Vec<([f64; 3], [u8; 3])> = (grids.par_iter().zip(&inside))
+    let points: Vec<(DVec3, [u8; 3])> = (grids.par_iter().zip(&inside))
         .flat_map_iter(|(grid, inside)| {
             let deep = |site: usize| {
-                let (x, y) = ((site as u32 % grid.columns) as i64, (site as u32 / grid.columns) as i64);
-                let mut around = (-WITHIN..=WITHIN).flat_map(|dy| (-WITHIN..=WITHIN).map(move |dx| (x + dx, y + dy)));
-                around.all(|(x, y)| grid.site(x, y).is_some_and(|near| inside[near]))
+                // Beyond the picture nothing is.
+                grid.around(site, WITHIN).filter(|near| inside[*near]).count() == (2 * WITHIN as usize + 1).pow(2)
             };
             let known = sites(grid).filter(|site| inside[*site] && grid.confirmed[*site]).filter(|site| deep(*site));
             known
-                .filter_map(|site| Some((grid.point(site)?.to_array(), grid.colors[site])))
+                .filter_map(|site| Some((grid.point(site)?, grid.colors[site])))
                 .filter(|(point, _)| on_object(*point))
                 .collect::<Vec<_>>()
         })
@@ -330,14 +330,13 @@ pub fn complete(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage]
             let looks = |site: usize, color: [u8; 3]| {
                 let apart =
                     |at: usize| grid.colors[at].iter().zip(color).map(|(a, b)| u32::from(a.abs_diff(b))).sum::<u32>();
-                let (x, y) = ((site as u32 % grid.columns) as i64, (site as u32 / grid.columns) as i64);
-                let mut near = (-1..=1).flat_map(|dy| (-1..=1).filter_map(move |dx| grid.site(x + dx, y + dy)));
-                near.any(|at| !inside[at] && apart(at) <= 3 * LIKE_ITSELF)
+                grid.around(site, 1).any(|at| !inside[at] && apart(at) <= 3 * LIKE_ITSELF)
             };
-            for (site, z, color) in points.iter().filter_map(|(point, c)| see(grid, *point).map(|(s, z)| (s, z, *c))) {
+            for (point, color) in &points {
+                let Some((site, _, z)) = grid.see(*point) else { continue };
                 let hidden = grid.confirmed[site] && z > (1.0 + APART) * grid.depth[site];
                 let shows = !inside[site] && !hidden;
-                count[site] = [count[site][0] + 1, count[site][1] + u32::from(shows && looks(site, color))];
+                count[site] = [count[site][0] + 1, count[site][1] + u32::from(shows && looks(site, *color))];
             }
             let object = |site: usize| count[site][1] >= FEWEST_POINTS && 2 * count[site][1] >= count[site][0];
             beside(grid, inside, object)
@@ -396,15 +395,11 @@ impl Sights {
     /// Of views with these depths, cameras and masks. `wide` are the masks with as much around them as depth may bleed over the
     /// object's border: what lies within them in nearly all views is not taken for background.
     pub fn new(grids: Vec<DepthGrid>, cameras: &[Camera], masks: &[GrayImage], wide: &[GrayImage]) -> Self {
-        let inside: Vec<Vec<bool>> = (grids.par_iter().zip(cameras).zip(wide))
-            .map(|((grid, camera), wide)| (0..grid.depth.len()).map(|site| covers(wide, camera, grid, site)).collect())
-            .collect();
+        let inside = inside(&grids, cameras, wide);
         let views = grids.into_par_iter().zip(cameras).zip(masks);
         let mut sights = Self(views.map(|((grid, camera), mask)| Sight::new(grid, camera, mask)).collect());
         let on_object = |point: DVec3| {
-            let trusted = sights.0.iter().zip(&inside).filter(|(sight, _)| sight.grid.trusted);
-            let framing = trusted.filter_map(|(sight, inside)| Some(inside[sight.see(point)?.0]));
-            let (framed, covered) = framing.fold((0, 0), |(n, k), inside| (n + 1, k + usize::from(inside)));
+            let (framed, covered) = framing(sights.0.iter().map(|sight| &sight.grid), &inside, point);
             framed >= HULL_VIEWS && covered as f64 >= HULL * framed as f64
         };
         let bled: Vec<Vec<usize>> = (sights.0.par_iter().zip(&inside))

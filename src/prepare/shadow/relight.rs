@@ -41,11 +41,21 @@ fn left(found: &Found, photograph: &Photograph<'_>, [x, y]: [u32; 2]) -> [u8; 3]
     found.shadow.ratio.map(|ratio| (255.0 * ratio.powf(amount)).round().clamp(1.0, 255.0) as u8)
 }
 
-/// Whether two colours, logarithms of their channels, are of one surface.
-fn is_alike(one: [f32; 3], other: [f32; 3]) -> bool {
+/// Logarithms of a pixel's channels; nothing is darker than 4 of 255, where noise alone is left.
+pub fn log(pixel: [u8; 3]) -> [f32; 3] {
+    pixel.map(|v| f32::from(v).max(4.0).ln())
+}
+
+/// Whether two colours, logarithms of their channels, differ in brightness alone.
+pub fn has_hue(one: [f32; 3], other: [f32; 3]) -> bool {
     let apart: [f32; 3] = std::array::from_fn(|c| one[c] - other[c]);
     let mean = apart.iter().sum::<f32>() / 3.0;
-    apart.iter().all(|v| v.abs() <= SAME && (v - mean).abs() <= HUE)
+    apart.iter().all(|v| (v - mean).abs() <= HUE)
+}
+
+/// Whether two colours, logarithms of their channels, are of one surface.
+fn is_alike(one: [f32; 3], other: [f32; 3]) -> bool {
+    (0..3).all(|c| (one[c] - other[c]).abs() <= SAME) && has_hue(one, other)
 }
 
 /// Whether the object is so near that colours are mixed with its own.
@@ -93,7 +103,7 @@ fn amount(found: &Found, photograph: &Photograph<'_>, pixel: [f64; 2]) -> f64 {
     let depth = f64::from(photograph.depth.smooth(scaled));
     // On bare surfaces the fit's depth errs: what has the surface's colour is the surface.
     let nearest = row * texture.side + column;
-    let color = photograph.picture.get_pixel(pixel[0] as u32, pixel[1] as u32).0.map(|v| f32::from(v).max(4.0).ln());
+    let color = log(photograph.picture.get_pixel(pixel[0] as u32, pixel[1] as u32).0);
     if is_alike(color, texture.log[nearest]) {
         return amount;
     }
