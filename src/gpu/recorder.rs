@@ -1,21 +1,25 @@
 //! Recording passes: barriers, labels, timestamps and markers come from one function.
 
+mod mode;
+mod submission;
+
 use std::collections::BTreeMap;
-use std::sync::Arc;
 
 use ash::vk;
 
-use super::check::Difference;
 use super::commands::{Command, Commands, Dispatch, Work, Workgroups};
 use super::context::{Context, MAX_PASSES};
 use super::device::{Gpu, lock};
 use super::error::{Error, Named};
 use super::hazards::{self, Entry, Hazards, Id, Schedule};
-use super::kernel::{Access, Interface, Reference, Scalar, Twin, with_twin};
-use super::ledger::Rehearsal;
+use super::kernel::{Access, Interface, Reference, Twin, with_twin};
 use super::memory::{Buffer, Slot};
-use super::timings::Timing;
 use super::witness::Case;
+use mode::Mode;
+use submission::Target;
+
+pub use mode::NotFinite;
+pub use submission::Submission;
 
 /// A kernel with what one dispatch gives it, without its types.
 #[derive(Clone, Copy)]
@@ -80,18 +84,15 @@ pub struct Groups {
 /// Records passes. The first error is kept and returned by [`Recorder::submit`], so that a step reads as plain lines.
 pub struct Recorder<'g> {
     gpu: &'g Gpu,
-    context: Option<Context>,
+    /// There until it is submitted.
+    target: Option<Target>,
     hazards: Hazards,
     schedule: Schedule,
     noted: Vec<Command>,
     passes: Vec<&'static str>,
     stage: &'static str,
-    /// In a rehearsal, in place of a context.
-    rehearsal: Option<Arc<Rehearsal>>,
     error: Option<Error>,
-    differences: Option<Vec<Difference>>,
-    inspection: Option<Option<NotFinite>>,
-    trace: Option<Trace>,
+    mode: Mode,
     /// Passes that wait to be put in order: see [`Recorder::overlapped`].
     held: Option<Vec<Held>>,
 }
@@ -104,129 +105,46 @@ struct Held {
     work: Option<Work>,
 }
 
-/// The first value that is not finite, of an inspected recording.
-#[derive(Clone, Debug, PartialEq)]
-pub struct NotFinite {
-    /// The pass that wrote it.
-    pub pass: &'static str,
-    /// The pass's name for the array.
-    pub tensor: &'static str,
-    /// Its float in the array.
-    pub index: usize,
-    /// NaN or an infinity.
-    pub value: f32,
-}
-
-/// What a traced recording keeps.
-struct Trace {
-    wanted: &'static [&'static str],
-    found: BTreeMap<&'static str, Vec<u32>>,
-    twins: bool,
-}
-
-/// Work given to the device.
-#[must_use = "wait() frees what the submission holds"]
-pub struct Submission<'g> {
-    gpu: &'g Gpu,
-    context: Option<Context>,
-    /// The queue has taken it.
-    submitted: bool,
-    rehearsal: Option<Arc<Rehearsal>>,
-    passes: Vec<&'static str>,
-    /// What was recorded.
-    pub schedule: Schedule,
-    /// What the device was given for it, in this order. A submission begins with a barrier and ends with one to the host.
-    pub commands: Vec<Command>,
-    /// GPU against twin, of a checked recording.
-    pub differences: Vec<Difference>,
-    /// The wanted buffers of a traced recording by name, as the last pass that wrote them left them.
-    pub trace: BTreeMap<&'static str, Vec<u32>>,
-}
-
 impl Gpu {
     /// A new recording.
     ///
     /// # Errors
     /// When the device has no memory for a command buffer.
     pub fn recorder(&self) -> Result<Recorder<'_>, Error> {
-        let rehearsal = self.rehearsing().cloned();
+        self.recorder_in(Mode::Together)
+    }
+
+    fn recorder_in(&self, mode: Mode) -> Result<Recorder<'_>, Error> {
         // From here on the device may come to use whatever is recorded: dropped buffers wait.
-        let context = match &rehearsal {
+        let target = match self.rehearsing() {
             Some(rehearsal) => {
                 rehearsal.began();
-                None
+                Target::Books(rehearsal.clone())
             }
-            None => {
-                let context = lock(&self.inner().contexts).pop();
-                let context = context.map_or_else(|| Context::new(self), Ok)?;
-                self.inner().began();
-                Some(context)
-            }
+            None => Target::Device(self.begun_context()?),
         };
         let mut recorder = Recorder {
             gpu: self,
-            context,
+            target: Some(target),
             stage: self.ledger().stage(),
-            rehearsal,
             hazards: Hazards::default(),
             schedule: Schedule::default(),
             noted: vec![],
             passes: vec![],
             error: None,
-            differences: None,
-            inspection: None,
-            trace: None,
+            mode,
             held: None,
         };
         recorder.begin()?;
         Ok(recorder)
     }
 
-    /// A recording in which every pass runs at once, and its CPU twin on the same inputs beside it.
-    ///
-    /// # Errors
-    /// As [`Gpu::recorder`].
-    ///
-    /// # Panics
-    /// In a rehearsal, which has no numbers to compare.
-    pub fn checked(&self) -> Result<Recorder<'_>, Error> {
-        assert!(self.rehearsing().is_none(), "a rehearsal has no numbers to compare");
-        let mut recorder = self.recorder()?;
-        recorder.differences = Some(vec![]);
-        Ok(recorder)
-    }
-
-    /// A recording in which every pass runs at once, and what it wrote is searched for values that are not finite. With
-    /// the first one found the device's work ends: [`Recorder::not_finite`] names it.
-    ///
-    /// # Errors
-    /// As [`Gpu::recorder`].
-    pub fn inspected(&self) -> Result<Recorder<'_>, Error> {
-        let mut recorder = self.recorder()?;
-        recorder.inspection = Some(None);
-        Ok(recorder)
-    }
-
-    /// A recording in which every pass runs at once, and which keeps the words of the buffers of these names. Elements
-    /// that no pass writes are zero: a kernel that only writes such a buffer finds it zeroed the first time.
-    ///
-    /// # Errors
-    /// As [`Gpu::recorder`].
-    pub fn traced(&self, wanted: &'static [&'static str]) -> Result<Recorder<'_>, Error> {
-        let mut recorder = self.recorder()?;
-        recorder.trace = Some(Trace { wanted, found: BTreeMap::new(), twins: false });
-        Ok(recorder)
-    }
-
-    /// As [`Gpu::traced`], but the CPU twins run in the kernels' place: the reference path, float64 within a pass and
-    /// float32 in the buffers between passes. Fills and copies remain the device's.
-    ///
-    /// # Errors
-    /// As [`Gpu::recorder`].
-    pub fn reference(&self, wanted: &'static [&'static str]) -> Result<Recorder<'_>, Error> {
-        let mut recorder = self.recorder()?;
-        recorder.trace = Some(Trace { wanted, found: BTreeMap::new(), twins: true });
-        Ok(recorder)
+    /// A context that nothing uses, which counts as used from now on.
+    fn begun_context(&self) -> Result<Context, Error> {
+        let context = lock(&self.inner().contexts).pop();
+        let context = context.map_or_else(|| Context::new(self), Ok)?;
+        self.inner().began();
+        Ok(context)
     }
 }
 
@@ -246,10 +164,7 @@ impl<'g> Recorder<'g> {
     /// them to write it, keep their order, so that the result is the same. Recordings that run pass by pass keep the order of
     /// all.
     pub fn overlapped<T>(&mut self, record: impl FnOnce(&mut Self) -> T) -> T {
-        let pass_by_pass = self.differences.is_some()
-            || self.trace.is_some()
-            || self.inspection.is_some()
-            || self.gpu.options().one_by_one();
+        let pass_by_pass = !matches!(self.mode, Mode::Together) || self.gpu.options().one_by_one();
         if pass_by_pass || self.held.is_some() {
             return record(self);
         }
@@ -322,95 +237,7 @@ impl<'g> Recorder<'g> {
                 assert!(a.raw != b.raw || !written, "{name}: {} is bound twice, once for writing", a.name);
             }
         }
-        match self.inspection {
-            None => {}
-            Some(None) => return self.inspect(call, threads),
-            // Nothing behind it is worth running.
-            Some(Some(_)) => return Ok(()),
-        }
-        if self.differences.is_none() && self.trace.is_none() {
-            self.witness(call, twin, threads)?;
-            return self.dispatch(call, threads);
-        }
-        self.flush()?;
-        let wanted = |trace: &Trace, i: usize| bindings[i].access.writes() && trace.wanted.contains(&slots[i].name);
-        if let Some(trace) = &self.trace {
-            let fresh = |i: &usize| {
-                let only_written = bindings[*i].access == Access::Write;
-                only_written && wanted(trace, *i) && !trace.found.contains_key(slots[*i].name)
-            };
-            let fresh: Vec<usize> = (0..slots.len()).filter(fresh).collect();
-            fresh.into_iter().for_each(|i| self.fill_slot(slots[i], 0));
-            self.flush()?;
-        }
-        let twins = self.trace.as_ref().is_some_and(|trace| trace.twins);
-        let mut words = if twins || self.differences.is_some() { self.download(slots)? } else { vec![] };
-        if twins {
-            (twin.reference)(&mut words);
-            for ((slot, words), binding) in slots.iter().zip(&words).zip(bindings.iter()) {
-                if binding.access.writes() {
-                    self.gpu.write_words(*slot, words)?;
-                }
-            }
-        } else {
-            self.dispatch(call, threads)?;
-            self.flush()?;
-        }
-        if let Some(differences) = &mut self.differences {
-            (twin.reference)(&mut words);
-            for ((binding, slot), want) in bindings.iter().zip(slots).zip(&words) {
-                if binding.access.writes() {
-                    let got = self.gpu.read_words(*slot, slot.bytes)?;
-                    differences.push(Difference::of_words(name, twin, binding, &got, want));
-                }
-            }
-        }
-        if let Some(trace) = &mut self.trace {
-            let written: Vec<&Slot> = (0..slots.len()).filter(|i| wanted(trace, *i)).map(|i| &slots[i]).collect();
-            for slot in written {
-                trace.found.insert(slot.name, self.gpu.read_words(*slot, slot.bytes)?);
-            }
-        }
-        Ok(())
-    }
-
-    /// The first value that is not finite that a pass of this inspected recording wrote.
-    pub fn not_finite(&self) -> Option<&NotFinite> {
-        self.inspection.as_ref()?.as_ref()
-    }
-
-    /// Runs one pass and searches what it wrote. Arrays that it only writes hold a pattern meanwhile, so that what it left
-    /// alone is told from what it wrote; in the others that is what has changed.
-    fn inspect(&mut self, call: Call<'_>, threads: Threads<'_>) -> Result<(), Error> {
-        const PATTERN: u32 = 0x7fa5_a5a5; // a NaN that no arithmetic makes
-        let Call { kernel: Interface { name, bindings, .. }, slots, .. } = call;
-        let written: Vec<(usize, &'static str, Access)> = (0..slots.len())
-            .filter(|&i| bindings[i].access.writes() && bindings[i].scalar == Scalar::F32)
-            .map(|i| (i, bindings[i].name, bindings[i].access))
-            .collect();
-        self.flush()?;
-        let before = written.iter().map(|(i, ..)| self.words(slots[*i])).collect::<Result<Vec<_>, _>>()?;
-        for ((i, ..), before) in written.iter().zip(&before).filter(|((.., access), _)| *access == Access::Write) {
-            self.gpu.write_words(slots[*i], &vec![PATTERN; before.len()])?;
-        }
-        self.dispatch(call, threads)?;
-        self.flush()?;
-        for ((i, tensor, access), before) in written.into_iter().zip(before) {
-            let mut after = self.words(slots[i])?;
-            let left_alone = |after: u32, before: u32| after == if access == Access::Write { PATTERN } else { before };
-            let broken =
-                |(after, before): (&u32, &u32)| !f32::from_bits(*after).is_finite() && !left_alone(*after, *before);
-            if let Some(index) = after.iter().zip(&before).position(broken) {
-                let value = f32::from_bits(after[index]);
-                let found = NotFinite { pass: name, tensor, index, value };
-                self.inspection.as_mut().expect("an inspected recording").get_or_insert(found);
-            }
-            if access == Access::Write {
-                after.iter_mut().zip(before).filter(|(a, _)| **a == PATTERN).for_each(|(a, before)| *a = before);
-                self.gpu.write_words(slots[i], &after)?;
-            }
-        }
-        Ok(())
+        self.run_by_mode(call, twin, threads)
     }
 
     fn words(&self, slot: Slot) -> Result<Vec<u32>, Error> {
@@ -424,7 +251,7 @@ impl<'g> Recorder<'g> {
     /// Keeps a dispatch where the device was opened for it.
     fn witness(&mut self, call: Call<'_>, twin: Twin<'_>, threads: Threads<'_>) -> Result<(), Error> {
         let Call { kernel, constants, push, slots } = call;
-        if self.rehearsal.is_some() || !self.gpu.wants_case(kernel, constants) {
+        if self.gpu.rehearsing().is_some() || !self.gpu.wants_case(kernel, constants) {
             return Ok(());
         }
         self.flush()?;
@@ -473,7 +300,7 @@ impl<'g> Recorder<'g> {
             accesses.push((counted.buffer.slot().id(), counted.buffer.name(), Access::Read));
         }
         let inner = self.gpu.inner();
-        if let Some(rehearsal) = &self.rehearsal {
+        if let Some(Target::Books(rehearsal)) = &self.target {
             rehearsal.pipeline(name);
             if self.gpu.options().statistics {
                 let pipeline = inner.pipeline(kernel, constants)?;
@@ -487,8 +314,8 @@ impl<'g> Recorder<'g> {
         if self.held.is_none() {
             inner.compile(&pipeline)?;
         }
-        let set = match (&inner.push_descriptor, &mut self.context) {
-            (None, Some(context)) => {
+        let set = match (&inner.push_descriptor, &mut self.target) {
+            (None, Some(Target::Device(context))) => {
                 let set = context.sets.get(&inner.device, pipeline.set, bindings, slots);
                 set.named("making a descriptor set")?
             }
@@ -594,11 +421,10 @@ impl<'g> Recorder<'g> {
         }
         let listed = accesses.iter().map(|(_, buffer, access)| (*buffer, *access)).collect();
         self.schedule.entries.push(Entry::Pass { name, stage, accesses: listed });
-        if let Some(rehearsal) = &self.rehearsal {
-            rehearsal.pass(stage, name);
-            return;
-        }
-        let context = self.context.as_ref().expect("a recorder has its context until it is submitted");
+        let context = match self.target.as_ref().expect("there until it is submitted") {
+            Target::Device(context) => context,
+            Target::Books(rehearsal) => return rehearsal.pass(stage, name),
+        };
         let mut commands = Commands { inner, raw: context.commands, noted: &mut self.noted };
         if waits && !inner.options.omit_barriers {
             commands.barrier();
@@ -622,11 +448,8 @@ impl<'g> Recorder<'g> {
     }
 
     fn begin(&mut self) -> Result<(), Error> {
-        if self.rehearsal.is_some() {
-            return Ok(());
-        }
         let inner = self.gpu.inner();
-        let context = self.context.as_mut().expect("begin comes before submit");
+        let Some(Target::Device(context)) = &mut self.target else { return Ok(()) };
         let info = vk::CommandBufferBeginInfo::default().flags(vk::CommandBufferUsageFlags::ONE_TIME_SUBMIT);
         // SAFETY: the context is not in flight: it came from the free list or was waited for.
         unsafe {
@@ -656,19 +479,29 @@ impl<'g> Recorder<'g> {
         if let Some(error) = self.error.take() {
             return Err(error);
         }
-        let mut submission = Submission {
-            gpu: self.gpu,
-            context: self.context.take(),
-            submitted: false,
-            rehearsal: self.rehearsal.take(),
-            passes: std::mem::take(&mut self.passes),
-            schedule: std::mem::take(&mut self.schedule),
-            commands: std::mem::take(&mut self.noted),
-            differences: self.differences.take().unwrap_or_default(),
-            trace: self.trace.take().map(|trace| trace.found).unwrap_or_default(),
-        };
+        let mut submission = self.hand_over();
+        submission.schedule = std::mem::take(&mut self.schedule);
+        match std::mem::take(&mut self.mode) {
+            Mode::Checked(differences) => submission.differences = differences,
+            Mode::Traced(trace) => submission.trace = trace.found,
+            Mode::Together | Mode::Inspected(_) => {}
+        }
         submission.start()?;
         Ok(submission)
+    }
+
+    /// What was recorded since the last submission.
+    fn hand_over(&mut self) -> Submission<'g> {
+        Submission {
+            gpu: self.gpu,
+            target: self.target.take(),
+            submitted: false,
+            passes: std::mem::take(&mut self.passes),
+            schedule: Schedule::default(),
+            commands: std::mem::take(&mut self.noted),
+            differences: vec![],
+            trace: BTreeMap::new(),
+        }
     }
 
     /// What was recorded so far, without running it.
@@ -677,172 +510,27 @@ impl<'g> Recorder<'g> {
     }
 
     fn flush(&mut self) -> Result<(), Error> {
-        let context = self.context.take().expect("flush comes before submit");
-        let passes = std::mem::take(&mut self.passes);
-        let mut submission = Submission {
-            gpu: self.gpu,
-            context: Some(context),
-            submitted: false,
-            rehearsal: None,
-            passes,
-            schedule: Schedule::default(),
-            commands: std::mem::take(&mut self.noted),
-            differences: vec![],
-            trace: BTreeMap::new(),
-        };
+        let mut submission = self.hand_over();
         submission.start()?;
         submission.wait()?;
-        let context = lock(&self.gpu.inner().contexts).pop();
-        self.context = Some(context.map_or_else(|| Context::new(self.gpu), Ok)?);
-        self.gpu.inner().began();
+        self.target = Some(Target::Device(self.gpu.begun_context()?));
         self.begin()
     }
 }
 
 impl Drop for Recorder<'_> {
     fn drop(&mut self) {
-        if let Some(rehearsal) = self.rehearsal.take() {
-            rehearsal.ended();
-        }
-        if let Some(context) = self.context.take() {
-            // SAFETY: recording, never submitted; ending it makes it reusable.
-            let _ = unsafe { self.gpu.inner().device.end_command_buffer(context.commands) };
-            lock(&self.gpu.inner().contexts).push(context);
-            self.gpu.inner().ended();
-        }
-    }
-}
-
-impl Submission<'_> {
-    fn start(&mut self) -> Result<(), Error> {
-        if self.rehearsal.is_some() {
-            return Ok(());
-        }
-        let inner = self.gpu.inner();
-        let context = self.context.as_ref().expect("a submission holds its context until it is waited for");
-        Commands { inner, raw: context.commands, noted: &mut self.commands }.barrier_to_host();
-        let commands = [vk::CommandBufferSubmitInfo::default().command_buffer(context.commands)];
-        let submit = [vk::SubmitInfo2::default().command_buffer_infos(&commands)];
-        // SAFETY: the command buffer is in recording, its fence is new or was reset when it was last waited for, and the guard of
-        // the queue is held.
-        let result = unsafe {
-            inner.device.end_command_buffer(context.commands).named("ending a command buffer")?;
-            inner.device.queue_submit2(*lock(&inner.queue), &submit, context.fence)
-        };
-        self.submitted = result.is_ok();
-        self.lost(result)
-    }
-
-    fn lost(&self, result: ash::prelude::VkResult<()>) -> Result<(), Error> {
-        match result {
-            Ok(()) => Ok(()),
-            Err(vk::Result::ERROR_DEVICE_LOST) => {
-                let context = self.context.as_ref().expect("held until waited for");
-                let markers = context.markers.as_ref().and_then(|(_, allocation)| allocation.mapped_slice());
-                Err(Error::DeviceLost { place: place_of_fault(&self.passes, markers) })
+        match self.target.take() {
+            Some(Target::Device(context)) => {
+                // SAFETY: recording, never submitted; ending it makes it reusable.
+                let _ = unsafe { self.gpu.inner().device.end_command_buffer(context.commands) };
+                lock(&self.gpu.inner().contexts).push(context);
+                self.gpu.inner().ended();
             }
-            Err(result) => Err(Error::Vulkan { what: "submitting work", result }),
+            Some(Target::Books(rehearsal)) => rehearsal.ended(),
+            None => {}
         }
     }
-
-    /// Waits for the end and returns the time of every pass (empty unless the device was opened with timestamps).
-    ///
-    /// # Errors
-    /// [`Error::DeviceLost`] with the pass, where faults are traced.
-    pub fn wait(mut self) -> Result<Vec<Timing>, Error> {
-        if self.rehearsal.is_some() {
-            return Ok(vec![]);
-        }
-        let inner = self.gpu.inner().clone();
-        let context = self.context.as_ref().expect("waited for once");
-        // SAFETY: the fence was given to the queue in `start`.
-        let result = unsafe { inner.device.wait_for_fences(&[context.fence], true, u64::MAX) };
-        self.lost(result)?;
-        let mut timings = vec![];
-        if inner.options.timestamps && inner.info.timestamp_period > 0.0 {
-            let timed = self.passes.len().min(MAX_PASSES as usize);
-            let mut ticks = vec![0u64; 2 * timed];
-            if timed > 0 {
-                // SAFETY: the queries were reset and written by the finished command buffer.
-                unsafe {
-                    let flags = vk::QueryResultFlags::TYPE_64 | vk::QueryResultFlags::WAIT;
-                    inner
-                        .device
-                        .get_query_pool_results(context.queries, 0, &mut ticks, flags)
-                        .named("reading timestamps")?;
-                }
-            }
-            let period = f64::from(inner.info.timestamp_period);
-            timings.extend(self.passes.iter().zip(ticks.chunks_exact(2)).map(|(name, t)| Timing {
-                name,
-                start: t[0] as f64 * period,
-                duration: t[1].saturating_sub(t[0]) as f64 * period,
-            }));
-        }
-        let context = self.context.take().expect("waited for once");
-        // SAFETY: the fence is signalled and nobody else waits for it.
-        unsafe { inner.device.reset_fences(&[context.fence]) }.named("resetting a fence")?;
-        lock(&inner.contexts).push(context);
-        inner.ended();
-        Ok(timings)
-    }
-
-    /// True when the device has finished it.
-    pub fn is_done(&self) -> bool {
-        let inner = self.gpu.inner();
-        // SAFETY: a live fence.
-        self.context.as_ref().is_none_or(|c| unsafe { inner.device.get_fence_status(c.fence) }.unwrap_or(true))
-    }
-}
-
-/// Whether a wait for a fence came to its end: nothing runs after it, or the device is lost and nothing runs any more. After
-/// any other failure the work may be in flight still.
-fn is_over(waited: ash::prelude::VkResult<()>) -> bool {
-    matches!(waited, Ok(()) | Err(vk::Result::ERROR_DEVICE_LOST))
-}
-
-impl Drop for Submission<'_> {
-    fn drop(&mut self) {
-        if let Some(rehearsal) = self.rehearsal.take() {
-            rehearsal.ended();
-        }
-        if let Some(context) = self.context.take() {
-            let inner = self.gpu.inner();
-            // What never reached the queue signals no fence: waiting for it would not end.
-            if self.submitted {
-                // SAFETY: the fence was given to the queue in `start`.
-                let waited = unsafe { inner.device.wait_for_fences(&[context.fence], true, u64::MAX) };
-                if !is_over(waited) {
-                    // It may run still: neither the context nor any buffer may be used again or freed, as long as this
-                    // process has the device.
-                    std::mem::forget(context);
-                    return;
-                }
-                // SAFETY: nothing runs that would signal the fence, and nobody else waits for it.
-                if unsafe { inner.device.reset_fences(&[context.fence]) }.is_err() {
-                    // SAFETY: nothing in flight uses the context. With its fence up it is of no use for another submission.
-                    unsafe { context.destroy(inner) };
-                    inner.ended();
-                    return;
-                }
-            }
-            lock(&inner.contexts).push(context);
-            inner.ended();
-        }
-    }
-}
-
-/// Where a device was lost, as a part of a sentence: in the first pass without its marker. Without markers, what would tell.
-fn place_of_fault(passes: &[&str], markers: Option<&[u8]>) -> String {
-    let Some(markers) = markers else {
-        let [first, last] = [passes.first(), passes.last()].map(|pass| pass.copied().unwrap_or("none"));
-        return format!(
-            "in one of {} passes from {first} to {last}; the same command with --trace-faults says in which, and takes longer",
-            passes.len()
-        );
-    };
-    let ended = bytemuck::pod_collect_to_vec::<u8, u32>(markers).iter().take_while(|&&marker| marker == 1).count();
-    passes.get(ended).map_or_else(|| "behind the last pass that is traced".to_owned(), |pass| format!("in pass {pass}"))
 }
 
 #[cfg(test)]
@@ -851,7 +539,7 @@ mod tests {
     use rand_pcg::Pcg64Mcg;
 
     use super::*;
-    use crate::gpu::{Options, testing};
+    use crate::gpu::testing;
 
     /// Fills and copies among a few buffers, drawn at random: overlapped they come to what they come to one by one.
     #[test]
@@ -891,63 +579,5 @@ mod tests {
             saved += barriers - overlapped;
         }
         assert!(saved > 40, "{saved} barriers fewer");
-    }
-
-    #[test]
-    fn a_wait_that_failed_is_no_end_unless_the_device_is_lost() {
-        assert!(is_over(Ok(())) && is_over(Err(vk::Result::ERROR_DEVICE_LOST)));
-        for result in
-            [vk::Result::ERROR_OUT_OF_HOST_MEMORY, vk::Result::ERROR_OUT_OF_DEVICE_MEMORY, vk::Result::TIMEOUT]
-        {
-            assert!(!is_over(Err(result)), "{result}");
-        }
-    }
-
-    /// Its fence was never given to the queue: waiting for it would not end.
-    #[test]
-    fn what_the_queue_refused_is_not_waited_for() {
-        let gpu = testing::gpu();
-        for _ in 0..3 {
-            let mut recorder = gpu.recorder().expect("a recorder");
-            let context = recorder.context.take().expect("a device that runs");
-            // SAFETY: in recording, never submitted.
-            unsafe { gpu.inner().device.end_command_buffer(context.commands) }.expect("nothing was recorded");
-            drop(Submission {
-                gpu: &gpu,
-                context: Some(context),
-                submitted: false,
-                rehearsal: None,
-                passes: vec![],
-                schedule: Schedule::default(),
-                commands: vec![],
-                differences: vec![],
-                trace: BTreeMap::new(),
-            });
-        }
-        let buffer = gpu.upload("words", &[1u32, 2, 3]).expect("the device goes on");
-        assert_eq!(gpu.read(&buffer).expect("readable"), [1, 2, 3]);
-    }
-
-    #[test]
-    fn a_lost_device_is_said_to_be_lost_in_a_pass() {
-        let lost = |options: Options| {
-            let gpu = testing::gpu_with(options);
-            let buffer = gpu.upload("words", &[1u32, 2, 3]).expect("room");
-            let mut rec = gpu.recorder().expect("a recorder");
-            rec.fill(&buffer, 7);
-            rec.zero(&buffer);
-            let mut submission = rec.submit().expect("the device takes it");
-            gpu.wait_idle().expect("the device runs it");
-            submission.passes.push("primitives/scan");
-            let said = submission.lost(Err(vk::Result::ERROR_DEVICE_LOST)).expect_err("lost").to_string();
-            submission.wait().expect("it is not");
-            said
-        };
-        let plain = lost(Options::default());
-        assert!(
-            plain.contains("in one of 3 passes from fill to primitives/scan; ") && plain.contains("--trace-faults")
-        );
-        let traced = Options { trace_faults: true, ..Options::default() };
-        assert_eq!(lost(traced), "the device was lost in pass primitives/scan");
     }
 }
