@@ -315,6 +315,17 @@ pub fn neighbours(i: usize, [w, h]: [usize; 2]) -> impl Iterator<Item = usize> {
         .flatten()
 }
 
+/// The pixels that hang together with one, by their sides, of those that are left; they are left no more.
+pub fn connected(first: usize, left: &mut [bool], size: [usize; 2]) -> Vec<usize> {
+    let mut part: Vec<usize> = Some(first).filter(|i| std::mem::take(&mut left[*i])).into_iter().collect();
+    let mut at = 0;
+    while at < part.len() {
+        part.extend(neighbours(part[at], size).filter(|i| std::mem::take(&mut left[*i])));
+        at += 1;
+    }
+    part
+}
+
 /// Fills what is not a number with a membrane over what is: values spread inwards, then settle to the mean of their
 /// neighbours. Only pixels for which `wanted` says so are filled.
 pub fn membrane(values: &mut [f32], size: [usize; 2], wanted: impl Fn(usize) -> bool) {

@@ -3,6 +3,8 @@
 //! A plane is brought into a chart, as if seen straight on, so that what repeats on it repeats at one distance and straight
 //! lines meet; what all views show of the plane is in the chart. What lies on no plane is filled in the picture itself.
 
+use std::collections::BTreeSet;
+
 use glam::{DVec2, DVec3};
 use image::{GrayImage, Luma};
 use rayon::prelude::*;
@@ -10,7 +12,7 @@ use rayon::prelude::*;
 use super::color::{Filling, Photograph, between};
 use super::surface::{SAME, Sights};
 use super::texture::{self, Texture};
-use crate::prepare::planes::{Plane, membrane};
+use crate::prepare::planes::{self, Plane, membrane};
 use crate::scene::resample;
 use crate::statistics::quantile;
 
@@ -18,6 +20,8 @@ use crate::statistics::quantile;
 const CHART: f64 = 960.0;
 /// Least margin of a chart around what is to be filled, pixels.
 const MARGIN: f64 = 48.0;
+/// What a chart shows of the surroundings of what is to be filled, on each side and times its extent.
+const AROUND: f64 = 1.5;
 /// A chart ends where the plane is this many times as far as in the middle of what is to be filled.
 const FARTHEST: f64 = 4.0;
 /// Other views that a chart is filled from.
@@ -102,30 +106,42 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
     let surface = |i: usize| ray(i).map(|ray| sight.surface_at(sight.grid.place(ray)));
     let focal = f64::from(own.camera.focal[0].max(own.camera.focal[1]));
     for (number, plane) in sight.planes.iter().enumerate() {
-        let on_it: Vec<(usize, [f64; 2])> = (guessed.par_iter())
-            .filter(|i| filling.guessed[**i] && surface(**i) == Some(number as u8))
-            .filter_map(|i| Some((*i, ray(*i)?)))
-            .collect();
-        let rays: Vec<[f64; 2]> = on_it.iter().filter(|(i, _)| thick[*i]).map(|(_, ray)| *ray).collect();
-        let Some(chart) = Chart::new(*plane, &rays, focal, 1.0) else { continue };
-        let mut texture = charted(sights, photographs, of, filling, &chart, number as u8);
-        let wanted = texture.hole.clone();
-        if !texture::fill(&mut texture) {
-            continue;
-        }
-        for (i, ray) in on_it {
-            let color = chart.pixel(ray).and_then(|at| texel(&texture, &wanted, at));
-            if let Some(color) = color {
-                filling.rgb[i] = color;
-                filling.guessed[i] = false;
+        let mut left: Vec<usize> = guessed.par_iter().copied().filter(|i| surface(*i) == Some(number as u8)).collect();
+        // Around the largest part first: another may be far away on the same plane, and a chart of all would be coarse.
+        while let Some(part) = parts(&left, [w, h]).into_iter().max_by_key(Vec::len) {
+            let rays: Vec<[f64; 2]> = part.iter().filter(|i| thick[**i]).filter_map(|i| ray(*i)).collect();
+            if let Some(chart) = Chart::new(*plane, &rays, focal, AROUND) {
+                let mut texture = charted(sights, photographs, of, filling, &chart, number as u8);
+                let wanted = texture.hole.clone();
+                let filled = texture::fill(&mut texture);
+                for i in left.iter().filter(|_| filled) {
+                    let color = ray(*i).and_then(|ray| chart.pixel(ray)).and_then(|at| texel(&texture, &wanted, at));
+                    if let Some(color) = color {
+                        filling.rgb[*i] = color;
+                        filling.guessed[*i] = false;
+                    }
+                }
             }
+            let part: BTreeSet<usize> = part.into_iter().collect();
+            left.retain(|i| filling.guessed[*i] && !part.contains(i));
         }
     }
     in_picture(filling, [w, h], &thick, |i| surface(i).unwrap_or(0));
-    // A picture that is nearly all hole has nothing to copy.
+    // What is small, and a picture that is nearly all hole, which has nothing to copy.
     if filling.guessed.contains(&true) {
         smooth(filling, [w, h]);
     }
+}
+
+/// Smallest part of a hole that has a texture, as a part of the picture.
+const LEAST_PART: f64 = 5e-4;
+
+/// What hangs together of some pixels, by their sides, where it is not too small for a texture.
+fn parts(of: &[usize], size @ [w, h]: [usize; 2]) -> Vec<Vec<usize>> {
+    let mut left = vec![false; w * h];
+    of.iter().for_each(|i| left[*i] = true);
+    let parts = of.iter().map(|first| planes::connected(*first, &mut left, size));
+    parts.filter(|part| part.len() as f64 >= LEAST_PART * (w * h) as f64).collect()
 }
 
 /// Narrowest part of a hole that has a texture, as a part of the picture's longer side.

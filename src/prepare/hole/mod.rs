@@ -49,7 +49,7 @@ const LEAST_HOLE: f64 = 0.4;
 /// Views whose pictures are filled at once: each is held as float32.
 const AT_ONCE: usize = 16;
 /// Name of the way in which holes are filled: a scene that was filled in another way is filled anew.
-pub const METHOD: &str = "one surface, and what stands before the object stays whole";
+pub const METHOD: &str = "one surface, and no material comes into a part of the hole that is not beside it";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 
@@ -112,6 +112,7 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
     }
     let grids = multiview::depths(task.gpu, &matched)?;
     watch.turn(n)?;
+    log::debug!("hole: depth is measured");
     let mut batch = Batch::default();
     let grown = surface::complete(&grids, &cameras, &mut masks);
     if let Some(first) = grown.first() {
@@ -135,6 +136,7 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
     }
     let mut sights = Sights::new(grids, &cameras, &masks, &wide);
     sights.flatten(task.seed);
+    log::debug!("hole: planes are found");
     let of = reference(task, &sights, &with_holes)?;
     let photographed = |masks: &[GrayImage]| -> Vec<Photograph<'_>> {
         let views = task.fine.train.iter().zip(masks);
@@ -172,9 +174,11 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
     for i in order.iter().filter(|i| **i != of) {
         sights.solve(*i, task.seed + *i as u64);
     }
+    log::debug!("hole: every view has its surface");
     let mut done = 0;
     for some in order.chunks(AT_ONCE) {
         let gathered: Vec<Filling> = some.par_iter().map(|i| color::gather(&sights, &photographs, *i)).collect();
+        log::debug!("hole: {} views are gathered, {done} are filled", some.len());
         for (&i, mut filling) in some.iter().zip(gathered) {
             color::repaint(&sights, &photographs, &filled, i, &mut filling);
             // What was made for this view the others get from it; what photographs show they look up themselves.

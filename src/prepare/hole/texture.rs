@@ -54,6 +54,10 @@ const LIGHT: f32 = 0.05;
 /// from those that go on into the hole; it falls by a factor e every `FADES` of the hole's half width.
 const UNLIKE: f64 = 6.0;
 const FADES: f64 = 0.6;
+/// The same difference of surroundings from which on they are of a material that is not beside the hole, and what there must
+/// be of those that are for each pixel of the hole.
+const MATERIAL: f32 = 0.25;
+const ENOUGH: f64 = 0.25;
 /// Half the width of the squares over which surroundings are averaged, pixels.
 const SURROUNDINGS: usize = 8;
 /// Cost of a pixel whose copy is no source.
@@ -101,7 +105,7 @@ impl Texture {
     }
 
     /// The shifts under which patches around the hole are most often most like others, most frequent first.
-    fn shifts(&self) -> Vec<Shift> {
+    fn shifts(&self, materials: &Materials) -> Vec<Shift> {
         let [w, h] = self.size;
         let longest = w.max(h) as f64;
         let shortest = (SHORTEST * longest).ceil() as isize;
@@ -124,7 +128,7 @@ impl Texture {
             .filter(|[dx, dy]| dx * dx + dy * dy >= shortest * shortest && (*dy > 0 || *dy == 0 && *dx > 0))
             .filter(|shift| {
                 let mut some = holes.iter().step_by(holes.len().div_ceil(64));
-                some.any(|i| self.source(*i, *shift).or(self.source(*i, shift.map(|v| -v))).is_some())
+                some.any(|i| [*shift, shift.map(|v| -v)].iter().any(|shift| self.copy(materials, *i, *shift).is_some()))
             })
             .collect();
         // Of each patch the best shift: row by row of shifts, so that memory is bounded.
@@ -168,7 +172,7 @@ impl Texture {
         ranked.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         let mut shifts: Vec<Shift> = vec![];
         let apart = |a: &Shift, b: &Shift| (a[0] - b[0]).abs().max((a[1] - b[1]).abs()) > 1;
-        let useful = |shift: &Shift| holes.iter().any(|i| self.source(*i, *shift).is_some());
+        let useful = |shift: &Shift| holes.iter().any(|i| self.copy(materials, *i, *shift).is_some());
         for (_, shift) in ranked {
             if shifts.len() == SHIFTS {
                 break;
@@ -177,15 +181,15 @@ impl Texture {
                 shifts.push(shift);
             }
         }
-        let whole = self.whole(&holes, &all);
+        let whole = self.whole(&holes, &all, materials);
         shifts.extend(whole);
-        self.reach_all(&holes, &all, &mut shifts);
+        self.reach_all(&holes, &all, &mut shifts, materials);
         shifts
     }
 
     /// The shifts that fill nearly all of a hole in something plain, and under which what is around it is most like what it is
     /// covered with.
-    fn whole(&self, holes: &[usize], all: &[Shift]) -> Vec<Shift> {
+    fn whole(&self, holes: &[usize], all: &[Shift], materials: &Materials) -> Vec<Shift> {
         let every = |count: usize| count.div_ceil(SAMPLES).max(1);
         let beside = |i: &usize| {
             let mut near = (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| [dx, dy]));
@@ -201,7 +205,7 @@ impl Texture {
         let score = |shift: Shift| {
             let apart =
                 |i: &usize| self.source(*i, shift).map_or(DIFFERENT, |from| self.apart(*i, from).min(DIFFERENT));
-            let bare = holes.iter().filter(|i| self.source(**i, shift).is_none()).count();
+            let bare = holes.iter().filter(|i| self.copy(materials, **i, shift).is_none()).count();
             rim.iter().map(apart).sum::<f32>() / rim.len().max(1) as f32 + bare as f32 / holes.len().max(1) as f32
         };
         let mut scored: Vec<(f32, Shift)> = (all.par_iter())
@@ -222,17 +226,17 @@ impl Texture {
     }
 
     /// Adds shifts until every pixel of the hole has a source, as far as there are any.
-    fn reach_all(&self, holes: &[usize], all: &[Shift], shifts: &mut Vec<Shift>) {
+    fn reach_all(&self, holes: &[usize], all: &[Shift], shifts: &mut Vec<Shift>, materials: &Materials) {
         let mut left: Vec<usize> =
-            holes.iter().copied().filter(|i| shifts.iter().all(|s| self.source(*i, *s).is_none())).collect();
+            holes.iter().copied().filter(|i| shifts.iter().all(|s| self.copy(materials, *i, *s).is_none())).collect();
         while !left.is_empty() {
-            let count = |shift: Shift| left.iter().filter(|i| self.source(**i, shift).is_some()).count();
+            let count = |shift: Shift| left.iter().filter(|i| self.copy(materials, **i, shift).is_some()).count();
             let every = all.len().div_ceil(2000).max(1);
             let both = all.iter().step_by(every).flat_map(|shift| [*shift, shift.map(|v| -v)]);
             let best = both.map(|shift| (count(shift), shift)).max_by_key(|(n, s)| (*n, std::cmp::Reverse(*s)));
             let Some((_, shift)) = best.filter(|(n, _)| *n > 0) else { break };
             shifts.push(shift);
-            left.retain(|i| self.source(*i, shift).is_none());
+            left.retain(|i| self.copy(materials, *i, shift).is_none());
         }
     }
 
@@ -243,7 +247,7 @@ impl Texture {
     }
 
     /// `[pixel]` number of the shift of each pixel; `shifts.len()` outside the hole, and where nothing can be copied.
-    fn labels(&self, shifts: &[Shift]) -> Vec<usize> {
+    fn labels(&self, shifts: &[Shift], materials: &Materials) -> Vec<usize> {
         let none = shifts.len();
         // The hole's box and what touches it.
         let [w, h] = self.size;
@@ -266,7 +270,7 @@ impl Texture {
                 }
             }
             (true, true) => 2.0 * NO_SOURCE,
-            (true, false) => self.source(i, shifts[label]).map_or(NO_SOURCE, |from| unlike(i, from)),
+            (true, false) => self.copy(materials, i, shifts[label]).map_or(NO_SOURCE, |from| unlike(i, from)),
         };
         let costs: Vec<Vec<f64>> =
             (0..=none).map(|label| (0..n).map(|node| cost(label, pixel(node))).collect()).collect();
@@ -323,24 +327,73 @@ fn box_means(values: &[f32], [w, h]: [usize; 2]) -> Vec<f32> {
     sums.iter().map(|[sum, count]| if *count >= enough { sum / count } else { f32::INFINITY }).collect()
 }
 
+/// How much the colours of two surroundings are those of different materials, summed over the channels.
+fn of_another(one: [f32; 3], other: [f32; 3]) -> f32 {
+    let off: [f32; 3] = std::array::from_fn(|c| one[c] - other[c]);
+    let light = off.iter().sum::<f32>() / 3.0;
+    // Light is alike in all channels; the rest is another colour.
+    let color: f32 = off.iter().map(|off| (off - light).abs()).sum();
+    color + 3.0 * (light.abs() - LIGHT).max(0.0)
+}
+
+/// What may be copied where.
+struct Materials {
+    /// `[pixel]` of the hole the number of its part.
+    part: Vec<usize>,
+    /// `[part][pixel]`
+    allowed: Vec<Vec<bool>>,
+}
+
 impl Texture {
+    /// `[pixel]` the mean of what is known around it; NaN where nothing is.
+    fn around(&self) -> Vec<[f32; 3]> {
+        let [w, h] = self.size;
+        let mean = |i: usize| {
+            let (x, y) = (i % w, i / w);
+            let rows = y.saturating_sub(SURROUNDINGS)..(y + SURROUNDINGS + 1).min(h);
+            let near = rows
+                .flat_map(|v| (x.saturating_sub(SURROUNDINGS)..(x + SURROUNDINGS + 1).min(w)).map(move |u| v * w + u));
+            let known: Vec<usize> = near.filter(|j| self.source[*j]).collect();
+            let n = known.len() as f32;
+            std::array::from_fn(|c| known.iter().map(|j| self.rgb[*j][c]).sum::<f32>() / n)
+        };
+        (0..w * h).into_par_iter().map(mean).collect()
+    }
+
+    /// What may be copied into each part of the hole: nothing of a material that is nowhere beside it, where there is enough of
+    /// those that are. What a surface is covered with elsewhere does not begin just where the object hides it.
+    fn materials(&self) -> Materials {
+        let around = self.around();
+        let known: Vec<usize> = (0..self.source.len()).filter(|i| self.source[*i]).collect();
+        let mut materials = Materials { part: vec![0; self.hole.len()], allowed: vec![] };
+        let mut left = self.hole.clone();
+        while let Some(first) = left.iter().position(|left| *left) {
+            let part = planes::connected(first, &mut left, self.size);
+            let mut rim: Vec<usize> = part.iter().flat_map(|i| planes::neighbours(*i, self.size)).collect();
+            rim.retain(|i| self.source[*i]);
+            rim.sort_unstable();
+            rim.dedup();
+            let like = |i: &usize| rim.iter().any(|rim| of_another(around[*i], around[*rim]) <= MATERIAL);
+            let like: Vec<usize> = known.par_iter().copied().filter(like).collect();
+            let enough = like.len() as f64 >= ENOUGH * part.len() as f64;
+            let mut allowed = vec![!enough; self.source.len()];
+            like.into_iter().for_each(|i| allowed[i] = true);
+            part.into_iter().for_each(|i| materials.part[i] = materials.allowed.len());
+            materials.allowed.push(allowed);
+        }
+        materials
+    }
+
+    /// The pixel that one of the hole is copied from at a shift, if it may be.
+    fn copy(&self, materials: &Materials, pixel: usize, shift: Shift) -> Option<usize> {
+        self.source(pixel, shift).filter(|from| materials.allowed[materials.part[pixel]][*from])
+    }
+
     /// What it costs a pixel of the hole to be copied from another: the colours around that one are compared with those that
     /// go on into the hole from its border.
     fn unlike(&self) -> impl Fn(usize, usize) -> f64 {
         let [w, h] = self.size;
-        let around: Vec<[f32; 3]> = (0..w * h)
-            .into_par_iter()
-            .map(|i| {
-                let (x, y) = (i % w, i / w);
-                let rows = y.saturating_sub(SURROUNDINGS)..(y + SURROUNDINGS + 1).min(h);
-                let near = rows.flat_map(|v| {
-                    (x.saturating_sub(SURROUNDINGS)..(x + SURROUNDINGS + 1).min(w)).map(move |u| v * w + u)
-                });
-                let known: Vec<usize> = near.filter(|j| self.source[*j]).collect();
-                let n = known.len() as f32;
-                std::array::from_fn(|c| known.iter().map(|j| self.rgb[*j][c]).sum::<f32>() / n)
-            })
-            .collect();
+        let around = self.around();
         let mut expected = vec![[0f32; 3]; w * h];
         for c in 0..3 {
             let mut channel: Vec<f32> =
@@ -354,11 +407,7 @@ impl Texture {
         let deepest = (0..w * h).filter(|i| self.hole[*i]).map(|i| inwards[i]).max().unwrap_or(1);
         let fades = FADES * f64::from(deepest);
         move |pixel, from| {
-            let off: [f32; 3] = std::array::from_fn(|c| around[from][c] - expected[pixel][c]);
-            let light = off.iter().sum::<f32>() / 3.0;
-            // Light is alike in all channels; the rest is another colour.
-            let color: f32 = off.iter().map(|off| (off - light).abs()).sum();
-            let apart = color + 3.0 * (light.abs() - LIGHT).max(0.0);
+            let apart = of_another(around[from], expected[pixel]);
             let weight = UNLIKE * (-f64::from(inwards[pixel]) / fades).exp();
             if apart.is_finite() { weight * f64::from(apart) } else { 0.0 }
         }
@@ -372,11 +421,12 @@ pub fn fill(texture: &mut Texture) -> bool {
     }
     let by = texture.size[0].max(texture.size[1]).div_ceil(SIDE).max(1);
     let small = texture.reduced(by);
-    let coarse = small.shifts();
+    let materials = small.materials();
+    let coarse = small.shifts(&materials);
     if coarse.is_empty() {
         return false;
     }
-    let labels = small.labels(&coarse);
+    let labels = small.labels(&coarse, &materials);
     let shifts = refined(texture, &small, &labels, &coarse, by);
     // Of each pixel the pixel that it copies.
     let [w, h] = texture.size;
@@ -479,14 +529,17 @@ fn join(texture: &mut Texture, copied: &[Option<usize>]) {
             // Only what is known and what is being filled has a colour.
             let neighbour = texture.shifted(i, shift).filter(|j| copied[*j].is_some() || texture.source[*j]);
             let Some(j) = neighbour else { continue };
-            // Beside the hole a copy goes on in another light, or it shows something else and ends.
-            let beside = copied[i].filter(|_| copied[j].is_none()).and_then(|at| texture.source(at, shift));
-            if beside.is_some_and(|there| texture.apart(there, j) > ANOTHER) {
+            // A copy goes on in another light, or there is something else, and it ends: beside the hole and at a seam.
+            let goes_on = |from: Option<usize>, shift: Shift, there: usize| {
+                from.and_then(|at| texture.source(at, shift)).is_none_or(|on| texture.apart(on, there) <= ANOTHER)
+            };
+            let back = shift.map(|v| -v);
+            let [here, there] = [i, j].map(|pixel| copied[pixel].unwrap_or(pixel));
+            if !goes_on(copied[i], shift, there) || !goes_on(copied[j], back, here) {
                 continue;
             }
             // That of the copy; of two copies the mean of both.
             let own = copied[i].and_then(|at| Some(less(at, texture.source(at, shift)?)));
-            let back = shift.map(|v| -v);
             let other = copied[j].and_then(|at| Some(less(texture.source(at, back)?, at)));
             let gradient = match (own, other) {
                 (Some(own), Some(other)) => std::array::from_fn(|c| 0.5 * (own[c] + other[c])),
@@ -592,6 +645,24 @@ mod tests {
             let apart = (0..3).map(|c| (two.rgb[i][c] - truth[i][c]).abs()).fold(0.0, f32::max);
             assert!(off < 2.5 || apart < 0.08, "({x}, {y}): {apart}");
         }
+    }
+
+    /// Leaves and stone whose border bends meet in a hole: what is there is leaves or stone, and no mixture of both.
+    #[test]
+    fn two_materials_do_not_run_into_each_other() {
+        let noise = |x: usize, y: usize| ((x * 7919 + y * 104_729) * 2_654_435_761 % 1000) as f32 / 1000.0;
+        let hole = |x: usize, y: usize| (60..115).contains(&x) && (30..95).contains(&y);
+        let leaves = |x: usize, y: usize| (x as f64) < 85.0 + 14.0 * (y as f64 / 9.0).sin();
+        let color = |x: usize, y: usize| {
+            if leaves(x, y) { [0.1, 0.15 + 0.15 * noise(x, y), 0.1] } else { [0.65 + 0.04 * noise(x, y), 0.65, 0.7] }
+        };
+        let (mut two, _) = texture([180, 130], hole, color);
+        let before = two.hole.clone();
+        assert!(fill(&mut two));
+        let mixed = |i: &usize| (0.2..0.55).contains(&two.rgb[*i][0]);
+        let inside = || (0..before.len()).filter(|i| before[*i]);
+        let count = inside().filter(mixed).count();
+        assert!(count * 25 < inside().count(), "{count} of {}", inside().count());
     }
 
     #[test]
