@@ -432,12 +432,8 @@ pub fn fill(texture: &mut Texture) -> bool {
     let [w, h] = texture.size;
     let copied: Vec<Option<usize>> = (0..w * h)
         .map(|i| {
-            if !texture.hole[i] {
-                return None;
-            }
             let label = labels[(i / w / by) * small.size[0] + i % w / by];
-            let own = shifts.get(label).and_then(|shift| texture.source(i, *shift));
-            own.or_else(|| shifts.iter().find_map(|shift| texture.source(i, *shift)))
+            texture.hole[i].then(|| shifts.get(label).and_then(|shift| texture.source(i, *shift))).flatten()
         })
         .collect();
     for (i, from) in copied.iter().enumerate() {
@@ -446,7 +442,21 @@ pub fn fill(texture: &mut Texture) -> bool {
         }
     }
     join(texture, &copied);
-    texture.hole.iter_mut().zip(&copied).filter(|(_, from)| from.is_some()).for_each(|(hole, _)| *hole = false);
+    // Pixels at the end of what a copy has to give, and what another would copy there is not what is around them.
+    let between: Vec<bool> = (0..w * h)
+        .map(|i| {
+            texture.hole[i] && copied[i].is_none() && shifts.iter().any(|shift| texture.source(i, *shift).is_some())
+        })
+        .collect();
+    for c in 0..3 {
+        let value = |i: usize| if texture.source[i] || copied[i].is_some() { texture.rgb[i][c] } else { f32::NAN };
+        let mut channel: Vec<f32> = (0..w * h).map(value).collect();
+        planes::membrane(&mut channel, texture.size, |i| between[i]);
+        (0..w * h).filter(|i| between[*i]).for_each(|i| texture.rgb[i][c] = channel[i]);
+    }
+    for (i, hole) in texture.hole.iter_mut().enumerate() {
+        *hole &= copied[i].is_none() && !(between[i] && texture.rgb[i][0].is_finite());
+    }
     true
 }
 
