@@ -84,7 +84,7 @@ pub struct Groups {
 /// Records passes. The first error is kept and returned by [`Recorder::submit`], so that a step reads as plain lines.
 pub struct Recorder<'g> {
     gpu: &'g Gpu,
-    /// There until it is submitted.
+    /// The place that the passes go to, until they are submitted.
     target: Option<Target>,
     hazards: Hazards,
     schedule: Schedule,
@@ -490,7 +490,7 @@ impl<'g> Recorder<'g> {
         Ok(submission)
     }
 
-    /// What was recorded since the last submission.
+    /// Takes out the passes that were recorded since the last submission.
     fn hand_over(&mut self) -> Submission<'g> {
         Submission {
             gpu: self.gpu,

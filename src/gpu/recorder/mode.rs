@@ -1,4 +1,4 @@
-//! What happens at a pass beside its being recorded.
+//! Modes of a recorder: the work that a pass causes beside its being recorded.
 
 use std::collections::BTreeMap;
 
@@ -9,17 +9,17 @@ use crate::gpu::error::Error;
 use crate::gpu::kernel::{Access, Interface, Scalar, Twin};
 use crate::gpu::memory::Slot;
 
-/// What happens at a pass. In all modes but the first each pass runs at once.
+/// A recorder does more at a pass than to record it. In all modes but the first each pass runs at once.
 #[derive(Default)]
 pub(super) enum Mode {
-    /// Nothing: the device runs all passes when they are submitted.
+    /// The device runs all passes when they are submitted.
     #[default]
     Together,
-    /// The CPU twin runs on the same inputs. What differs so far.
+    /// The CPU twin runs on the same inputs. The differences so far.
     Checked(Vec<Difference>),
-    /// What it wrote is searched for values that are not finite. The first one so far.
+    /// Values that are not finite are searched for in the arrays that the pass wrote. The first one so far.
     Inspected(Option<NotFinite>),
-    /// Some of what it wrote is kept.
+    /// Buffers of some names are kept as the pass left them.
     Traced(Trace),
 }
 
@@ -30,7 +30,7 @@ pub struct NotFinite {
     pub pass: &'static str,
     /// The pass's name for the array.
     pub tensor: &'static str,
-    /// Its float in the array.
+    /// The number of the float in the array.
     pub index: usize,
     /// NaN or an infinity.
     pub value: f32,

@@ -36,7 +36,7 @@ impl Target {
 #[must_use = "wait() frees what the submission holds"]
 pub struct Submission<'g> {
     pub(super) gpu: &'g Gpu,
-    /// There until it was waited for.
+    /// The place that the passes went to, until they were waited for.
     pub(super) target: Option<Target>,
     /// The queue has taken it.
     pub(super) submitted: bool,

@@ -260,7 +260,7 @@ impl Texture {
         let size = [x1 - x0, y1 - y0];
         let pixel = |node: usize| (y0 + node / size[0]) * w + x0 + node % size[0];
         let n = size[0] * size[1];
-        let unlike = self.unlike();
+        let unlike = self.unlike(&materials.around);
         let cost = |label: usize, i: usize| match (self.hole[i], label == none) {
             (false, own) => {
                 if own {
@@ -336,16 +336,18 @@ fn of_another(one: [f32; 3], other: [f32; 3]) -> f32 {
     color + 3.0 * (light.abs() - LIGHT).max(0.0)
 }
 
-/// What may be copied where.
+/// Materials of a picture: they say which pixels may be copied into which part of the hole.
 struct Materials {
-    /// `[pixel]` of the hole the number of its part.
+    /// The number of its part for each `[pixel]` of the hole.
     part: Vec<usize>,
-    /// `[part][pixel]`
+    /// Whether a pixel may be copied into a part: `[part][pixel]`.
     allowed: Vec<Vec<bool>>,
+    /// The mean of what is known around each `[pixel]`; NaN where nothing is.
+    around: Vec<[f32; 3]>,
 }
 
 impl Texture {
-    /// `[pixel]` the mean of what is known around it; NaN where nothing is.
+    /// The mean of what is known around each `[pixel]`; NaN where nothing is.
     fn around(&self) -> Vec<[f32; 3]> {
         let [w, h] = self.size;
         let mean = |i: usize| {
@@ -360,15 +362,18 @@ impl Texture {
         (0..w * h).into_par_iter().map(mean).collect()
     }
 
-    /// What may be copied into each part of the hole: nothing of a material that is nowhere beside it, where there is enough of
+    /// Finds what may be copied into each part of the hole: nothing of a material that is nowhere beside it, where there is enough of
     /// those that are. What a surface is covered with elsewhere does not begin just where the object hides it.
     fn materials(&self) -> Materials {
         let around = self.around();
         let known: Vec<usize> = (0..self.source.len()).filter(|i| self.source[*i]).collect();
-        let mut materials = Materials { part: vec![0; self.hole.len()], allowed: vec![] };
+        let (mut of, mut all) = (vec![0; self.hole.len()], vec![]);
         let mut left = self.hole.clone();
-        while let Some(first) = left.iter().position(|left| *left) {
+        for first in (0..left.len()).filter(|i| self.hole[*i]) {
             let part = planes::connected(first, &mut left, self.size);
+            if part.is_empty() {
+                continue;
+            }
             let mut rim: Vec<usize> = part.iter().flat_map(|i| planes::neighbours(*i, self.size)).collect();
             rim.retain(|i| self.source[*i]);
             rim.sort_unstable();
@@ -378,22 +383,21 @@ impl Texture {
             let enough = like.len() as f64 >= ENOUGH * part.len() as f64;
             let mut allowed = vec![!enough; self.source.len()];
             like.into_iter().for_each(|i| allowed[i] = true);
-            part.into_iter().for_each(|i| materials.part[i] = materials.allowed.len());
-            materials.allowed.push(allowed);
+            part.into_iter().for_each(|i| of[i] = all.len());
+            all.push(allowed);
         }
-        materials
+        Materials { part: of, allowed: all, around }
     }
 
-    /// The pixel that one of the hole is copied from at a shift, if it may be.
+    /// The pixel that a pixel of the hole is copied from at a shift, if it may be.
     fn copy(&self, materials: &Materials, pixel: usize, shift: Shift) -> Option<usize> {
         self.source(pixel, shift).filter(|from| materials.allowed[materials.part[pixel]][*from])
     }
 
     /// What it costs a pixel of the hole to be copied from another: the colours around that one are compared with those that
     /// go on into the hole from its border.
-    fn unlike(&self) -> impl Fn(usize, usize) -> f64 {
+    fn unlike(&self, around: &[[f32; 3]]) -> impl Fn(usize, usize) -> f64 {
         let [w, h] = self.size;
-        let around = self.around();
         let mut expected = vec![[0f32; 3]; w * h];
         for c in 0..3 {
             let mut channel: Vec<f32> =
