@@ -30,7 +30,7 @@ pub const REST: f64 = 1.5;
 /// The same in the hole, where nothing fits better or worse.
 const UNKNOWN_REST: f64 = 0.4;
 /// What a pixel costs where its surface is impossible.
-const IMPOSSIBLE: f64 = 40.0;
+pub const IMPOSSIBLE: f64 = 40.0;
 /// What a border costs per pixel of its length.
 const BORDER: f64 = 6.0;
 /// How many times more it costs along the object's outline: a surface that ends just there would be a coincidence.

@@ -198,7 +198,12 @@ impl Sights {
         let depth_on = |plane: &Plane, site: usize| 1.0 / planes::on(plane, own.ray(site));
         let possible = |site: usize, z: f64| {
             let measured = own.depth[site];
-            z > 0.0 && !(own.hole[site] || measured.is_finite() && (z / measured - 1.0).abs() > FARTHEST)
+            let apart = match measured.is_nan() {
+                // It has the depth of something nearer than what is there.
+                true => z < (1.0 - SAME) * own.grid.depth[site],
+                false => (z / measured - 1.0).abs() > FARTHEST,
+            };
+            z > 0.0 && !own.hole[site] && !apart
         };
         let unlike = |depth: &(dyn Fn(usize) -> f64 + Sync)| -> Vec<f64> {
             let one = |site: &usize| Some(depth(*site)).filter(|z| possible(*site, *z));
@@ -221,7 +226,9 @@ impl Sights {
                 (true, _) => 0.0,
                 (false, refuted) => NEAR * apart.min(4.0) + if refuted { CONFIRMED } else { 0.0 },
             };
-            match (hole[cell], possible(site, z)) {
+            let refuted =
+                || (apart.is_nan() || apart > 1.0) && self.looked_through(others.iter().copied(), own.point(site, z));
+            match (hole[cell], possible(site, z) && !refuted()) {
                 (true, _) => 0.0,
                 (false, false) => 10.0 * MOST,
                 (false, true) => cost(on_planes[label][cell]) + off + LATER * label as f64,
@@ -390,11 +397,29 @@ mod tests {
     /// Views that are too near each other to tell two planes apart by their colours tell nothing.
     #[test]
     fn where_views_are_too_near_nothing_is_moved() {
-        let (mut sights, patches) = patched(|_, _| 90, false);
+        let (mut sights, patches) = patched(|_, _| 90, true);
         sights.flatten(1);
         for (sight, patch) in sights.0.iter().zip(&patches) {
             assert!(sight.around.is_empty() && patch.iter().all(|site| sight.depth[*site] == 3.6));
         }
+    }
+
+    /// What the object's depth has bled into lies behind it: not on a plane that goes past before it, however bare it is.
+    #[test]
+    fn what_bled_lies_behind_the_object() {
+        let (mut sights, _) = patched(|_, _| 90, false);
+        let bled: Vec<usize> =
+            (2..28).flat_map(|row| (32..44).map(move |column| row * SIZE[0] as usize + column)).collect();
+        for site in &bled {
+            (sights.0[2].depth[*site], sights.0[2].grid.depth[*site]) = (f64::NAN, 2.0);
+        }
+        let before = Common { normal: DVec3::Z, offset: 1.0 };
+        let flat = sights.flat(2, &[before], 0.1, 1);
+        let near = sights.0[2].surroundings();
+        let bled: Vec<usize> = bled.into_iter().filter(|site| near[*site]).collect();
+        let found: Vec<f64> = flat.sites.iter().filter(|(site, _)| bled.contains(site)).map(|(_, z)| *z).collect();
+        assert!(found.len() * 10 > bled.len() * 9 && bled.len() > 100, "{} of {}", found.len(), bled.len());
+        assert!(found.iter().all(|z| (z / 4.0 - 1.0).abs() < 0.005));
     }
 
     /// What the photographs show before the plane stays there.

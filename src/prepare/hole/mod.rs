@@ -49,7 +49,8 @@ const LEAST_HOLE: f64 = 0.4;
 /// Views whose pictures are filled at once: each is held as float32.
 const AT_ONCE: usize = 16;
 /// Name of the way in which holes are filled: a scene that was filled in another way is filled anew.
-pub const METHOD: &str = "one surface, and no material comes into a part of the hole that is not beside it";
+pub const METHOD: &str =
+    "one surface, nothing where others look through it, and no material that is not beside the hole";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 

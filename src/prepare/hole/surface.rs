@@ -39,6 +39,8 @@ const LEAST_MARGIN: i64 = 16;
 const BETTER: f64 = 2.0;
 /// What a depth costs where too few photographs show what is there.
 const UNSHOWN: f64 = 1.0;
+/// Part of the depth that a site was carried to before which no plane takes it: a bare surface is measured wrong, not so wrong.
+const NEARER: f64 = 0.5;
 /// Sites of a hole that are filled from their neighbours where no more than these are unknown.
 const FEW: usize = 12;
 
@@ -249,6 +251,11 @@ impl Sight {
     }
 }
 
+/// Whether so many views that look through a point, where so many have a surface, prove that nothing is there.
+fn refuted(through: u32, agree: u32) -> bool {
+    through >= 2 && through > 2 * agree
+}
+
 /// Whether a mask as large as a camera's picture covers a site.
 fn covers(mask: &GrayImage, camera: &Camera, grid: &DepthGrid, site: usize) -> bool {
     let at = [site as u32 % grid.columns, site as u32 / grid.columns];
@@ -408,10 +415,41 @@ impl Sights {
                 near.filter(|site| on_object(sight.point(*site, sight.depth[*site]))).collect()
             })
             .collect();
-        for (sight, bled) in sights.0.iter_mut().zip(bled) {
-            bled.into_iter().for_each(|site| sight.depth[site] = f64::NAN);
-        }
+        sights.forget(bled);
+        sights.forget(sights.floating());
         sights
+    }
+
+    /// The depth of these `[view]` sites is not known.
+    fn forget(&mut self, sites: Vec<Vec<usize>>) {
+        for (sight, sites) in self.0.iter_mut().zip(sites) {
+            sites.into_iter().for_each(|site| sight.depth[site] = f64::NAN);
+        }
+    }
+
+    /// `[view]` sites whose depth nobody confirms and others look through: a bare background takes the depth of what is
+    /// beside it.
+    fn floating(&self) -> Vec<Vec<usize>> {
+        let of = |sight: &Sight| {
+            let doubtful = |site: &usize| sight.depth[*site].is_finite() && !sight.grid.confirmed[*site];
+            let point = |site: usize| sight.point(site, sight.depth[site]);
+            let sites = (0..sight.depth.len()).filter(doubtful);
+            sites.filter(|site| self.looked_through(0..self.0.len(), point(*site))).collect()
+        };
+        self.0.par_iter().map(of).collect()
+    }
+
+    /// Whether what is measured, and confirmed, beside the object is behind this point in at least two of these views, and
+    /// in more than twice as many as have it there.
+    pub(super) fn looked_through(&self, views: impl Iterator<Item = usize>, point: DVec3) -> bool {
+        let (mut through, mut agree) = (0, 0);
+        for sight in views.map(|view| &self.0[view]) {
+            let Some((site, z)) = sight.see(point).filter(|(site, _)| !sight.hole[*site]) else { continue };
+            let known = sight.grid.depth[site];
+            through += u32::from(sight.grid.confirmed[site] && z < (1.0 - APART) * known);
+            agree += u32::from(sight.grid.confirmed[site] && (z / known - 1.0).abs() <= SAME);
+        }
+        refuted(through, agree)
     }
 
     /// How a view, whose object is taken for glass, sees a point.
@@ -447,7 +485,7 @@ impl Sights {
             agree += u32::from(said == Witness::Agrees);
             hidden += u32::from(said == Witness::Hidden);
         }
-        if through >= 2 && through > 2 * agree {
+        if refuted(through, agree) {
             return 1.0;
         }
         BURIED * f64::from(hidden) / f64::from(asked.max(1))
@@ -562,7 +600,15 @@ impl Sights {
             (own.hole[site] && disparity[site].is_finite()).then_some(())?;
             let levels = |label: usize| all[label][cell];
             let least = (0..all.len()).map(levels).filter(|v| v.is_finite()).fold(f64::INFINITY, f64::min);
+            let impossible = |plane: &planes::Plane| {
+                let z = 1.0 / planes::on(plane, own.ray(site));
+                let before = z < NEARER / f64::from(disparity[site]);
+                before || self.against(of, own.point(site, z)) == 1.0
+            };
             let cost = |label: usize| {
+                if planes.get(label).is_some_and(impossible) {
+                    return planes::IMPOSSIBLE;
+                }
                 let apart = if levels(label).is_finite() {
                     ((levels(label) - least) / flat::LEVELS).min(planes::OFF)
                 } else {
@@ -792,6 +838,39 @@ pub(super) mod tests {
         grids.iter_mut().enumerate().filter(|(view, _)| *view != 2).for_each(|(_, grid)| grid.trusted = false);
         let sights = Sights::new(grids, &cameras, &masks, &masks);
         assert!(sights.carried(2).iter().all(|(depth, _)| depth.is_nan()));
+    }
+
+    /// A depth that nobody confirms, before a wall that others see, is not known; a confirmed one stays.
+    #[test]
+    fn what_others_look_through_is_not_there() {
+        for confirmed in [false, true] {
+            let (mut grids, cameras, masks) = views(0.2);
+            let block: Vec<usize> =
+                (4..9).flat_map(|row| (20..26).map(move |column| row * SIZE[0] as usize + column)).collect();
+            for site in &block {
+                (grids[2].depth[*site], grids[2].confirmed[*site]) = (3.0, confirmed);
+            }
+            let sights = Sights::new(grids, &cameras, &masks, &masks);
+            assert!(block.iter().all(|site| sights.0[2].depth[*site].is_nan() != confirmed));
+            let others = (0..5).filter(|view| *view != 2).map(|view| &sights.0[view]);
+            assert!(others.flat_map(|sight| sight.depth.iter().zip(&sight.hole)).all(|(z, hole)| z.is_nan() == *hole));
+        }
+    }
+
+    /// Behind the square the wall is taken, not a plane that others look through, nor one far before what they show.
+    #[test]
+    fn no_plane_stands_before_what_others_show() {
+        let (grids, cameras, masks) = views(0.2);
+        let sights = Sights::new(grids, &cameras, &masks, &masks);
+        let (sites, size) = ((0..sights.0[2].hole.len()).collect::<Vec<_>>(), SIZE.map(|n| n as usize));
+        let carried: Vec<f32> = sights.carried(2).iter().map(|(z, _)| (1.0 / z) as f32).collect();
+        let planes = [1.5, 3.2, 4.0].map(|z| [0.0, 0.0, 1.0 / z]);
+        let costs: Vec<Vec<f64>> = sights.evidence(2, &sites, size, &carried, &planes).into_iter().flatten().collect();
+        assert!(costs.len() > 40, "{}", costs.len());
+        assert!(costs.iter().all(|cost| cost[0] == planes::IMPOSSIBLE && cost[2] < cost[3]), "{costs:?}");
+        // In its middle no two views look past the square.
+        let refuted = costs.iter().filter(|cost| cost[1] == planes::IMPOSSIBLE).count();
+        assert!(refuted * 2 > costs.len(), "{refuted} of {}", costs.len());
     }
 
     /// A mask that ends in the middle of the object is completed by what the other masks cover; the others stay.
