@@ -3,7 +3,8 @@
 //! - `front`: what stands before the object stays.
 //! - `flat`: what is bare lies on the planes around it.
 //! - `residue`: what is left of a shadow that was taken out goes with the object.
-//! - `surface`: the depth of what is behind the object, in all views.
+//! - `complete`: masks that end before the object does grow.
+//! - `surface`: the depth of what is behind the object, in all views, by what they know of a point (`witness`).
 //! - `color`: what photographs show of it, and what views that were filled before show of it.
 //! - `guess`: what nobody shows is filled with pieces of the same surface, seen straight on (`texture`), or by a network.
 //!
@@ -11,6 +12,7 @@
 //! holes are filled from the same surface, into `hole/`.
 
 mod color;
+mod complete;
 mod flat;
 mod front;
 mod gradient;
@@ -20,6 +22,7 @@ mod shade;
 mod support;
 mod surface;
 mod texture;
+mod witness;
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -115,7 +118,7 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
     watch.turn(n)?;
     log::debug!("hole: depth is measured");
     let mut batch = Batch::default();
-    let grown = surface::complete(&grids, &cameras, &mut masks);
+    let grown = complete::complete(&grids, &cameras, &mut masks);
     if let Some(first) = grown.first() {
         batch.notes.push(format!(
             "{} of {n} masks end before the object does, by what the other views show of it; there the hole is larger than \

@@ -26,10 +26,8 @@ const UNCONFIRMED: f64 = 0.5;
 /// Share of the views with a point in the picture whose masks must cover it for it to be the object's.
 const HULL: f64 = 0.8;
 /// Fewest views with a point in the picture that can tell whether it is the object's.
-const HULL_VIEWS: usize = 3;
-/// Part of what speaks against a surface that all other views have hidden behind something else; 1 is a proof.
-const BURIED: f64 = 0.1;
-/// The same of a surface behind what the object stands on: likely, and no proof.
+pub(super) const HULL_VIEWS: usize = 3;
+/// What speaks against a surface behind what the object stands on: it is likely hidden, which is no proof.
 const BELOW: f64 = 0.5;
 /// Relative difference to a plane up to which a measured inverse depth is taken to lie on it.
 const FLAT: f32 = 0.015;
@@ -65,15 +63,6 @@ pub struct Sight {
     pub solved: bool,
     /// How many views were solved before it.
     rank: usize,
-}
-
-/// How a view sees a point that some other view claims.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Witness {
-    Agrees,
-    Hidden,
-    Through,
-    Silent,
 }
 
 /// Depth z that another view claims at a site.
@@ -251,11 +240,6 @@ impl Sight {
     }
 }
 
-/// Whether so many views that look through a point, where so many have a surface, prove that nothing is there.
-fn refuted(through: u32, agree: u32) -> bool {
-    through >= 2 && through > 2 * agree
-}
-
 /// Whether a mask as large as a camera's picture covers a site.
 fn covers(mask: &GrayImage, camera: &Camera, grid: &DepthGrid, site: usize) -> bool {
     let at = [site as u32 % grid.columns, site as u32 / grid.columns];
@@ -281,92 +265,6 @@ pub(super) fn framing<'a>(
     let trusted = grids.zip(inside).filter(|(grid, _)| grid.trusted);
     let framing = trusted.filter_map(|(grid, inside)| Some(inside[grid.see(point)?.0]));
     framing.fold((0, 0), |(n, k), inside| (n + 1, k + usize::from(inside)))
-}
-
-/// Sites from the mask's border from which on what it covers is the object.
-const WITHIN: i64 = 2;
-/// Share of the views with a point of the object in the picture whose masks must cover it.
-const SHARED: f64 = 0.7;
-/// Difference, 8-bit levels in the mean of the channels, up to which a point of the object looks like itself in another view.
-const LIKE_ITSELF: u32 = 12;
-/// Points of the object that must fall into a site for it to be the object's.
-const FEWEST_POINTS: u32 = 2;
-
-/// The sites of which this is said that hang together with what is inside.
-fn beside(grid: &DepthGrid, inside: &[bool], of: impl Fn(usize) -> bool) -> Vec<usize> {
-    let mut found = vec![false; inside.len()];
-    let mut open: Vec<usize> = (0..inside.len()).filter(|site| inside[*site]).collect();
-    while let Some(site) = open.pop() {
-        for at in grid.around(site, WITHIN) {
-            if !inside[at] && !found[at] && of(at) {
-                found[at] = true;
-                open.push(at);
-            }
-        }
-    }
-    (0..found.len()).filter(|site| found[*site]).collect()
-}
-
-/// Adds to the masks (as large as the pictures of these cameras) where points of the object fall that most other masks cover:
-/// a mask that stops short of the object is completed by what all views know of it. Returns the views whose masks grew.
-pub fn complete(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage]) -> Vec<usize> {
-    let sites = |grid: &DepthGrid| 0..grid.depth.len();
-    let inside = inside(grids, cameras, masks);
-    let on_object = |point: DVec3| {
-        let (framed, covered) = framing(grids.iter(), &inside, point);
-        framed >= HULL_VIEWS && covered as f64 >= SHARED * framed as f64
-    };
-    let points: Vec<(DVec3, [u8; 3])> = (grids.par_iter().zip(&inside))
-        .flat_map_iter(|(grid, inside)| {
-            let deep = |site: usize| {
-                // Beyond the picture nothing is.
-                grid.around(site, WITHIN).filter(|near| inside[*near]).count() == (2 * WITHIN as usize + 1).pow(2)
-            };
-            let known = sites(grid).filter(|site| inside[*site] && grid.confirmed[*site]).filter(|site| deep(*site));
-            known
-                .filter_map(|site| Some((grid.point(site)?, grid.colors[site])))
-                .filter(|(point, _)| on_object(*point))
-                .collect::<Vec<_>>()
-        })
-        .collect();
-    let added: Vec<Vec<usize>> = (grids.par_iter().zip(&inside))
-        .map(|(grid, inside)| {
-            // Points of the object that fall into a site, and those that it looks like.
-            let mut count = vec![[0u32; 2]; grid.depth.len()];
-            // Where something else stands before the object, known to or by what it looks like, the object does not show.
-            let looks = |site: usize, color: [u8; 3]| {
-                let apart =
-                    |at: usize| grid.colors[at].iter().zip(color).map(|(a, b)| u32::from(a.abs_diff(b))).sum::<u32>();
-                grid.around(site, 1).any(|at| !inside[at] && apart(at) <= 3 * LIKE_ITSELF)
-            };
-            for (point, color) in &points {
-                let Some((site, _, z)) = grid.see(*point) else { continue };
-                let hidden = grid.confirmed[site] && z > (1.0 + APART) * grid.depth[site];
-                let shows = !inside[site] && !hidden;
-                count[site] = [count[site][0] + 1, count[site][1] + u32::from(shows && looks(site, *color))];
-            }
-            let object = |site: usize| count[site][1] >= FEWEST_POINTS && 2 * count[site][1] >= count[site][0];
-            beside(grid, inside, object)
-        })
-        .collect();
-    let mut grown = vec![];
-    for (view, added) in added.into_iter().enumerate().filter(|(_, added)| !added.is_empty()) {
-        let (grid, camera, mask) = (&grids[view], &cameras[view], &mut masks[view]);
-        let mut more = GrayImage::new(mask.width(), mask.height());
-        for site in &added {
-            let at = [*site as u32 % grid.columns, *site as u32 / grid.columns];
-            let Some([x, y]) = camera.project(camera.along(grid.ray(at), 1.0)) else { continue };
-            if let Some(pixel) = more.get_pixel_mut_checked(x.max(0.0) as u32, y.max(0.0) as u32) {
-                pixel.0 = [255];
-            }
-        }
-        // A site's pixels, and a half more on each side.
-        let site = f64::from(grid.stride) * f64::from(camera.size[0]) / f64::from(grid.camera.size[0]);
-        let more = crate::scene::resample::dilate(&more, site.ceil() as u32);
-        mask.iter_mut().zip(more.as_raw()).for_each(|(m, more)| *m = (*m).max(*more));
-        grown.push(view);
-    }
-    grown
 }
 
 /// A rectangle of a view's sites.
@@ -425,70 +323,6 @@ impl Sights {
         for (sight, sites) in self.0.iter_mut().zip(sites) {
             sites.into_iter().for_each(|site| sight.depth[site] = f64::NAN);
         }
-    }
-
-    /// `[view]` sites whose depth nobody confirms and others look through: a bare background takes the depth of what is
-    /// beside it.
-    fn floating(&self) -> Vec<Vec<usize>> {
-        let of = |sight: &Sight| {
-            let doubtful = |site: &usize| sight.depth[*site].is_finite() && !sight.grid.confirmed[*site];
-            let point = |site: usize| sight.point(site, sight.depth[site]);
-            let sites = (0..sight.depth.len()).filter(doubtful);
-            sites.filter(|site| self.looked_through(0..self.0.len(), point(*site))).collect()
-        };
-        self.0.par_iter().map(of).collect()
-    }
-
-    /// Whether what is measured, and confirmed, beside the object is behind this point in at least two of these views, and
-    /// in more than twice as many as have it there.
-    pub(super) fn looked_through(&self, views: impl Iterator<Item = usize>, point: DVec3) -> bool {
-        let (mut through, mut agree) = (0, 0);
-        for sight in views.map(|view| &self.0[view]) {
-            let Some((site, z)) = sight.see(point).filter(|(site, _)| !sight.hole[*site]) else { continue };
-            let known = sight.grid.depth[site];
-            through += u32::from(sight.grid.confirmed[site] && z < (1.0 - APART) * known);
-            agree += u32::from(sight.grid.confirmed[site] && (z / known - 1.0).abs() <= SAME);
-        }
-        refuted(through, agree)
-    }
-
-    /// How a view, whose object is taken for glass, sees a point.
-    fn witness(&self, view: usize, point: DVec3) -> Witness {
-        let sight = &self.0[view];
-        let Some((site, z)) = sight.see(point).filter(|_| sight.grid.trusted) else { return Witness::Silent };
-        let hole = sight.hole[site];
-        // The object hides what is behind it, and shows that nothing else is before it.
-        let known = if hole && !sight.solved { sight.grid.depth[site] } else { sight.depth[site] };
-        let object = hole && !sight.solved;
-        if !known.is_finite() || object && !sight.grid.confirmed[site] {
-            Witness::Silent
-        } else if z < (1.0 - APART) * known {
-            Witness::Through
-        } else if object {
-            Witness::Silent
-        } else if (z / known - 1.0).abs() <= SAME {
-            Witness::Agrees
-        } else if z > (1.0 + APART) * known {
-            Witness::Hidden
-        } else {
-            Witness::Silent
-        }
-    }
-
-    /// From 0, nothing speaks against a surface at this point, to 1, it cannot be there.
-    fn against(&self, of: usize, point: DVec3) -> f64 {
-        let (mut through, mut agree, mut hidden, mut asked) = (0u32, 0u32, 0u32, 0u32);
-        for view in (0..self.0.len()).filter(|view| *view != of) {
-            let said = self.witness(view, point);
-            asked += u32::from(said != Witness::Silent);
-            through += u32::from(said == Witness::Through);
-            agree += u32::from(said == Witness::Agrees);
-            hidden += u32::from(said == Witness::Hidden);
-        }
-        if refuted(through, agree) {
-            return 1.0;
-        }
-        BURIED * f64::from(hidden) / f64::from(asked.max(1))
     }
 
     /// `[site]` of a view's hole what others claim to be there.
@@ -840,23 +674,6 @@ pub(super) mod tests {
         assert!(sights.carried(2).iter().all(|(depth, _)| depth.is_nan()));
     }
 
-    /// A depth that nobody confirms, before a wall that others see, is not known; a confirmed one stays.
-    #[test]
-    fn what_others_look_through_is_not_there() {
-        for confirmed in [false, true] {
-            let (mut grids, cameras, masks) = views(0.2);
-            let block: Vec<usize> =
-                (4..9).flat_map(|row| (20..26).map(move |column| row * SIZE[0] as usize + column)).collect();
-            for site in &block {
-                (grids[2].depth[*site], grids[2].confirmed[*site]) = (3.0, confirmed);
-            }
-            let sights = Sights::new(grids, &cameras, &masks, &masks);
-            assert!(block.iter().all(|site| sights.0[2].depth[*site].is_nan() != confirmed));
-            let others = (0..5).filter(|view| *view != 2).map(|view| &sights.0[view]);
-            assert!(others.flat_map(|sight| sight.depth.iter().zip(&sight.hole)).all(|(z, hole)| z.is_nan() == *hole));
-        }
-    }
-
     /// Behind the square the wall is taken, not a plane that others look through, nor one far before what they show.
     #[test]
     fn no_plane_stands_before_what_others_show() {
@@ -871,41 +688,5 @@ pub(super) mod tests {
         // In its middle no two views look past the square.
         let refuted = costs.iter().filter(|cost| cost[1] == planes::IMPOSSIBLE).count();
         assert!(refuted * 2 > costs.len(), "{refuted} of {}", costs.len());
-    }
-
-    /// A mask that ends in the middle of the object is completed by what the other masks cover; the others stay.
-    #[test]
-    fn a_mask_that_stops_short_is_completed() {
-        let (grids, cameras, whole) = views(0.4);
-        let mut masks = whole.clone();
-        for (x, _, pixel) in masks[3].enumerate_pixels_mut() {
-            // The object's middle is at x = 24 - 40 * 0.3 / 2.
-            pixel.0 = if x < 18 { [0] } else { pixel.0 };
-        }
-        assert_eq!(complete(&grids, &cameras, &mut masks), [3]);
-        let left = whole[3].pixels().zip(masks[3].pixels()).filter(|(whole, now)| whole.0[0] != 0 && now.0[0] == 0);
-        let missing = whole[3].pixels().filter(|p| p.0[0] != 0).count() / 2;
-        // Its rim is left, where no point of the object is deep enough in the others' masks.
-        assert!(left.count() * 2 < missing, "of {missing}");
-        assert!(masks.iter().zip(&whole).enumerate().all(|(view, (now, whole))| view == 3 || now == whole));
-    }
-
-    /// Where the object is hidden by something of another colour, whose depth nobody knows, its mask is complete.
-    #[test]
-    fn what_hides_the_object_is_no_part_of_it() {
-        let (mut grids, cameras, whole) = views(0.4);
-        let mut masks = whole.clone();
-        for (grid, mask) in grids.iter_mut().zip(&whole) {
-            let red = |on: &u8| if *on != 0 { [200, 40, 40] } else { [90; 3] };
-            grid.colors = mask.as_raw().iter().map(red).collect();
-        }
-        for i in (0..whole[3].as_raw().len()).filter(|i| (*i as u32) % SIZE[0] < 18) {
-            masks[3].as_mut()[i] = 0;
-            (grids[3].colors[i], grids[3].confirmed[i]) = ([40, 160, 60], false);
-        }
-        assert_eq!(complete(&grids, &cameras, &mut masks), [0usize; 0]);
-        // Were it of the object's colour, it would be a part of it.
-        grids[3].colors.fill([200, 40, 40]);
-        assert_eq!(complete(&grids, &cameras, &mut masks), [3]);
     }
 }

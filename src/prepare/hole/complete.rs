@@ -1,0 +1,137 @@
+//! Masks that end before the object does are completed by what all views know of it.
+
+use glam::DVec3;
+use image::GrayImage;
+use rayon::prelude::*;
+
+use super::surface::{APART, HULL_VIEWS, framing, inside};
+use crate::multiview::DepthGrid;
+use crate::scene::Camera;
+
+/// Sites from the mask's border from which on what it covers is the object.
+const WITHIN: i64 = 2;
+/// Share of the views with a point of the object in the picture whose masks must cover it.
+const SHARED: f64 = 0.7;
+/// Difference, 8-bit levels in the mean of the channels, up to which a point of the object looks like itself in another view.
+const LIKE_ITSELF: u32 = 12;
+/// Points of the object that must fall into a site for it to be the object's.
+const FEWEST_POINTS: u32 = 2;
+
+/// The sites of which this is said that hang together with what is inside.
+fn beside(grid: &DepthGrid, inside: &[bool], of: impl Fn(usize) -> bool) -> Vec<usize> {
+    let mut found = vec![false; inside.len()];
+    let mut open: Vec<usize> = (0..inside.len()).filter(|site| inside[*site]).collect();
+    while let Some(site) = open.pop() {
+        for at in grid.around(site, WITHIN) {
+            if !inside[at] && !found[at] && of(at) {
+                found[at] = true;
+                open.push(at);
+            }
+        }
+    }
+    (0..found.len()).filter(|site| found[*site]).collect()
+}
+
+/// Adds to the masks (as large as the pictures of these cameras) where points of the object fall that most other masks cover:
+/// a mask that stops short of the object is completed by what all views know of it. Returns the views whose masks grew.
+pub fn complete(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage]) -> Vec<usize> {
+    let sites = |grid: &DepthGrid| 0..grid.depth.len();
+    let inside = inside(grids, cameras, masks);
+    let on_object = |point: DVec3| {
+        let (framed, covered) = framing(grids.iter(), &inside, point);
+        framed >= HULL_VIEWS && covered as f64 >= SHARED * framed as f64
+    };
+    let points: Vec<(DVec3, [u8; 3])> = (grids.par_iter().zip(&inside))
+        .flat_map_iter(|(grid, inside)| {
+            let deep = |site: usize| {
+                // Beyond the picture nothing is.
+                grid.around(site, WITHIN).filter(|near| inside[*near]).count() == (2 * WITHIN as usize + 1).pow(2)
+            };
+            let known = sites(grid).filter(|site| inside[*site] && grid.confirmed[*site]).filter(|site| deep(*site));
+            known
+                .filter_map(|site| Some((grid.point(site)?, grid.colors[site])))
+                .filter(|(point, _)| on_object(*point))
+                .collect::<Vec<_>>()
+        })
+        .collect();
+    let added: Vec<Vec<usize>> = (grids.par_iter().zip(&inside))
+        .map(|(grid, inside)| {
+            // Points of the object that fall into a site, and those that it looks like.
+            let mut count = vec![[0u32; 2]; grid.depth.len()];
+            // Where something else stands before the object, known to or by what it looks like, the object does not show.
+            let looks = |site: usize, color: [u8; 3]| {
+                let apart =
+                    |at: usize| grid.colors[at].iter().zip(color).map(|(a, b)| u32::from(a.abs_diff(b))).sum::<u32>();
+                grid.around(site, 1).any(|at| !inside[at] && apart(at) <= 3 * LIKE_ITSELF)
+            };
+            for (point, color) in &points {
+                let Some((site, _, z)) = grid.see(*point) else { continue };
+                let hidden = grid.confirmed[site] && z > (1.0 + APART) * grid.depth[site];
+                let shows = !inside[site] && !hidden;
+                count[site] = [count[site][0] + 1, count[site][1] + u32::from(shows && looks(site, *color))];
+            }
+            let object = |site: usize| count[site][1] >= FEWEST_POINTS && 2 * count[site][1] >= count[site][0];
+            beside(grid, inside, object)
+        })
+        .collect();
+    let mut grown = vec![];
+    for (view, added) in added.into_iter().enumerate().filter(|(_, added)| !added.is_empty()) {
+        let (grid, camera, mask) = (&grids[view], &cameras[view], &mut masks[view]);
+        let mut more = GrayImage::new(mask.width(), mask.height());
+        for site in &added {
+            let at = [*site as u32 % grid.columns, *site as u32 / grid.columns];
+            let Some([x, y]) = camera.project(camera.along(grid.ray(at), 1.0)) else { continue };
+            if let Some(pixel) = more.get_pixel_mut_checked(x.max(0.0) as u32, y.max(0.0) as u32) {
+                pixel.0 = [255];
+            }
+        }
+        // A site's pixels, and a half more on each side.
+        let site = f64::from(grid.stride) * f64::from(camera.size[0]) / f64::from(grid.camera.size[0]);
+        let more = crate::scene::resample::dilate(&more, site.ceil() as u32);
+        mask.iter_mut().zip(more.as_raw()).for_each(|(m, more)| *m = (*m).max(*more));
+        grown.push(view);
+    }
+    grown
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::surface::tests::{SIZE, views};
+    use super::*;
+
+    /// A mask that ends in the middle of the object is completed by what the other masks cover; the others stay.
+    #[test]
+    fn a_mask_that_stops_short_is_completed() {
+        let (grids, cameras, whole) = views(0.4);
+        let mut masks = whole.clone();
+        for (x, _, pixel) in masks[3].enumerate_pixels_mut() {
+            // The object's middle is at x = 24 - 40 * 0.3 / 2.
+            pixel.0 = if x < 18 { [0] } else { pixel.0 };
+        }
+        assert_eq!(complete(&grids, &cameras, &mut masks), [3]);
+        let left = whole[3].pixels().zip(masks[3].pixels()).filter(|(whole, now)| whole.0[0] != 0 && now.0[0] == 0);
+        let missing = whole[3].pixels().filter(|p| p.0[0] != 0).count() / 2;
+        // Its rim is left, where no point of the object is deep enough in the others' masks.
+        assert!(left.count() * 2 < missing, "of {missing}");
+        assert!(masks.iter().zip(&whole).enumerate().all(|(view, (now, whole))| view == 3 || now == whole));
+    }
+
+    /// Where the object is hidden by something of another colour, whose depth nobody knows, its mask is complete.
+    #[test]
+    fn what_hides_the_object_is_no_part_of_it() {
+        let (mut grids, cameras, whole) = views(0.4);
+        let mut masks = whole.clone();
+        for (grid, mask) in grids.iter_mut().zip(&whole) {
+            let red = |on: &u8| if *on != 0 { [200, 40, 40] } else { [90; 3] };
+            grid.colors = mask.as_raw().iter().map(red).collect();
+        }
+        for i in (0..whole[3].as_raw().len()).filter(|i| (*i as u32) % SIZE[0] < 18) {
+            masks[3].as_mut()[i] = 0;
+            (grids[3].colors[i], grids[3].confirmed[i]) = ([40, 160, 60], false);
+        }
+        assert_eq!(complete(&grids, &cameras, &mut masks), [0usize; 0]);
+        // Were it of the object's colour, it would be a part of it.
+        grids[3].colors.fill([200, 40, 40]);
+        assert_eq!(complete(&grids, &cameras, &mut masks), [3]);
+    }
+}

@@ -1,0 +1,112 @@
+//! What the views know of a point: whether something is there, whether they look through it, whether it is hidden.
+
+use glam::DVec3;
+use rayon::prelude::*;
+
+use super::surface::{APART, SAME, Sight, Sights};
+
+/// Part of what speaks against a surface that all other views have hidden behind something else; 1 is a proof.
+const BURIED: f64 = 0.1;
+
+/// How a view sees a point that some other view claims.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Witness {
+    Agrees,
+    Hidden,
+    Through,
+    Silent,
+}
+
+/// Whether so many views that look through a point, where so many have a surface, prove that nothing is there.
+fn refuted(through: u32, agree: u32) -> bool {
+    through >= 2 && through > 2 * agree
+}
+
+impl Sights {
+    /// `[view]` sites whose depth nobody confirms and others look through: a bare background takes the depth of what is
+    /// beside it.
+    pub(super) fn floating(&self) -> Vec<Vec<usize>> {
+        let of = |sight: &Sight| {
+            let doubtful = |site: &usize| sight.depth[*site].is_finite() && !sight.grid.confirmed[*site];
+            let point = |site: usize| sight.point(site, sight.depth[site]);
+            let sites = (0..sight.depth.len()).filter(doubtful);
+            sites.filter(|site| self.looked_through(0..self.0.len(), point(*site))).collect()
+        };
+        self.0.par_iter().map(of).collect()
+    }
+
+    /// Whether what is measured, and confirmed, beside the object is behind this point in at least two of these views, and
+    /// in more than twice as many as have it there.
+    pub(super) fn looked_through(&self, views: impl Iterator<Item = usize>, point: DVec3) -> bool {
+        let (mut through, mut agree) = (0, 0);
+        for sight in views.map(|view| &self.0[view]) {
+            let Some((site, z)) = sight.see(point).filter(|(site, _)| !sight.hole[*site]) else { continue };
+            let known = sight.grid.depth[site];
+            through += u32::from(sight.grid.confirmed[site] && z < (1.0 - APART) * known);
+            agree += u32::from(sight.grid.confirmed[site] && (z / known - 1.0).abs() <= SAME);
+        }
+        refuted(through, agree)
+    }
+
+    /// How a view, whose object is taken for glass, sees a point.
+    fn witness(&self, view: usize, point: DVec3) -> Witness {
+        let sight = &self.0[view];
+        let Some((site, z)) = sight.see(point).filter(|_| sight.grid.trusted) else { return Witness::Silent };
+        let hole = sight.hole[site];
+        // The object hides what is behind it, and shows that nothing else is before it.
+        let known = if hole && !sight.solved { sight.grid.depth[site] } else { sight.depth[site] };
+        let object = hole && !sight.solved;
+        if !known.is_finite() || object && !sight.grid.confirmed[site] {
+            Witness::Silent
+        } else if z < (1.0 - APART) * known {
+            Witness::Through
+        } else if object {
+            Witness::Silent
+        } else if (z / known - 1.0).abs() <= SAME {
+            Witness::Agrees
+        } else if z > (1.0 + APART) * known {
+            Witness::Hidden
+        } else {
+            Witness::Silent
+        }
+    }
+
+    /// From 0, nothing speaks against a surface at this point, to 1, it cannot be there.
+    pub(super) fn against(&self, of: usize, point: DVec3) -> f64 {
+        let (mut through, mut agree, mut hidden, mut asked) = (0u32, 0u32, 0u32, 0u32);
+        for view in (0..self.0.len()).filter(|view| *view != of) {
+            let said = self.witness(view, point);
+            asked += u32::from(said != Witness::Silent);
+            through += u32::from(said == Witness::Through);
+            agree += u32::from(said == Witness::Agrees);
+            hidden += u32::from(said == Witness::Hidden);
+        }
+        if refuted(through, agree) {
+            return 1.0;
+        }
+        BURIED * f64::from(hidden) / f64::from(asked.max(1))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::surface::tests::{SIZE, views};
+    use super::*;
+
+    /// A depth that nobody confirms, before a wall that others see, is not known; a confirmed one stays.
+    #[test]
+    fn what_others_look_through_is_not_there() {
+        for confirmed in [false, true] {
+            let (mut grids, cameras, masks) = views(0.2);
+            let block: Vec<usize> =
+                (4..9).flat_map(|row| (20..26).map(move |column| row * SIZE[0] as usize + column)).collect();
+            for site in &block {
+                (grids[2].depth[*site], grids[2].confirmed[*site]) = (3.0, confirmed);
+            }
+            let sights = Sights::new(grids, &cameras, &masks, &masks);
+            assert!(block.iter().all(|site| sights.0[2].depth[*site].is_nan() != confirmed));
+            let others = (0..5).filter(|view| *view != 2).map(|view| &sights.0[view]);
+            assert!(others.flat_map(|sight| sight.depth.iter().zip(&sight.hole)).all(|(z, hole)| z.is_nan() == *hole));
+        }
+    }
+}
