@@ -35,7 +35,7 @@ const NEAR: f64 = 0.05;
 /// Cost of each plane above the one before it, which has more points.
 pub const LATER: f64 = 0.3;
 /// Largest relative difference between the measured depth and the plane's.
-const FARTHEST: f64 = 0.25;
+pub const FARTHEST: f64 = 0.25;
 /// Sites by which the depths of two planes, `APART` of them, must be apart in other views for these to tell which it is.
 const PARALLAX: f64 = 1.0;
 const APART: f64 = 0.05;

@@ -37,6 +37,8 @@ const LEAST_MARGIN: i64 = 16;
 const BETTER: f64 = 2.0;
 /// What a depth costs where too few photographs show what is there.
 const UNSHOWN: f64 = 1.0;
+/// The same of a depth behind the one that others claim: what they claim hides it.
+const UNSHOWN_BEHIND: f64 = 2.0;
 /// Part of the depth that a site was carried to before which no plane takes it: a bare surface is measured wrong, not so wrong.
 const NEARER: f64 = 0.5;
 /// Sites of a hole that are filled from their neighbours where no more than these are unknown.
@@ -398,6 +400,9 @@ impl Sights {
                 };
                 let enough = weight >= ENOUGH && depth > (1.0 - SAME) * object;
                 if enough && self.against(of, own.point(site, depth)) < 1.0 {
+                    if self.barred(of, site, depth) {
+                        break;
+                    }
                     return (depth, near[first..last].iter().any(|claim| claim.photographed));
                 }
                 // The cluster that begins with the next claim.
@@ -443,10 +448,13 @@ impl Sights {
                 if planes.get(label).is_some_and(impossible) {
                     return planes::IMPOSSIBLE;
                 }
-                let apart = if levels(label).is_finite() {
-                    ((levels(label) - least) / flat::LEVELS).min(planes::OFF)
-                } else {
-                    UNSHOWN
+                let behind = |plane: &planes::Plane| {
+                    f64::from(disparity[site]) > (1.0 + flat::FARTHEST) * planes::on(plane, own.ray(site))
+                };
+                let apart = match levels(label).is_finite() {
+                    true => ((levels(label) - least) / flat::LEVELS).min(planes::OFF),
+                    false if planes.get(label).is_some_and(behind) => UNSHOWN_BEHIND,
+                    false => UNSHOWN,
                 };
                 apart + if label == planes.len() { planes::REST } else { flat::LATER * label as f64 }
             };

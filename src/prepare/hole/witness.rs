@@ -3,10 +3,16 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::surface::{APART, SAME, Sight, Sights};
+use super::surface::{APART, HULL_VIEWS, SAME, Sight, Sights};
 
 /// Part of what speaks against a surface that all other views have hidden behind something else; 1 is a proof.
 const BURIED: f64 = 0.1;
+
+/// Part of the views that can tell that must have something before a point for it to be within a thing.
+const WITHIN_THING: f64 = 0.9;
+/// Steps in which a way is followed, as a part of the depth, and steps in a thing from which on the way is barred.
+const STEP: f64 = 0.03;
+const BARRED: usize = 2;
 
 /// How a view sees a point that some other view claims.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -86,11 +92,41 @@ impl Sights {
         }
         BURIED * f64::from(hidden) / f64::from(asked.max(1))
     }
+
+    /// Whether a point is within a thing: nearly all views that can tell have something before it, on several sides of it.
+    fn within(&self, of: usize, point: DVec3) -> bool {
+        let (mut hidden, mut asked) = (vec![], 0);
+        for view in (0..self.0.len()).filter(|view| *view != of) {
+            let said = self.witness(view, point);
+            asked += usize::from(said != Witness::Silent);
+            if said == Witness::Hidden {
+                hidden.push(DVec3::from(self.0[view].grid.camera.center()) - point);
+            }
+        }
+        let around = || hidden.iter().any(|side| side.dot(hidden[0]) < 0.0);
+        hidden.len() >= HULL_VIEWS && hidden.len() as f64 >= WITHIN_THING * asked as f64 && around()
+    }
+
+    /// Whether the way from the object to a depth z at a site goes through a thing: then something nearer is seen there.
+    pub(super) fn barred(&self, of: usize, site: usize, depth: f64) -> bool {
+        let own = &self.0[of];
+        let (mut z, mut steps) = ((1.0 + APART) * own.grid.depth[site], 0);
+        while own.grid.confirmed[site] && steps < BARRED && z < (1.0 - APART) * depth {
+            steps = if self.within(of, own.point(site, z)) { steps + 1 } else { 0 };
+            z *= 1.0 + STEP;
+        }
+        steps == BARRED
+    }
 }
 
 #[cfg(test)]
 mod tests {
+    use image::{GrayImage, Luma};
+
     use super::super::surface::tests::{SIZE, views};
+    use crate::multiview::DepthGrid;
+    use crate::scene::Camera;
+
     use super::*;
 
     /// A depth that nobody confirms, before a wall that others see, is not known; a confirmed one stays.
@@ -108,5 +144,42 @@ mod tests {
             let others = (0..5).filter(|view| *view != 2).map(|view| &sights.0[view]);
             assert!(others.flat_map(|sight| sight.depth.iter().zip(&sight.hole)).all(|(z, hole)| z.is_nan() == *hole));
         }
+    }
+
+    /// A ball that is seen from all around bars the way to what is behind it, not the way past it nor to its front.
+    #[test]
+    fn the_way_through_a_thing_is_barred() {
+        let grid = |turn: usize| {
+            let (sin, cos) = (std::f64::consts::TAU * turn as f64 / 8.0).sin_cos();
+            let camera = Camera {
+                rotation: [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]].map(|row| row.map(|v| v as f32)),
+                translation: [0.0, 0.0, 4.0],
+                focal: [40.0; 2],
+                principal: [24.0, 16.0],
+                distortion: [0.0; 4],
+                size: SIZE,
+            };
+            let pixels = (SIZE[0] * SIZE[1]) as usize;
+            let depth = |i: usize| {
+                // Along (x, y, 1) z, a ball of radius 1 at z = 4.
+                let [x, y, _] = camera.to_camera(camera.lift(camera.pixel_center(i), 1.0).expect("a ray"));
+                let a = 1.0 + x * x + y * y;
+                let root = 16.0 - 15.0 * a;
+                if root > 0.0 { (4.0 - root.sqrt()) / a } else { 14.0 }
+            };
+            let (depth, confirmed) = ((0..pixels).map(depth).collect(), vec![true; pixels]);
+            let colors = vec![[0; 3]; pixels];
+            DepthGrid { camera, stride: 1, columns: SIZE[0], rows: SIZE[1], depth, confirmed, colors, trusted: true }
+        };
+        let mut grids: Vec<DepthGrid> = (0..8).map(grid).collect();
+        let cameras: Vec<Camera> = grids.iter().map(|grid| grid.camera).collect();
+        // In the first view the object hides the ball, and what is beside it.
+        grids[0].depth.fill(2.5);
+        let hole = |view: u8| GrayImage::from_pixel(SIZE[0], SIZE[1], Luma([if view == 0 { 255 } else { 0 }]));
+        let masks: Vec<GrayImage> = (0..8).map(hole).collect();
+        let sights = Sights::new(grids, &cameras, &masks, &masks);
+        let site = |x: usize| 16 * SIZE[0] as usize + x;
+        assert!(sights.barred(0, site(24), 14.0) && sights.barred(0, site(28), 14.0));
+        assert!(!sights.barred(0, site(24), 3.0) && !sights.barred(0, site(42), 14.0));
     }
 }
