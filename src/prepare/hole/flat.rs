@@ -404,7 +404,7 @@ mod tests {
         }
     }
 
-    /// What the object's depth has bled into lies behind it: not on a plane that goes past before it, however bare it is.
+    /// A bare site that the object's depth has bled into lies behind the object, not on a plane that passes before it.
     #[test]
     fn what_bled_lies_behind_the_object() {
         let (mut sights, _) = patched(|_, _| 90, false);

@@ -20,7 +20,7 @@ use crate::statistics::quantile;
 const CHART: f64 = 960.0;
 /// Least margin of a chart around what is to be filled, pixels.
 const MARGIN: f64 = 48.0;
-/// What a chart shows of the surroundings of what is to be filled, on each side and times its extent.
+/// Margin of a chart on each side, as a multiple of the extent of what is to be filled.
 const AROUND: f64 = 1.5;
 /// A chart ends where the plane is this many times as far as in the middle of what is to be filled.
 const FARTHEST: f64 = 4.0;
@@ -136,7 +136,7 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
 /// Smallest part of a hole that has a texture, as a part of the picture.
 const LEAST_PART: f64 = 5e-4;
 
-/// What hangs together of some pixels, by their sides, where it is not too small for a texture.
+/// Splits pixels into parts that are connected by their sides; parts too small for a texture are left out.
 fn parts(of: &[usize], size @ [w, h]: [usize; 2]) -> Vec<Vec<usize>> {
     let mut left = vec![false; w * h];
     of.iter().for_each(|i| left[*i] = true);

@@ -27,7 +27,7 @@ const UNCONFIRMED: f64 = 0.5;
 const HULL: f64 = 0.8;
 /// Fewest views with a point in the picture that can tell whether it is the object's.
 pub(super) const HULL_VIEWS: usize = 3;
-/// What speaks against a surface behind what the object stands on: it is likely hidden, which is no proof.
+/// Part that speaks against a surface behind what the object stands on: it is likely hidden, which is no proof.
 const BELOW: f64 = 0.5;
 /// Relative difference to a plane up to which a measured inverse depth is taken to lie on it.
 const FLAT: f32 = 0.015;
@@ -37,7 +37,7 @@ const LEAST_MARGIN: i64 = 16;
 const BETTER: f64 = 2.0;
 /// What a depth costs where too few photographs show what is there.
 const UNSHOWN: f64 = 1.0;
-/// The same of a depth behind the one that others claim: what they claim hides it.
+/// Cost of such a depth behind the one that others claim, which hides it.
 const UNSHOWN_BEHIND: f64 = 2.0;
 /// Part of the depth that a site was carried to before which no plane takes it: a bare surface is measured wrong, not so wrong.
 const NEARER: f64 = 0.5;

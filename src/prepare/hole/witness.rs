@@ -7,7 +7,6 @@ use super::surface::{APART, HULL_VIEWS, SAME, Sight, Sights};
 
 /// Part of what speaks against a surface that all other views have hidden behind something else; 1 is a proof.
 const BURIED: f64 = 0.1;
-
 /// Part of the views that can tell that must have something before a point for it to be within a thing.
 const WITHIN_THING: f64 = 0.9;
 /// Steps in which a way is followed, as a part of the depth, and steps in a thing from which on the way is barred.
