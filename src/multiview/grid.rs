@@ -68,8 +68,9 @@ impl DepthGrid {
             return None;
         }
         let place = self.place([x / z, y / z]);
-        let [column, row] = place.map(f64::floor);
-        self.site(column as i64, row as i64).map(|site| (site, place, z))
+        let inside = place.iter().all(|v| *v >= 0.0);
+        let [column, row] = place.map(|v| v as i64);
+        self.site(column, row).filter(|_| inside).map(|site| (site, place, z))
     }
 
     /// The sites within `reach` columns and rows of one, itself included.

@@ -8,6 +8,7 @@
 
 use rand::RngExt;
 use rand_pcg::Pcg64;
+use rayon::prelude::*;
 
 use super::min_cut::Grid;
 
@@ -129,14 +130,14 @@ pub fn around(disparity: &[f32], rays: &[Option<[f64; 2]>], unknown: &[bool], se
 }
 
 /// Continues these planes, and what is beside them, in a hole.
-pub fn surfaces<F: Fn(usize, f64) -> f64>(hole: &Hole<'_, F>, planes: Vec<Plane>) -> Surfaces {
+pub fn surfaces<F: Fn(usize, f64) -> f64 + Sync>(hole: &Hole<'_, F>, planes: Vec<Plane>) -> Surfaces {
     let label = labels(hole, &planes);
     let disparity = continued(hole, &planes, &label);
     Surfaces { label, disparity, planes }
 }
 
 /// The surface of each pixel.
-fn labels<F: Fn(usize, f64) -> f64>(hole: &Hole<'_, F>, planes: &[Plane]) -> Vec<u8> {
+fn labels<F: Fn(usize, f64) -> f64 + Sync>(hole: &Hole<'_, F>, planes: &[Plane]) -> Vec<u8> {
     let [w, h] = hole.size;
     let stride = w.max(h).div_ceil(SIDE).max(1);
     let size @ [gw, gh] = [w.div_ceil(stride), h.div_ceil(stride)];
@@ -145,47 +146,41 @@ fn labels<F: Fn(usize, f64) -> f64>(hole: &Hole<'_, F>, planes: &[Plane]) -> Vec
         y.min(h - 1) * w + x.min(w - 1)
     };
     let rest = planes.len();
-    let cost = |node: usize, label: usize| -> f64 {
+    let of = |node: usize| -> Vec<f64> {
         let i = middle(node);
-        let Some(ray) = hole.rays[i] else { return 0.0 };
+        let Some(ray) = hole.rays[i] else { return vec![0.0; rest + 1] };
         if let Some(Some(costs)) = hole.costs.get(i) {
-            return costs[label];
+            return costs.clone();
+        }
+        let surfaces = planes.iter().map(|plane| on(plane, ray));
+        if hole.unknown[i] {
+            let against: Vec<f64> = surfaces.clone().map(|surface| (hole.against)(i, surface)).collect();
+            // What speaks against all planes alike speaks against what is between them, too.
+            let likely = against.iter().copied().filter(|against| *against < 0.5).reduce(f64::min);
+            let of = |(surface, against): (f64, f64)| IMPOSSIBLE * if surface <= 0.0 { 1.0 } else { against };
+            let of_rest = UNKNOWN_REST + IMPOSSIBLE * likely.unwrap_or(0.0);
+            return surfaces.zip(against).map(of).chain([of_rest]).collect();
         }
         let d = f64::from(hole.disparity[i]);
-        let is_known = !hole.unknown[i] && d > 0.0 && d.is_finite();
-        if label == rest {
-            // What speaks against all planes alike speaks against what is between them, too.
-            let likely =
-                || planes.iter().map(|plane| (hole.against)(i, on(plane, ray))).filter(|against| *against < 0.5);
-            return if hole.unknown[i] {
-                UNKNOWN_REST + IMPOSSIBLE * likely().reduce(f64::min).unwrap_or(0.0)
-            } else {
-                REST
-            };
-        }
-        let surface = on(&planes[label], ray);
-        if is_known {
-            return ((surface - d).abs() / (THICKNESS * d)).min(OFF);
-        }
-        match hole.unknown[i] {
-            true if surface <= 0.0 => IMPOSSIBLE,
-            true => IMPOSSIBLE * (hole.against)(i, surface),
-            false => 0.0,
-        }
+        let is_known = d > 0.0 && d.is_finite();
+        let off = |surface: f64| if is_known { ((surface - d).abs() / (THICKNESS * d)).min(OFF) } else { 0.0 };
+        surfaces.map(off).chain([REST]).collect()
     };
     let nodes = gw * gh;
     let outline: Vec<bool> = (0..nodes).map(|node| hole.outline[middle(node)]).collect();
     let scale = stride as f64;
     // A node stands for stride^2 pixels, an edge of the grid for a border of stride pixels.
+    let of_nodes: Vec<Vec<f64>> = (0..nodes).into_par_iter().map(of).collect();
     let costs: Vec<Vec<f64>> =
-        (0..=rest).map(|label| (0..nodes).map(|node| scale * cost(node, label)).collect()).collect();
+        (0..=rest).map(|label| of_nodes.iter().map(|costs| scale * costs[label]).collect()).collect();
     let border = |[p, q]: [usize; 2], _: [usize; 2]| BORDER * if outline[p] || outline[q] { COINCIDENCE } else { 1.0 };
     let current = cheapest(&costs, border, size);
     (0..w * h).map(|i| current[(i / w / stride) * gw + (i % w) / stride] as u8).collect()
 }
 
 /// The labels of least cost on a grid, by alpha expansion: `costs` `[label][node]`, and for each pair of nodes and their
-/// labels what `border` says, for each unit of a border's length between them; 0 for the same label.
+/// labels what `border` says, for each unit of a border's length between them: the same for `[a, b]` and `[b, a]`; 0 for the same
+/// label.
 pub fn cheapest(
     costs: &[Vec<f64>],
     border: impl Fn([usize; 2], [usize; 2]) -> f64 + Copy,
@@ -249,6 +244,7 @@ fn expand(
     size @ [w, h]: [usize; 2],
 ) {
     let mut grid = Grid::new(size, &SHIFTS);
+    let scales = SHIFTS.map(|[dx, dy]| UNIT * length(dx, dy));
     // Of keeping, minus of taking alpha.
     let mut gain: Vec<i64> = (0..current.len()).map(|i| units[current[i]][i] - units[alpha][i]).collect();
     for p in 0..current.len() {
@@ -258,11 +254,10 @@ fn expand(
                 continue;
             }
             let q = y as usize * w + x as usize;
-            let scale = UNIT * length(dx, dy);
             let differ =
-                |a: usize, b: usize| if a == b { 0 } else { (scale * border([p, q], [a, b])).min(MOST) as i64 };
-            let (keep, take_q, take_p) =
-                (differ(current[p], current[q]), differ(current[p], alpha), differ(alpha, current[q]));
+                |a: usize, b: usize| if a == b { 0 } else { (scales[d] * border([p, q], [a, b])).min(MOST) as i64 };
+            let (keep, take_q) = (differ(current[p], current[q]), differ(current[p], alpha));
+            let take_p = if current[p] == current[q] { take_q } else { differ(alpha, current[q]) };
             gain[p] += keep - take_p;
             gain[q] += take_p;
             // A border that is no metric is made one: what would be negative is 0.

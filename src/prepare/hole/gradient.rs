@@ -1,5 +1,7 @@
 //! Colours whose gradients are given (Pérez et al. 2003), by successive over-relaxation.
 
+use glam::Vec3A;
+
 /// Largest number of rounds, and the factor of over-relaxation.
 const ROUNDS: usize = 300;
 const RELAXATION: f32 = 1.9;
@@ -8,58 +10,59 @@ const SETTLED: f32 = 2e-4;
 
 /// What one pixel's colour is: the mean over its neighbours of theirs and the gradient to them.
 pub struct Equation {
-    /// The pixel.
-    pub pixel: usize,
-    /// Its neighbours that have a colour.
-    pub beside: Vec<usize>,
+    pixel: u32,
+    /// Its neighbours that have a colour, and how many they are.
+    beside: [u32; 4],
+    count: usize,
     /// Sum of the gradients: the pixel's colour less each neighbour's.
-    pub target: [f32; 3],
+    target: [f32; 3],
 }
 
 impl Equation {
     /// Of a pixel without neighbours yet.
     pub fn new(pixel: usize) -> Self {
-        Self { pixel, beside: vec![], target: [0.0; 3] }
+        Self { pixel: pixel as u32, beside: [0; 4], count: 0, target: [0.0; 3] }
     }
 
-    /// Adds a neighbour that differs by this gradient.
+    /// Adds one of at most four neighbours, which differs by this gradient.
     pub fn add(&mut self, neighbour: usize, gradient: [f32; 3]) {
-        self.beside.push(neighbour);
+        self.beside[self.count] = neighbour as u32;
+        self.count += 1;
         (0..3).for_each(|c| self.target[c] += gradient[c]);
     }
 
     /// Brings the pixel nearer to its equation and returns by how much it changed.
-    fn relax(&self, rgb: &mut [[f32; 3]]) -> f32 {
-        if self.beside.is_empty() {
+    fn relax(&self, rgb: &mut [Vec3A]) -> f32 {
+        if self.count == 0 {
             return 0.0;
         }
-        let mut sum = self.target;
-        for neighbour in &self.beside {
-            (0..3).for_each(|c| sum[c] += rgb[*neighbour][c]);
-        }
-        let own = rgb[self.pixel];
-        let step: [f32; 3] = std::array::from_fn(|c| RELAXATION * (sum[c] / self.beside.len() as f32 - own[c]));
-        rgb[self.pixel] = std::array::from_fn(|c: usize| own[c] + step[c]);
-        step.iter().fold(0.0, |change: f32, step: &f32| change.max(step.abs()))
+        let mut sum = Vec3A::from(self.target);
+        self.beside[..self.count].iter().for_each(|neighbour| sum += rgb[*neighbour as usize]);
+        let own = &mut rgb[self.pixel as usize];
+        let step = RELAXATION * (sum / self.count as f32 - *own);
+        *own += step;
+        step.abs().max_element()
     }
 }
 
 /// Solves for the colours of the equations' pixels, beginning with those that are there; all others stay.
 pub fn solve(rgb: &mut [[f32; 3]], equations: &[Equation]) {
+    let mut colors: Vec<Vec3A> = rgb.iter().copied().map(Vec3A::from).collect();
     for round in 0..ROUNDS {
         // Forth and back, so that what is known on all sides travels as fast.
         let mut largest = 0f32;
         if round % 2 == 0 {
-            equations.iter().for_each(|e| largest = largest.max(e.relax(rgb)));
+            equations.iter().for_each(|e| largest = largest.max(e.relax(&mut colors)));
         } else {
-            equations.iter().rev().for_each(|e| largest = largest.max(e.relax(rgb)));
+            equations.iter().rev().for_each(|e| largest = largest.max(e.relax(&mut colors)));
         }
         if largest < SETTLED {
             break;
         }
     }
     for equation in equations {
-        rgb[equation.pixel] = rgb[equation.pixel].map(|v| v.clamp(0.0, 1.0));
+        let pixel = equation.pixel as usize;
+        rgb[pixel] = colors[pixel].clamp(Vec3A::ZERO, Vec3A::ONE).to_array();
     }
 }
 

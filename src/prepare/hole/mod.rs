@@ -19,6 +19,7 @@ mod gradient;
 mod guess;
 mod residue;
 mod shade;
+mod similar;
 mod support;
 mod surface;
 mod texture;

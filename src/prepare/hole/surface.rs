@@ -82,7 +82,7 @@ struct Claim {
 impl Sight {
     /// A view whose photograph has this camera and whose object, with its margin, has this mask, as large as the camera's
     /// picture.
-    fn new(grid: DepthGrid, camera: &Camera, mask: &GrayImage) -> Self {
+    pub(super) fn new(grid: DepthGrid, camera: &Camera, mask: &GrayImage) -> Self {
         let hole: Vec<bool> = (0..grid.depth.len()).map(|site| covers(mask, camera, &grid, site)).collect();
         let depth = grid.depth.iter().zip(&hole).map(|(z, hole)| if *hole { f64::NAN } else { *z }).collect();
         let sites = hole.len();
@@ -192,7 +192,7 @@ impl Sight {
     }
 
     /// The planes, of these of the view, that the object stands on.
-    fn supports(&self, planes: &[planes::Plane]) -> Vec<Support> {
+    pub(super) fn supports(&self, planes: &[planes::Plane]) -> Vec<Support> {
         // The margin around the object shows what is behind it.
         let deep = |site: usize| self.around(site).all(|near| self.hole[near]);
         let sites = (0..self.hole.len()).filter(|site| self.grid.confirmed[*site] && deep(*site));
@@ -460,7 +460,7 @@ impl Sights {
             };
             Some((0..all.len()).map(cost).collect())
         };
-        (0..sites.len()).map(one).collect()
+        (0..sites.len()).into_par_iter().map(one).collect()
     }
 
     /// Continues the planes around a view's hole in it: what is unknown, and what is carried there and does not speak against

@@ -12,6 +12,7 @@ use image::GrayImage;
 use rayon::prelude::*;
 
 use super::gradient::{self, Equation};
+use super::similar::{RADIUS, most_alike};
 use crate::prepare::planes;
 use crate::scene::resample;
 use crate::statistics::quantile;
@@ -39,12 +40,10 @@ const WHOLE: usize = 12;
 const PLAIN: f64 = 0.1;
 const MOSTLY: f64 = 0.98;
 const SAMPLES: usize = 128;
-/// Patches that are compared are 2 `RADIUS` + 1 pixels wide.
-const RADIUS: usize = 3;
 /// Shortest shift, as a part of the longer side: every texture is like itself next to itself.
 const SHORTEST: f64 = 0.06;
 /// Sum of the differences of the channels from which on two pixels are merely different.
-const DIFFERENT: f32 = 0.6;
+pub const DIFFERENT: f32 = 0.6;
 /// Sum of the differences of the channels from which on a copy shows something else than what is known there.
 const ANOTHER: f32 = 0.3;
 /// Mean difference of the channels up to which surroundings are of one material in another light, which costs nothing: copies
@@ -67,7 +66,8 @@ const SEAM: f64 = 10.0;
 /// Cost of a seam where both copies are the same: copies are large.
 const LEAST_SEAM: f64 = 0.05;
 
-type Shift = [isize; 2];
+/// Columns and rows from a pixel to what it copies.
+pub type Shift = [isize; 2];
 
 impl Texture {
     /// The pixel at a shift from another, if it is in the picture.
@@ -101,7 +101,7 @@ impl Texture {
     }
 
     fn apart(&self, a: usize, b: usize) -> f32 {
-        (0..3).map(|c| (self.rgb[a][c] - self.rgb[b][c]).abs()).sum()
+        apart(self.rgb[a], self.rgb[b])
     }
 
     /// The shifts under which patches around the hole are most often most like others, most frequent first.
@@ -119,8 +119,6 @@ impl Texture {
         let reach = ((x1 - x0).max(y1 - y0) / 2).max(4 * RADIUS);
         let (x0, y0) = (x0.saturating_sub(reach), y0.saturating_sub(reach));
         let (x1, y1) = ((x1 + reach + 1).min(w), (y1 + reach + 1).min(h));
-        let box_w = x1 - x0;
-        let patches: Vec<usize> = (y0..y1).flat_map(|y| (x0..x1).map(move |x| y * w + x)).collect();
         // Shifts by which some of the hole is filled at all, and of each only one direction: the other compares the same.
         let [rx, ry] = [w as isize, h as isize].map(|n| n - 1);
         let all: Vec<Shift> = (-ry..=ry)
@@ -131,37 +129,17 @@ impl Texture {
                 some.any(|i| [*shift, shift.map(|v| -v)].iter().any(|shift| self.copy(materials, *i, *shift).is_some()))
             })
             .collect();
-        // Of each patch the best shift: row by row of shifts, so that memory is bounded.
-        let best = |shifts: &[Shift]| -> Vec<(f32, u32)> {
-            let mut best = vec![(f32::INFINITY, u32::MAX); patches.len()];
-            let mut errors = vec![f32::NAN; patches.len()];
-            for (number, shift) in shifts.iter().enumerate() {
-                for (error, &i) in errors.iter_mut().zip(&patches) {
-                    let own = self.source[i].then(|| self.source(i, *shift)).flatten();
-                    *error = own.map_or(f32::NAN, |there| self.apart(i, there).min(DIFFERENT));
-                }
-                let means = box_means(&errors, [box_w, y1 - y0]);
-                for (best, mean) in best.iter_mut().zip(means) {
-                    if mean < best.0 {
-                        *best = (mean, number as u32);
-                    }
-                }
-            }
-            best
-        };
-        let chunk = all.len().div_ceil(4 * rayon::current_num_threads()).max(1);
-        let parts: Vec<(usize, Vec<(f32, u32)>)> =
-            all.par_chunks(chunk).enumerate().map(|(k, part)| (k * chunk, best(part))).collect();
+        let best = most_alike(self, &all, x0..x1, y0..y1);
         let mut votes = std::collections::BTreeMap::<Shift, f64>::new();
-        for at in 0..patches.len() {
-            let found = parts.iter().map(|(first, best)| (best[at].0, *first + best[at].1 as usize));
-            let Some((error, number)) = found.min_by(|a, b| a.0.total_cmp(&b.0)).filter(|f| f.0.is_finite()) else {
+        let patches = (y0..y1).flat_map(|y| (x0..x1).map(move |x| y * w + x));
+        for (patch, (error, number)) in patches.zip(best.error.iter().zip(&best.shift)) {
+            if error.is_infinite() {
                 continue;
-            };
+            }
             // Neighbouring shifts are one: votes are smoothed by a small disc below. Patches with structure say more than blank
             // ones, whose best shift is a matter of noise.
-            let [dx, dy] = all[number];
-            let contrast = self.contrast(patches[at]);
+            let [dx, dy] = all[*number as usize];
+            let contrast = self.contrast(patch);
             let vote = f64::from((-8.0 * error).exp()) * f64::from(0.05 + contrast);
             for (ox, oy, weight) in [(0, 0, 1.0), (1, 0, 0.5), (-1, 0, 0.5), (0, 1, 0.5), (0, -1, 0.5)] {
                 *votes.entry([dx + ox, dy + oy]).or_default() += weight * vote;
@@ -274,16 +252,20 @@ impl Texture {
         };
         let costs: Vec<Vec<f64>> =
             (0..=none).map(|label| (0..n).map(|node| cost(label, pixel(node))).collect()).collect();
-        let color = |i: usize, label: usize| {
-            if label == none { self.source[i].then_some(i) } else { self.source(i, shifts[label]) }
+        // Not a number where there is nothing to copy.
+        let color = |label: usize, i: usize| {
+            let from = if label == none { self.source[i].then_some(i) } else { self.source(i, shifts[label]) };
+            from.map_or([f32::NAN; 3], |from| self.rgb[from])
         };
+        let colors: Vec<Vec<[f32; 3]>> =
+            (0..=none).map(|label| (0..n).map(|node| color(label, pixel(node))).collect()).collect();
         let border = |[p, q]: [usize; 2], [a, b]: [usize; 2]| {
-            let at = |i: usize| match (color(i, a), color(i, b)) {
-                (Some(one), Some(other)) => f64::from(self.apart(one, other)),
+            let at = |node: usize| {
+                let apart = apart(colors[a][node], colors[b][node]);
                 // Known pixels have one colour; that a copy would have there is compared on the other side.
-                _ => f64::from(DIFFERENT) / 2.0,
+                f64::from(if apart.is_nan() { DIFFERENT / 2.0 } else { apart })
             };
-            LEAST_SEAM + SEAM * (at(pixel(p)) + at(pixel(q)))
+            LEAST_SEAM + SEAM * (at(p) + at(q))
         };
         let mut labels = vec![none; w * h];
         planes::cheapest(&costs, border, size)
@@ -294,37 +276,9 @@ impl Texture {
     }
 }
 
-/// Means over squares of 2 `RADIUS` + 1 pixels of what is a number; infinite where less than two thirds are.
-fn box_means(values: &[f32], [w, h]: [usize; 2]) -> Vec<f32> {
-    let line = |values: &[[f32; 2]], length: usize, out: &mut Vec<[f32; 2]>| {
-        out.clear();
-        let mut sum = [0f32; 2];
-        let add = |sum: &mut [f32; 2], v: [f32; 2], sign: f32| (0..2).for_each(|k| sum[k] += sign * v[k]);
-        (0..RADIUS.min(length)).for_each(|i| add(&mut sum, values[i], 1.0));
-        for i in 0..length {
-            if i + RADIUS < length {
-                add(&mut sum, values[i + RADIUS], 1.0);
-            }
-            if i > RADIUS {
-                add(&mut sum, values[i - RADIUS - 1], -1.0);
-            }
-            out.push(sum);
-        }
-    };
-    let mut sums: Vec<[f32; 2]> = values.iter().map(|v| if v.is_nan() { [0.0; 2] } else { [*v, 1.0] }).collect();
-    let mut out = Vec::with_capacity(w.max(h));
-    for y in 0..h {
-        line(&sums[y * w..(y + 1) * w], w, &mut out);
-        sums[y * w..(y + 1) * w].copy_from_slice(&out);
-    }
-    let mut column = vec![[0f32; 2]; h];
-    for x in 0..w {
-        (0..h).for_each(|y| column[y] = sums[y * w + x]);
-        line(&column, h, &mut out);
-        (0..h).for_each(|y| sums[y * w + x] = out[y]);
-    }
-    let enough = (2 * RADIUS + 1).pow(2) as f32 * 2.0 / 3.0;
-    sums.iter().map(|[sum, count]| if *count >= enough { sum / count } else { f32::INFINITY }).collect()
+/// Sum of the differences of the channels.
+fn apart(one: [f32; 3], other: [f32; 3]) -> f32 {
+    (0..3).map(|c| (one[c] - other[c]).abs()).sum()
 }
 
 /// How much the colours of two surroundings are those of different materials, summed over the channels.

@@ -1,0 +1,195 @@
+//! The shift under which each patch of a texture is most like the texture itself.
+
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+use super::texture::{DIFFERENT, Shift, Texture};
+
+/// Patches are `WIDE` pixels wide.
+const WIDE: usize = 7;
+/// Pixels to each side of a patch's middle.
+pub const RADIUS: usize = WIDE / 2;
+/// Pixels of a patch whose copies must be known: two thirds.
+const ENOUGH: f32 = (WIDE * WIDE) as f32 * 2.0 / 3.0;
+
+/// The best shift of each patch.
+pub struct Best {
+    /// Mean over a patch's pixels of the differences, summed over the channels, at most [`DIFFERENT`] each; infinite where no
+    /// shift has enough of them.
+    pub error: Vec<f32>,
+    /// Number of the shift.
+    pub shift: Vec<u32>,
+}
+
+impl Best {
+    /// Of so many patches, before any shift is tried.
+    fn none(patches: usize) -> Self {
+        Self { error: vec![f32::INFINITY; patches], shift: vec![u32::MAX; patches] }
+    }
+
+    /// Keeps the better of both, of equals the earlier one.
+    fn or(mut self, later: &Self) -> Self {
+        for at in 0..self.error.len() {
+            if later.error[at] < self.error[at] {
+                (self.error[at], self.shift[at]) = (later.error[at], later.shift[at]);
+            }
+        }
+        self
+    }
+}
+
+/// Finds for each pixel of a box, row by row, the first of the best shifts of the patch around it. What lies outside the box does
+/// not count.
+pub fn most_alike(texture: &Texture, shifts: &[Shift], columns: Range<usize>, rows: Range<usize>) -> Best {
+    let patches = columns.len() * rows.len();
+    let channels = [0, 1, 2].map(|c| texture.rgb.iter().map(|rgb| rgb[c]).collect::<Vec<f32>>());
+    let known = texture.source.iter().map(|source| f32::from(u8::from(*source))).collect();
+    let search = Search { channels, known, size: texture.size, columns, rows };
+    let chunk = shifts.len().div_ceil(4 * rayon::current_num_threads()).max(1);
+    let parts = shifts.par_chunks(chunk).enumerate().map(|(part, shifts)| search.of(shifts, part * chunk));
+    parts.collect::<Vec<Best>>().iter().fold(Best::none(patches), Best::or)
+}
+
+/// A texture as it is searched: each channel for itself, so that pixels of a row are compared at once.
+struct Search {
+    channels: [Vec<f32>; 3],
+    /// `[pixel]` 1 where it may be copied, 0 elsewhere.
+    known: Vec<f32>,
+    size: [usize; 2],
+    columns: Range<usize>,
+    rows: Range<usize>,
+}
+
+/// Sums of differences, and of how many pixels they are.
+type Sums = [Vec<f32>; 2];
+
+impl Search {
+    /// The best of some shifts, the first of which has this number.
+    fn of(&self, shifts: &[Shift], first: usize) -> Best {
+        let width = self.columns.len();
+        let zeros = |n: usize| -> Sums { [vec![0.0; n], vec![0.0; n]] };
+        let mut best = Best::none(width * self.rows.len());
+        let mut compared: Vec<Sums> = self.rows.clone().map(|_| zeros(width)).collect();
+        // With a margin of nothing on both sides.
+        let (mut down, mut across) = (zeros(width + WIDE), zeros(width));
+        for (number, [dx, dy]) in (first as u32..).zip(shifts) {
+            // Where both a pixel and its copy are in the picture: a patch around another has not enough of them, nor one of a
+            // narrower strip.
+            let columns = overlap(&self.columns, self.size[0], *dx);
+            let rows = overlap(&self.rows, self.size[1], *dy);
+            let (n, m) = (columns.len(), rows.len());
+            if n <= RADIUS || m <= RADIUS {
+                continue;
+            }
+            down.iter_mut().for_each(|sums| sums[RADIUS + n..].fill(0.0));
+            for (row, to) in rows.clone().zip(&mut compared) {
+                let here = row * self.size[0] + columns.start;
+                self.compare(here, here.wrapping_add_signed(dy * self.size[0] as isize + dx), n, to);
+            }
+            for row in 0..m {
+                let patch = row.saturating_sub(RADIUS)..(row + RADIUS + 1).min(m);
+                for k in 0..2 {
+                    let sums = &mut down[k][RADIUS..RADIUS + n];
+                    sums.fill(0.0);
+                    compared[patch.clone()].iter().for_each(|row| add(sums, &row[k]));
+                    let sums = &mut across[k][..n];
+                    sums.fill(0.0);
+                    (0..WIDE).for_each(|by| add(sums, &down[k][by..]));
+                }
+                let at = (rows.start + row - self.rows.start) * width + columns.start - self.columns.start;
+                keep(&across, number, &mut best.error[at..at + n], &mut best.shift[at..at + n]);
+            }
+        }
+        best
+    }
+
+    /// The differences of `n` pixels in a row and their copies.
+    fn compare(&self, here: usize, there: usize, n: usize, [sums, counts]: &mut Sums) {
+        let channel = |c: usize| (&self.channels[c][here..here + n], &self.channels[c][there..there + n]);
+        let ((r, red), (g, green), (b, blue)) = (channel(0), channel(1), channel(2));
+        let (own, copy) = (&self.known[here..here + n], &self.known[there..there + n]);
+        let (sums, counts) = (&mut sums[..n], &mut counts[..n]);
+        for i in 0..n {
+            let apart = (r[i] - red[i]).abs() + (g[i] - green[i]).abs() + (b[i] - blue[i]).abs();
+            counts[i] = own[i] * copy[i];
+            sums[i] = apart.min(DIFFERENT) * counts[i];
+        }
+    }
+}
+
+/// The part of a range of which a shift stays within 0 to `length`.
+fn overlap(range: &Range<usize>, length: usize, by: isize) -> Range<usize> {
+    let start = range.start.max((-by).max(0) as usize);
+    start..range.end.min((length as isize - by).max(0) as usize).max(start)
+}
+
+/// Adds what comes first of a row to each of these.
+fn add(sums: &mut [f32], row: &[f32]) {
+    sums.iter_mut().zip(row).for_each(|(sum, value)| *sum += value);
+}
+
+/// Keeps for a row of patches the shift of this number where it is better than what was found before.
+fn keep([sums, counts]: &Sums, number: u32, error: &mut [f32], shift: &mut [u32]) {
+    let n = error.len();
+    let (sums, counts, shift) = (&sums[..n], &counts[..n], &mut shift[..n]);
+    for i in 0..n {
+        let found = if counts[i] >= ENOUGH { sums[i] / counts[i] } else { f32::INFINITY };
+        let better = found < error[i];
+        error[i] = if better { found } else { error[i] };
+        shift[i] = if better { number } else { shift[i] };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{RngExt, SeedableRng};
+    use rand_pcg::Pcg64;
+
+    use super::*;
+
+    /// Against each patch and shift by itself, with parts unknown and a box that is not the whole picture.
+    #[test]
+    fn the_best_of_every_shift_is_found() {
+        let mut rng = Pcg64::seed_from_u64(4);
+        let size @ [w, h] = [31, 26];
+        let mut pixel = |_| {
+            let rgb: [f32; 3] = std::array::from_fn(|_| rng.random_range(0.0..0.4));
+            (rgb, rng.random_bool(0.9))
+        };
+        let (rgb, source): (Vec<[f32; 3]>, Vec<bool>) = (0..w * h).map(&mut pixel).unzip();
+        let texture = Texture { size, rgb, hole: source.iter().map(|source| !source).collect(), source };
+        let all = (0..h as isize).flat_map(|dy| (1 - w as isize..w as isize).map(move |dx| [dx, dy]));
+        let shifts: Vec<Shift> = all.filter(|[dx, dy]| dx * dx + dy * dy >= 16).collect();
+        let (columns, rows) = (3..29, 2..26);
+        let found = most_alike(&texture, &shifts, columns.clone(), rows.clone());
+        let inside = |[x, y]: [isize; 2]| x >= 0 && y >= 0 && x < w as isize && y < h as isize;
+        let known =
+            |[x, y]: [isize; 2]| inside([x, y]).then(|| y as usize * w + x as usize).filter(|i| texture.source[*i]);
+        let error = |[x, y]: [isize; 2], [dx, dy]: Shift| {
+            let r = RADIUS as isize;
+            let patch = (y - r..=y + r).flat_map(|y| (x - r..=x + r).map(move |x| [x, y]));
+            let patch = patch.filter(|[x, y]| columns.contains(&(*x as usize)) && rows.contains(&(*y as usize)));
+            let both = patch.filter_map(|[x, y]| Some((known([x, y])?, known([x + dx, y + dy])?)));
+            let apart =
+                |(a, b): (usize, usize)| (0..3).map(|c| (texture.rgb[a][c] - texture.rgb[b][c]).abs()).sum::<f32>();
+            let apart: Vec<f32> = both.map(|pair| apart(pair).min(DIFFERENT)).collect();
+            if apart.len() as f32 >= ENOUGH { apart.iter().sum::<f32>() / apart.len() as f32 } else { f32::INFINITY }
+        };
+        let mut some = 0;
+        for (at, (x, y)) in rows.clone().flat_map(|y| columns.clone().map(move |x| (x, y))).enumerate() {
+            let errors: Vec<f32> = shifts.iter().map(|shift| error([x as isize, y as isize], *shift)).collect();
+            let least = errors.iter().copied().fold(f32::INFINITY, f32::min);
+            if least.is_infinite() {
+                assert!(found.error[at].is_infinite(), "({x}, {y})");
+                continue;
+            }
+            // Two sums of up to 49 numbers below 1, so many roundings of half a unit in the last place of 32, over 33 or more.
+            let tolerance = 2.0 * 49.0 * 16.0 * f32::EPSILON / 33.0;
+            assert!((found.error[at] - least).abs() <= tolerance, "({x}, {y}): {} for {least}", found.error[at]);
+            assert!(errors[found.shift[at] as usize] - least <= tolerance, "({x}, {y})");
+            some += 1;
+        }
+        assert!(some > 300, "{some}");
+    }
+}
