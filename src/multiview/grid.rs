@@ -1,6 +1,7 @@
 //! Depth of whole views: what [`points`](super::points) takes its points from.
 
 use glam::DVec3;
+use rayon::prelude::*;
 
 use super::picture::Picture;
 use super::{STRIDE, Sites, agree, depth, fill, fuse, neighbors};
@@ -116,15 +117,44 @@ impl DepthGrid {
 /// # Errors
 /// When the device has no room or is lost.
 pub fn depths(gpu: &Gpu, scene: &Scene) -> Result<Vec<DepthGrid>, Error> {
-    use rayon::prelude::*;
-    let pictures: Vec<Picture> = scene.train.par_iter().map(Picture::new).collect();
-    let neighbors = neighbors::choose(&pictures, pictures.len(), &scene.points);
-    let maps = depth::estimate(gpu, &pictures, &neighbors.of, &scene.points)?;
-    let confirmed = fuse::confirm(&pictures, &neighbors.of, &maps);
-    let wrong = agree::wrong(&agree::shares(&pictures, &neighbors, &confirmed));
-    let mut surfaces = seen_by_most(&pictures, confirmed);
-    pictures.par_iter().zip(&mut surfaces).for_each(|(picture, surface)| add_points(picture, surface, &scene.points));
-    let filled = fill::fill(&pictures, &surfaces);
+    Ok(Matched::new(gpu, scene)?.depths(scene))
+}
+
+/// What matching the photographs of a scene has told, whatever their masks are.
+pub struct Matched {
+    neighbors: neighbors::Neighbors,
+    /// Depths that neighbours confirm.
+    confirmed: Vec<fuse::Surface>,
+    /// Those of them that more views have than look past, and the sparse model's points.
+    surfaces: Vec<fuse::Surface>,
+}
+
+impl Matched {
+    /// Matches the train views of a scene.
+    ///
+    /// # Errors
+    /// When the device has no room or is lost.
+    pub fn new(gpu: &Gpu, scene: &Scene) -> Result<Self, Error> {
+        let pictures: Vec<Picture> = scene.train.par_iter().map(Picture::new).collect();
+        let neighbors = neighbors::choose(&pictures, pictures.len(), &scene.points);
+        let maps = depth::estimate(gpu, &pictures, &neighbors.of, &scene.points)?;
+        let confirmed = fuse::confirm(&pictures, &neighbors.of, &maps);
+        let mut surfaces = seen_by_most(&pictures, confirmed.clone());
+        let views = pictures.par_iter().zip(&mut surfaces);
+        views.for_each(|(picture, surface)| add_points(picture, surface, &scene.points));
+        Ok(Self { neighbors, confirmed, surfaces })
+    }
+
+    /// [`depths`] of the same views, with the masks that they have in this scene.
+    pub fn depths(&self, scene: &Scene) -> Vec<DepthGrid> {
+        let pictures = scene.train.par_iter().map(Picture::new).collect();
+        grids(pictures, self)
+    }
+}
+
+fn grids(pictures: Vec<Picture>, Matched { neighbors, confirmed, surfaces }: &Matched) -> Vec<DepthGrid> {
+    let wrong = agree::wrong(&agree::shares(&pictures, neighbors, confirmed));
+    let filled = fill::fill(&pictures, surfaces);
     let all = pictures.into_par_iter().zip(surfaces).zip(filled).zip(wrong);
     let grids = all.map(|(((picture, surface), filled), wrong)| {
         let Sites { columns, rows } = picture.sites;
@@ -136,13 +166,12 @@ pub fn depths(gpu: &Gpu, scene: &Scene) -> Result<Vec<DepthGrid>, Error> {
         grid.despeckle();
         grid
     });
-    Ok(grids.collect())
+    grids.collect()
 }
 
 /// The depths that more views confirm than see through: a weave that repeats itself matches at a wrong depth in neighbours,
 /// and other views look past it.
 fn seen_by_most(pictures: &[Picture], surfaces: Vec<fuse::Surface>) -> Vec<fuse::Surface> {
-    use rayon::prelude::*;
     let kept = |at: usize| -> fuse::Surface {
         let own = &pictures[at];
         let one = |site: usize| {

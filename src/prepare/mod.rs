@@ -27,7 +27,8 @@ use image::GrayImage;
 use rayon::prelude::*;
 
 use crate::gpu::{self, Gpu};
-use crate::scene::{self, PriorKind, Scene};
+use crate::multiview::Matched;
+use crate::scene::{self, Camera, PriorKind, Scene};
 use crate::sentence::one_line;
 use crate::signal::Signal;
 use crate::train::checkpoint::Fingerprint;
@@ -295,7 +296,8 @@ fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(
                 .into(),
         ));
     }
-    let mut preparation = Preparation { gpu, request, folder: &mut folder, watch, depth: request.depth, networks };
+    let depth = request.depth;
+    let mut preparation = Preparation { gpu, request, folder: &mut folder, watch, depth, networks, matched: None };
     if request.wants(Step::Poses) {
         preparation.poses(&capture)?;
     }
@@ -359,6 +361,8 @@ struct Preparation<'a> {
     /// Whether priors are written.
     depth: bool,
     networks: Networks,
+    /// What matching the photographs has told, once it was asked for.
+    matched: Option<Matched>,
 }
 
 /// The networks that the user named, and the hashes of their files.
@@ -522,8 +526,17 @@ impl Preparation<'_> {
         let names: Vec<&str> = given.keys().map(String::as_str).collect();
         let from = format!("carried from {}", abridged(&names));
         let others: Vec<&scene::View> = scene.train.iter().filter(|view| !given.contains_key(&view.name)).collect();
+        let beside = self.beside(scene, given)?;
         let carry = |shares: &masks::Shares, splats: &mut Splats| -> Result<Vec<masks::Carried>, Error> {
-            others.iter().map(|view| Ok(shares.carry(splats, &view.camera)?)).collect()
+            let views = scene.train.iter().enumerate().filter(|(_, view)| !given.contains_key(&view.name));
+            let carried = views.map(|(at, view)| {
+                let mut carried = shares.carry(splats, &view.camera)?;
+                for (part, _) in carried.object.iter_mut().zip(&beside[at]).filter(|(_, beside)| **beside) {
+                    *part = 0.0;
+                }
+                Ok(carried)
+            });
+            carried.collect()
         };
         let pictures: Vec<Result<_, scene::Error>> =
             others.par_iter().map(|view| scene::photograph_within(&files[&view.name], outline::SIDE)).collect();
@@ -586,6 +599,28 @@ impl Preparation<'_> {
         self.write(Step::Masks, inputs, batch)?;
         self.watch.end();
         Ok(())
+    }
+
+    /// What matching the photographs tells; they are matched once.
+    fn matched(&mut self, scene: &Scene) -> Result<&Matched, Error> {
+        let matched = match self.matched.take() {
+            Some(matched) => matched,
+            None => Matched::new(self.gpu, scene)?,
+        };
+        Ok(self.matched.insert(matched))
+    }
+
+    /// `[view][pixel]` of the fit's pictures: whether what is there is none of the object, by the given
+    /// masks and the depth that is measured between the photographs.
+    fn beside(&mut self, scene: &Scene, given: &BTreeMap<String, Given>) -> Result<Vec<Vec<bool>>, Error> {
+        if scene.train.iter().all(|view| given.contains_key(&view.name)) {
+            return Ok(vec![]);
+        }
+        let grids = self.matched(scene)?.depths(scene);
+        let cameras: Vec<Camera> = scene.train.iter().map(|view| view.camera).collect();
+        let masks: Vec<Option<&GrayImage>> =
+            scene.train.iter().map(|view| given.get(&view.name).map(|given| &given.mask)).collect();
+        Ok(hole::ground::beside(&grids, &cameras, &masks))
     }
 
     /// The masks that the scene has now, by view, as large as the photographs; an error unless all are there.
@@ -714,8 +749,9 @@ impl Preparation<'_> {
         let mut fine = self.load(hole::SIDE, true)?;
         scene::even_out(&mut fine);
         self.watch.begin(Step::Reference, 2 * scene.train.len() as u64 + 2);
+        self.matched(scene)?;
         let task = hole::Task {
-            gpu: self.gpu,
+            matched: self.matched.as_ref().expect("it was asked for"),
             scene,
             fine: &fine,
             root: self.folder.root(),

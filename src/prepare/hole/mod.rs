@@ -16,6 +16,7 @@ mod complete;
 mod flat;
 mod front;
 mod gradient;
+pub mod ground;
 mod guess;
 mod residue;
 mod shade;
@@ -35,8 +36,7 @@ use super::depth;
 use super::network::{self, Inpainting};
 use super::record::Batch;
 use super::{Error, Watch};
-use crate::gpu::Gpu;
-use crate::multiview;
+use crate::multiview::Matched;
 use crate::scene::{self, Camera, HOLE, MADE_WITH, PriorKind, Scene, resample};
 use color::{Filled, Filling, Photograph};
 use surface::{Sight, Sights};
@@ -60,8 +60,8 @@ pub const PROVENANCE: &str = "prepare/provenance.png";
 
 /// What the holes are filled from.
 pub struct Task<'a> {
-    /// The device that depth is measured on.
-    pub gpu: &'a Gpu,
+    /// What the photographs' matching has told.
+    pub matched: &'a Matched,
     /// The scene at the size that depth is measured at.
     pub scene: &'a Scene,
     /// The scene at the size that the holes are filled at.
@@ -111,11 +111,11 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
     let cameras: Vec<Camera> = task.fine.train.iter().map(|view| view.camera).collect();
     let mut masks: Vec<GrayImage> =
         task.masks.par_iter().zip(&cameras).map(|(mask, camera)| resample::mask(mask, camera.size)).collect();
-    let mut matched = task.scene.clone();
-    for (view, mask) in matched.train.iter_mut().zip(task.masks) {
+    let mut masked = task.scene.clone();
+    for (view, mask) in masked.train.iter_mut().zip(task.masks) {
         view.mask = Some(resample::mask(mask, view.camera.size));
     }
-    let grids = multiview::depths(task.gpu, &matched)?;
+    let grids = task.matched.depths(&masked);
     watch.turn(n)?;
     log::debug!("hole: depth is measured");
     let mut batch = Batch::default();

@@ -12,6 +12,8 @@ use crate::statistics::{median, quantile};
 const FEWEST: usize = 30;
 /// Points higher than this part of the object's height are clear of the plane; lower ones touch it.
 const CLEAR: f64 = 0.15;
+/// Points within this part of the object's height of the plane are the plane's.
+const ON_IT: f64 = 0.08;
 /// Least part of the points that is clear of the plane, most that lies behind it, and least that touches it.
 const RISES: f64 = 0.5;
 const BEHIND: f64 = 0.1;
@@ -23,6 +25,8 @@ const STRAY: f64 = 3.0;
 pub struct Support {
     plane: Plane,
     axes: [DVec3; 2],
+    /// The object's height above it.
+    tall: f64,
     /// Corners, along the axes, of the least convex polygon with all points of the object, counterclockwise.
     corners: Vec<DVec2>,
 }
@@ -52,7 +56,13 @@ impl Support {
         let middle = DVec2::new(median(dropped.iter().map(|p| p.x))?, median(dropped.iter().map(|p| p.y))?);
         let reach = STRAY * median(dropped.iter().map(|p| p.distance(middle)))?;
         let corners = hull(dropped.into_iter().filter(|p| p.distance(middle) <= reach).collect());
-        (corners.len() >= 3).then_some(Self { plane, axes, corners })
+        (corners.len() >= 3).then_some(Self { plane, axes, tall, corners })
+    }
+
+    /// Whether a point in the camera's coordinates lies on it, by the object's height.
+    pub fn has(&self, point: DVec3) -> bool {
+        let p = DVec3::from(self.plane);
+        (1.0 - p.dot(point)).abs() / p.length() <= ON_IT * self.tall
     }
 
     /// Depth z at which a ray (x/z, y/z) meets the plane under the object; nothing beside it.
