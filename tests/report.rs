@@ -70,6 +70,21 @@ fn strings(list: &Value, key: &str) -> Vec<String> {
     names.map(|item| item[key].as_str().expect("a name").to_owned()).collect()
 }
 
+/// The defaults have no attention, and the choices that have it are measured all the same.
+#[test]
+#[ignore = "long; .ci/run has it"]
+fn what_the_settings_leave_out_is_measured() {
+    let scene = common::folder();
+    let arguments = [
+        &["scene", "--out", "report", "--kernels-only", "--warm-up", "1", "--views", "1", "--repetitions", "1"][..],
+        &["--only", "attention", "--set", "model.attention.enabled=false"],
+    ]
+    .concat();
+    succeeds(scene.path(), &arguments);
+    let json: Value = serde_json::from_str(&read(&scene.path().join("report"), "report.json")).expect("JSON");
+    assert_eq!(strings(&json["kernels"]["variants"], "name"), ["as set", "attention"]);
+}
+
 #[test]
 #[ignore = "long; .ci/run has it"]
 fn all_files_say_the_same() {

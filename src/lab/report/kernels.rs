@@ -19,7 +19,7 @@ use crate::lab::pace::Pace;
 use crate::lab::pareto::{self, Choice};
 use crate::lab::statistics::Spread;
 use crate::lab::variants::Variant;
-use crate::model::files;
+use crate::model::{files, init};
 use crate::scene::{Reference, Scene};
 use crate::train::photographs::{self, Photograph};
 use crate::train::plan::Plan;
@@ -327,7 +327,13 @@ impl Warm {
             run.change_anchors(step)?;
         }
         let step = run.step();
-        let (anchors, weights) = step.model()?;
+        let (anchors, mut weights) = step.model()?;
+        if !weights.has_attention() {
+            // A choice may have it where the settings leave it out.
+            let fresh =
+                init::weights(settings.train.seed, settings.model.offsets as usize, true, settings.model.opacity);
+            fresh.tensors.into_iter().for_each(|(name, tensor)| _ = weights.tensors.entry(name).or_insert(tensor));
+        }
         let mut tensors = vec![];
         let mut values = BTreeMap::new();
         for parameter in step.learnt.rows().into_iter().chain(step.learnt.weights()) {
