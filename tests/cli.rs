@@ -383,7 +383,7 @@ fn train_without_a_preset_says_which_it_takes() {
     let devices: serde_json::Value = serde_json::from_str(&json).expect("JSON");
     let usable = devices.as_array().expect("a list").iter().find(|d| d["lacks"].as_array().is_some_and(Vec::is_empty));
     let cpu = usable.expect("a usable device")["kind"] == "cpu";
-    let (preset, voxel_pixels) = if cpu { ("lavapipe", 3.3) } else { ("gscream", 0.0) };
+    let (preset, voxel_pixels) = if cpu { ("gaussians", 3.3) } else { ("gscream", 0.0) };
     let outcome = succeeds(folder, "train scene --out run --iterations 2");
     assert!(outcome.stderr.contains(&format!("preset: {preset}, for ")), "{}", outcome.stderr);
     let settings = fs::read_to_string(folder.join("run/settings.toml")).expect("settings");

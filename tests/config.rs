@@ -186,7 +186,7 @@ fn broken_toml_missing_files_and_malformed_arguments_are_refused() {
         assert!(refusal(&["--set", text]).contains("write it as KEY=VALUE"), "{text}");
     }
     let unknown = Settings::resolve(&[Source::Preset("papre".into())]).unwrap_err().to_string();
-    assert_eq!(unknown, "there is no preset `papre`; choose one of gscream, paper, lavapipe, demo");
+    assert_eq!(unknown, "there is no preset `papre`; choose one of gscream, paper, lavapipe, gaussians, demo");
     assert!(Command::try_parse_from(["gscream-vk", "--preset", "papre"]).is_err());
     assert!(Command::try_parse_from(["gscream-vk", "--iterations", "0"]).is_err());
     assert!(Command::try_parse_from(["gscream-vk", "--seed", "-1"]).is_err());
@@ -245,7 +245,7 @@ fn values_that_make_no_sense_are_refused_with_the_layer_that_set_them() {
 
 #[test]
 fn a_shorter_run_keeps_the_places_of_its_schedule() {
-    for preset in ["gscream", "paper", "lavapipe", "demo"] {
+    for preset in ["gscream", "paper", "lavapipe", "gaussians", "demo"] {
         let settings = Settings::resolve(&[Source::Preset(preset.into())]).unwrap();
         for iterations in [30, 600, 3_000, 100_000] {
             let new = settings.rescheduled(iterations);

@@ -19,14 +19,14 @@ struct Choice {
     downscale: Option<u32>,
 }
 
-/// A GPU takes the defaults. A CPU takes `demo` for the built-in scene and `lavapipe` for others, reduced to about
+/// A GPU takes the defaults. A CPU takes `demo` for the built-in scene and `gaussians` for others, reduced to about
 /// [`SIDE`]; `longest` is the longer side of the scene's pictures, where it is known.
 fn choose(device: &DeviceInfo, scene: &Path, longest: Option<u32>) -> Choice {
     match device.kind {
         "cpu" if scene == Path::new(SYNTHETIC) => Choice { preset: "demo", downscale: None },
         "cpu" => {
             let downscale = longest.map(|side| (f64::from(side) / SIDE).round().max(1.0) as u32);
-            Choice { preset: "lavapipe", downscale }
+            Choice { preset: "gaussians", downscale }
         }
         _ => Choice { preset: "gscream", downscale: None },
     }
@@ -119,10 +119,10 @@ mod tests {
             (preset, downscale)
         };
         assert_eq!(of("cpu", SYNTHETIC, None), ("demo", None));
-        assert_eq!(of("cpu", "garden", Some(1008)), ("lavapipe", Some(4)));
-        assert_eq!(of("cpu", "garden", Some(4032)), ("lavapipe", Some(16)));
-        assert_eq!(of("cpu", "garden", Some(32)), ("lavapipe", Some(1)));
-        assert_eq!(of("cpu", "garden", None), ("lavapipe", None), "the preset's own");
+        assert_eq!(of("cpu", "garden", Some(1008)), ("gaussians", Some(4)));
+        assert_eq!(of("cpu", "garden", Some(4032)), ("gaussians", Some(16)));
+        assert_eq!(of("cpu", "garden", Some(32)), ("gaussians", Some(1)));
+        assert_eq!(of("cpu", "garden", None), ("gaussians", None), "the preset's own");
         assert_eq!(of("discrete", SYNTHETIC, None), ("gscream", None));
         assert_eq!(of("integrated", "garden", Some(4032)), ("gscream", None));
     }
@@ -141,10 +141,10 @@ mod tests {
         args.scene.settings.set.splice(0..0, Some("scene.downscale=7".to_owned()));
         let settings = args.scene.settings.resolve().expect("settings that make sense");
         assert_eq!((settings.scene.downscale, settings.train.iterations, settings.train.seed), (2, 4500, 3));
-        let choice = Choice { preset: "lavapipe", downscale: Some(7) };
+        let choice = Choice { preset: "gaussians", downscale: Some(7) };
         assert_eq!(
             describe(&choice, &device("cpu"), &settings),
-            "preset: lavapipe, for Device is a CPU: 4500 steps at 1/2 of the pictures' size; --preset gscream has the \
+            "preset: gaussians, for Device is a CPU: 4500 steps at 1/2 of the pictures' size; --preset gscream has the \
              defaults, made for a GPU"
         );
     }

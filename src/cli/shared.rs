@@ -137,7 +137,9 @@ pub struct MeasureArgs {
 /// One sentence.
 pub fn only_anchors(settings: &Settings, command: &str) -> anyhow::Result<()> {
     if settings.model.form == config::Form::Gaussians {
-        bail!("{command} measures models of anchors alone: leave out model.form=\"gaussians\"");
+        bail!(
+            "{command} measures models of anchors alone: set model.form=anchors, or take a preset of anchors such as lavapipe"
+        );
     }
     Ok(())
 }

@@ -37,8 +37,8 @@ use crate::work::{Loaded, Ready};
 /// views as rendered at the end, their figures (metrics.json), and a page of it all (index.html). `synthetic` is the
 /// built-in scene.
 ///
-/// Without --preset and --config a preset is chosen for the device and the size of the pictures: demo or lavapipe on a CPU,
-/// the defaults (gscream) on a GPU.
+/// Without --preset and --config a preset is chosen for the device and the size of the pictures: demo (the built-in
+/// scene) or gaussians on a CPU, the defaults (gscream) on a GPU.
 ///
 /// A run that ended early (Ctrl-C, SIGTERM, an error, a power failure) is gone on with by `--resume RUN`, to the same
 /// bytes as if nothing had happened. Until a run is complete its folder holds checkpoints: two at most, one every

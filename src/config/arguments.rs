@@ -9,7 +9,8 @@ pub struct SettingsArgs {
     /// Start from a preset instead of the defaults
     ///
     /// gscream: the defaults, every setting written out. paper: 30,000 steps at full size, voxel 0.005 (SPIn-NeRF
-    /// scenes). lavapipe: a quarter of the size and 4,500 steps, for a CPU. demo: the synthetic scene in minutes.
+    /// scenes). lavapipe: a quarter of the size and 4,500 steps, for a CPU. gaussians: the same with plain Gaussians in
+    /// place of anchors. demo: the synthetic scene in minutes.
     #[arg(long, value_name = "NAME", value_parser = clap::builder::PossibleValuesParser::new(PRESETS.map(|(name, _)| name)))]
     pub preset: Option<String>,
     /// TOML file whose settings replace those of the preset

@@ -6,7 +6,7 @@ use toml::de::{DeTable, DeValue};
 use toml::{Spanned, Table, Value};
 
 use super::removed::{instead, without_removed};
-use super::{Error, Invalid, Origin, PRESETS, Settings, Source};
+use super::{CHANGES, Error, Invalid, Origin, PRESETS, Settings, Source};
 
 /// The layers laid over each other so far, and who set each key.
 #[derive(Default)]
@@ -43,6 +43,9 @@ impl Layers {
                     .iter()
                     .find(|(known, _)| known == name)
                     .ok_or_else(|| Error::UnknownPreset { name: name.clone() })?;
+                if name == CHANGES.0 {
+                    self.push(&Source::Preset(CHANGES.1.into()))?;
+                }
                 self.push_text(text, &Place::Preset(name.clone()))
             }
             Source::File(path) => {

@@ -24,12 +24,16 @@ use layer::Layers;
 pub use removed::without_removed;
 
 /// The presets shipped with the program: name and TOML text (`configs/NAME.toml`).
-pub const PRESETS: [(&str, &str); 4] = [
+pub const PRESETS: [(&str, &str); 5] = [
     ("gscream", include_str!("../../configs/gscream.toml")),
     ("paper", include_str!("../../configs/paper.toml")),
     ("lavapipe", include_str!("../../configs/lavapipe.toml")),
+    ("gaussians", include_str!("../../configs/gaussians.toml")),
     ("demo", include_str!("../../configs/demo.toml")),
 ];
+
+/// A preset that says only what it changes of another.
+pub const CHANGES: (&str, &str) = ("gaussians", "lavapipe");
 
 /// Every setting of a run, resolved. The defaults are the paper's; `configs/gscream.toml` lists them with comments.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
