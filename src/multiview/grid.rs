@@ -120,7 +120,7 @@ pub fn depths(gpu: &Gpu, scene: &Scene) -> Result<Vec<DepthGrid>, Error> {
     Ok(Matched::new(gpu, scene)?.depths(scene))
 }
 
-/// What matching the photographs of a scene has told, whatever their masks are.
+/// The photographs of a scene, matched with each other, whatever their masks are.
 pub struct Matched {
     neighbors: neighbors::Neighbors,
     /// Depths that neighbours confirm.

@@ -361,7 +361,7 @@ struct Preparation<'a> {
     /// Whether priors are written.
     depth: bool,
     networks: Networks,
-    /// What matching the photographs has told, once it was asked for.
+    /// The matched photographs, once they were asked for.
     matched: Option<Matched>,
 }
 
@@ -601,7 +601,7 @@ impl Preparation<'_> {
         Ok(())
     }
 
-    /// What matching the photographs tells; they are matched once.
+    /// Matches the photographs, once.
     fn matched(&mut self, scene: &Scene) -> Result<&Matched, Error> {
         let matched = match self.matched.take() {
             Some(matched) => matched,

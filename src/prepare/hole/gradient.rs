@@ -8,7 +8,7 @@ const RELAXATION: f32 = 1.9;
 /// Change of a round, 0 to 1, from which on the colours have settled: a twentieth of a level of 8 bits.
 const SETTLED: f32 = 2e-4;
 
-/// What one pixel's colour is: the mean over its neighbours of theirs and the gradient to them.
+/// The equation of one pixel's colour: the mean over its neighbours of theirs and the gradient to them.
 pub struct Equation {
     pixel: u32,
     /// Its neighbours that have a colour, and how many they are.

@@ -1,4 +1,4 @@
-//! What the views that were masked by hand know not to be the object, wherever it is seen from.
+//! Pixels that show none of the object, by what the views that were masked by hand see.
 //!
 //! A measured point that such a view shows beside its mask is none of the object (the visual hull, Laurentini 1994). Nor is a point behind the object that lies on what it stands on: a mask that is carried to the
 //! far side would take the floor there for the side of the object that nobody has seen. What something else hides may be its.

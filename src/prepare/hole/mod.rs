@@ -60,7 +60,7 @@ pub const PROVENANCE: &str = "prepare/provenance.png";
 
 /// What the holes are filled from.
 pub struct Task<'a> {
-    /// What the photographs' matching has told.
+    /// The photographs, matched with each other.
     pub matched: &'a Matched,
     /// The scene at the size that depth is measured at.
     pub scene: &'a Scene,
