@@ -4,7 +4,10 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::texture::{DIFFERENT, Shift, Texture};
+/// Columns and rows from a pixel to what it copies.
+pub type Shift = [isize; 2];
+/// Sum of the differences of the channels from which on two pixels are merely different.
+pub const DIFFERENT: f32 = 0.6;
 
 /// Patches are `WIDE` pixels wide.
 const WIDE: usize = 7;
@@ -39,13 +42,29 @@ impl Best {
     }
 }
 
+/// A picture of which not all is known.
+#[derive(Clone, Copy)]
+pub struct Picture<'a> {
+    /// `[pixel]` RGB, 0 to 1.
+    pub rgb: &'a [[f32; 3]],
+    /// `[pixel]` whether it may be copied.
+    pub known: &'a [bool],
+    /// Width and height in pixels.
+    pub size: [usize; 2],
+}
+
 /// Finds for each pixel of a box, row by row, the first of the best shifts of the patch around it. What lies outside the box does
 /// not count.
-pub fn most_alike(texture: &Texture, shifts: &[Shift], columns: Range<usize>, rows: Range<usize>) -> Best {
+pub fn most_alike(
+    Picture { rgb, known, size }: Picture<'_>,
+    shifts: &[Shift],
+    columns: Range<usize>,
+    rows: Range<usize>,
+) -> Best {
     let patches = columns.len() * rows.len();
-    let channels = [0, 1, 2].map(|c| texture.rgb.iter().map(|rgb| rgb[c]).collect::<Vec<f32>>());
-    let known = texture.source.iter().map(|source| f32::from(u8::from(*source))).collect();
-    let search = Search { channels, known, size: texture.size, columns, rows };
+    let channels = [0, 1, 2].map(|c| rgb.iter().map(|rgb| rgb[c]).collect::<Vec<f32>>());
+    let known = known.iter().map(|known| f32::from(u8::from(*known))).collect();
+    let search = Search { channels, known, size, columns, rows };
     let chunk = shifts.len().div_ceil(4 * rayon::current_num_threads()).max(1);
     let parts = shifts.par_chunks(chunk).enumerate().map(|(part, shifts)| search.of(shifts, part * chunk));
     parts.collect::<Vec<Best>>().iter().fold(Best::none(patches), Best::or)
@@ -158,14 +177,14 @@ mod tests {
             (rgb, rng.random_bool(0.9))
         };
         let (rgb, source): (Vec<[f32; 3]>, Vec<bool>) = (0..w * h).map(&mut pixel).unzip();
-        let texture = Texture { size, rgb, hole: source.iter().map(|source| !source).collect(), source };
+        let texture = Picture { rgb: &rgb, known: &source, size };
         let all = (0..h as isize).flat_map(|dy| (1 - w as isize..w as isize).map(move |dx| [dx, dy]));
         let shifts: Vec<Shift> = all.filter(|[dx, dy]| dx * dx + dy * dy >= 16).collect();
         let (columns, rows) = (3..29, 2..26);
-        let found = most_alike(&texture, &shifts, columns.clone(), rows.clone());
+        let found = most_alike(texture, &shifts, columns.clone(), rows.clone());
         let inside = |[x, y]: [isize; 2]| x >= 0 && y >= 0 && x < w as isize && y < h as isize;
         let known =
-            |[x, y]: [isize; 2]| inside([x, y]).then(|| y as usize * w + x as usize).filter(|i| texture.source[*i]);
+            |[x, y]: [isize; 2]| inside([x, y]).then(|| y as usize * w + x as usize).filter(|i| texture.known[*i]);
         let error = |[x, y]: [isize; 2], [dx, dy]: Shift| {
             let r = RADIUS as isize;
             let patch = (y - r..=y + r).flat_map(|y| (x - r..=x + r).map(move |x| [x, y]));

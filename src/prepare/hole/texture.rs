@@ -12,7 +12,7 @@ use image::GrayImage;
 use rayon::prelude::*;
 
 use super::gradient::{self, Equation};
-use super::similar::{RADIUS, most_alike};
+use super::similar::{DIFFERENT, Picture, RADIUS, Shift, most_alike};
 use crate::prepare::planes;
 use crate::scene::resample;
 use crate::statistics::quantile;
@@ -42,8 +42,6 @@ const MOSTLY: f64 = 0.98;
 const SAMPLES: usize = 128;
 /// Shortest shift, as a part of the longer side: every texture is like itself next to itself.
 const SHORTEST: f64 = 0.06;
-/// Sum of the differences of the channels from which on two pixels are merely different.
-pub const DIFFERENT: f32 = 0.6;
 /// Sum of the differences of the channels from which on a copy shows something else than what is known there.
 const ANOTHER: f32 = 0.3;
 /// Mean difference of the channels up to which surroundings are of one material in another light, which costs nothing: copies
@@ -65,9 +63,6 @@ const NO_SOURCE: f64 = 1e4;
 const SEAM: f64 = 10.0;
 /// Cost of a seam where both copies are the same: copies are large.
 const LEAST_SEAM: f64 = 0.05;
-
-/// Columns and rows from a pixel to what it copies.
-pub type Shift = [isize; 2];
 
 impl Texture {
     /// The pixel at a shift from another, if it is in the picture.
@@ -129,7 +124,7 @@ impl Texture {
                 some.any(|i| [*shift, shift.map(|v| -v)].iter().any(|shift| self.copy(materials, *i, *shift).is_some()))
             })
             .collect();
-        let best = most_alike(self, &all, x0..x1, y0..y1);
+        let best = most_alike(Picture { rgb: &self.rgb, known: &self.source, size: self.size }, &all, x0..x1, y0..y1);
         let mut votes = std::collections::BTreeMap::<Shift, f64>::new();
         let patches = (y0..y1).flat_map(|y| (x0..x1).map(move |x| y * w + x));
         for (patch, (error, number)) in patches.zip(best.error.iter().zip(&best.shift)) {
