@@ -125,7 +125,7 @@ pub struct Matched {
     neighbors: neighbors::Neighbors,
     /// Depths that neighbours confirm.
     confirmed: Vec<fuse::Surface>,
-    /// Those of them that more views have than look past, and the sparse model's points.
+    /// Depths of these that more views have than look past, and of the sparse model's points.
     surfaces: Vec<fuse::Surface>,
 }
 

@@ -11,7 +11,7 @@ const SETTLED: f32 = 2e-4;
 /// The equation of one pixel's colour: the mean over its neighbours of theirs and the gradient to them.
 pub struct Equation {
     pixel: u32,
-    /// Its neighbours that have a colour, and how many they are.
+    /// Neighbours of the pixel that have a colour, and how many they are.
     beside: [u32; 4],
     count: usize,
     /// Sum of the gradients: the pixel's colour less each neighbour's.

@@ -27,7 +27,7 @@ struct Masked {
 }
 
 impl Masked {
-    /// Of a view with this camera and mask, of the same proportions.
+    /// Looks at a view with this camera and mask, of the same proportions.
     fn new(grid: &DepthGrid, camera: &Camera, mask: &GrayImage) -> Self {
         let mask = resample::mask(mask, camera.size);
         let longer = f64::from(camera.size[0].max(camera.size[1]));

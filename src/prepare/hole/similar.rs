@@ -26,7 +26,7 @@ pub struct Best {
 }
 
 impl Best {
-    /// Of so many patches, before any shift is tried.
+    /// Says that no shift is tried yet, for so many patches.
     fn none(patches: usize) -> Self {
         Self { error: vec![f32::INFINITY; patches], shift: vec![u32::MAX; patches] }
     }
