@@ -89,10 +89,25 @@ fn mean_focal(sight: &Sight) -> f64 {
     (fx * fy).sqrt()
 }
 
-/// Whether to believe what so many views show of a point that others have in the picture, too: one of many, whose depth nobody
-/// confirms, is wrong about what it shows.
-fn believed(show: usize, confirmed: bool, framed: usize) -> bool {
-    show > 1 || confirmed || framed < MANY
+/// What the views that show a point say about it.
+#[derive(Default)]
+struct Witnesses {
+    /// How many show it.
+    show: usize,
+    /// How many of these have it right beside the object.
+    beside: usize,
+    /// Whether another view confirms the depth that one of them has there.
+    confirmed: bool,
+    /// How many have it in the picture, hidden or not.
+    framed: usize,
+}
+
+impl Witnesses {
+    /// Whether to believe them. One of many, whose depth nobody confirms, is wrong about what it shows. Where all have the
+    /// point right beside the object, they show the object's rim as likely: masks end too early in places.
+    fn believed(&self) -> bool {
+        self.beside < self.show && (self.show > 1 || self.confirmed || self.framed < MANY)
+    }
 }
 
 /// `[site]` in and next to a view's hole the photographs that show it and what each costs.
@@ -106,17 +121,19 @@ fn candidates(sights: &Sights, of: usize) -> Vec<Vec<(usize, f64)>> {
         let point = own.point(site, own.depth[site]);
         let (to, distance) = ((point - eye).normalize(), point.distance(eye));
         let mut found: Vec<(usize, f64, [u8; 3])> = vec![];
-        let (mut confirmed, mut framed) = (false, 0);
+        let mut witnesses = Witnesses::default();
         for (view, sight) in sights.0.iter().enumerate().filter(|(view, sight)| *view != of && sight.grid.trusted) {
-            framed += usize::from(sight.see(point).is_some());
+            witnesses.framed += usize::from(sight.see(point).is_some());
             let Some(there) = sight.shows(point, 1.5 * SAME) else { continue };
             let from = DVec3::from(sight.grid.camera.center());
             let angle = to.dot((point - from).normalize()).clamp(-1.0, 1.0).acos();
             let finer = (mean_focal(sight) * distance / (mean_focal(own) * point.distance(from))).ln();
             found.push((view, ANGLE * angle + COARSER * (-finer).max(0.0), sight.grid.colors[there]));
-            confirmed |= sight.grid.confirmed[there];
+            witnesses.show += 1;
+            witnesses.beside += usize::from(sight.near_hole(there));
+            witnesses.confirmed |= sight.grid.confirmed[there];
         }
-        if !believed(found.len(), confirmed, framed) {
+        if !witnesses.believed() {
             return vec![];
         }
         let middle: [f64; 3] = std::array::from_fn(|c| {
@@ -381,11 +398,14 @@ mod tests {
         }
     }
 
-    /// A rim that one of many views takes for the floor behind it paints nothing; of few views each is needed.
+    /// A rim that one of many views takes for the floor behind it paints nothing; of few views each is needed. What no view
+    /// shows but right beside the object paints nothing, either.
     #[test]
-    fn one_of_many_views_is_no_witness() {
-        assert!(!believed(1, false, MANY));
-        assert!(believed(1, true, MANY) && believed(2, false, MANY) && believed(1, false, MANY - 1));
+    fn who_is_no_witness() {
+        let believed = |show, beside, confirmed, framed| Witnesses { show, beside, confirmed, framed }.believed();
+        assert!(!believed(1, 0, false, MANY) && !believed(0, 0, false, 0));
+        assert!(believed(1, 0, true, MANY) && believed(2, 0, false, MANY) && believed(1, 0, false, MANY - 1));
+        assert!(!believed(3, 3, true, MANY) && !believed(1, 1, true, 2) && believed(3, 2, true, MANY));
     }
 
     /// Next to a pixel without a colour the others' count alone, and nothing of it is mixed in.

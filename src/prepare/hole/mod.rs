@@ -54,7 +54,7 @@ const LEAST_HOLE: f64 = 0.4;
 const AT_ONCE: usize = 16;
 /// Name of the way in which holes are filled: a scene that was filled in another way is filled anew.
 pub const METHOD: &str =
-    "one surface, nothing where others look through it, and no material that is not beside the hole";
+    "one surface, nothing where others look through it, no colour seen beside the object alone, no strange material";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 
