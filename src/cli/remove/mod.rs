@@ -11,8 +11,8 @@ use std::time::Instant;
 use anyhow::Context as _;
 
 use super::prepare::{ObjectArgs, ShadowArgs, VideoArgs};
-use super::shared::DeviceArgs;
-use super::{next, signals, train};
+use super::shared::{DeviceArgs, SceneArgs};
+use super::{next, preset, signals, train};
 use crate::config::SettingsArgs;
 use crate::export;
 use crate::folder::Lock;
@@ -95,14 +95,17 @@ pub(super) struct Args {
 }
 
 impl Args {
-    /// The work that so many photographs are.
-    fn work(&self, views: usize) -> Work {
-        Work {
+    /// The work that so many photographs are, with what is made in the folder `root`.
+    fn work(&self, views: usize, root: &Path) -> anyhow::Result<Work> {
+        let given = SceneArgs { scene: root.to_owned(), settings: self.settings.clone() };
+        let settings = preset::chosen(&given, &self.device)?.settings.resolve()?;
+        Ok(Work {
+            form: settings.model.form,
             views,
             fit: f64::from(self.fit_steps) / 600.0,
             files: f64::from(self.export_steps) / f64::from(export::Options::default().steps),
             splat: read::is_splat(&self.photographs),
-        }
+        })
     }
 
     fn places(&self) -> Places {
@@ -136,7 +139,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         None => args.video.photographs(&args.photographs, &places.root)?,
     };
     let capture = found.map_or_else(|| poses::find(&photographs), Ok)?;
-    let time = Time::new(args.minutes, args.work(capture.photographs.len()));
+    let time = Time::new(args.minutes, args.work(capture.photographs.len(), &places.root)?);
     let job = Job { args, places, photographs, splat, time };
     if args.object.evidence().is_empty() && !args.yes {
         return page::run(&job, &capture);

@@ -56,6 +56,8 @@ pub struct Work {
     pub files: f64,
     /// Photographs are replaced by a splat, which is fit and points itself.
     pub splat: bool,
+    /// The form of what is trained: anchors are baked into the files.
+    pub form: Form,
 }
 
 /// The time that a removal has, and where it is in it.
@@ -132,12 +134,12 @@ impl Time {
 
     /// The processors' time for a part by [`COSTS`].
     fn told(&self, part: usize) -> f64 {
-        let Work { views, fit, files, splat } = self.work;
+        let Work { views, fit, files, splat, form } = self.work;
         let Cost { part: name, once, view } = COSTS[part];
         let share = match name {
             "fit" | "points" if splat => 0.0,
             "fit" => fit,
-            "export" if splat => 0.1,
+            "export" if splat || form == Form::Gaussians => 0.1,
             "export" => 0.3 + 0.7 * files,
             _ => 1.0,
         };
@@ -195,10 +197,10 @@ impl Time {
         })
     }
 
-    /// What the files of a model of this form take.
-    pub fn files(&self, form: Form) -> Reserve {
+    /// What the files take.
+    pub fn files(&self) -> Reserve {
         let baked = 1000.0 * self.work.files * REFINED + BAKED;
-        Reserve { steps: if form == Form::Anchors { baked } else { 0.0 }, seconds: WRITTEN }
+        Reserve { steps: if self.work.form == Form::Anchors { baked } else { 0.0 }, seconds: WRITTEN }
     }
 }
 
@@ -206,9 +208,13 @@ impl Time {
 mod tests {
     use super::*;
 
+    fn work(views: usize) -> Work {
+        Work { views, fit: 1.0, files: 1.0, splat: false, form: Form::Anchors }
+    }
+
     /// A removal of so many views that has begun, on a machine that takes as long as is told.
     fn begun(minutes: f64, views: usize) -> Time {
-        let time = Time::new(Some(minutes), Work { views, fit: 1.0, files: 1.0, splat: false });
+        let time = Time::new(Some(minutes), work(views));
         time.began.set(Some(Instant::now()));
         time.measured.set([10.0, 10.0]);
         time
@@ -261,7 +267,7 @@ mod tests {
     /// Before Remove is pressed, and without a limit, there is no hurry.
     #[test]
     fn nothing_is_in_vain_without_a_limit() {
-        let work = Work { views: 500, fit: 1.0, files: 1.0, splat: false };
+        let work = work(500);
         let time = Time::new(Some(0.001), work);
         assert_eq!(time.in_vain(), None);
         time.began.set(Some(Instant::now()));
@@ -276,10 +282,14 @@ mod tests {
     #[test]
     fn a_splat_takes_less() {
         let photographs = begun(4.0, 60);
-        let splat = Time::new(Some(4.0), Work { splat: true, ..photographs.work });
-        splat.measured.set(photographs.measured.get());
-        assert!(all(&splat, 0) < all(&photographs, 0));
-        let [anchors, gaussians] = [Form::Anchors, Form::Gaussians].map(|form| photographs.files(form).steps);
-        assert!(anchors > gaussians && gaussians == 0.0);
+        let of = |work: Work| {
+            let time = Time::new(Some(4.0), work);
+            time.measured.set(photographs.measured.get());
+            time
+        };
+        let gaussians = of(Work { form: Form::Gaussians, ..photographs.work });
+        let splat = of(Work { splat: true, ..photographs.work });
+        assert!(all(&gaussians, 0) < all(&photographs, 0) && all(&splat, 0) < all(&gaussians, 0));
+        assert!(photographs.files().steps > 0.0 && gaussians.files().steps == 0.0);
     }
 }

@@ -328,8 +328,7 @@ impl Job<'_> {
         };
         let (settings, clock) = match minutes {
             Some(time) if !begun => {
-                let (settings, clock) =
-                    minutes::fitted(gpu, &scene, &settings, *time, began, self.time.files(settings.model.form))?;
+                let (settings, clock) = minutes::fitted(gpu, &scene, &settings, *time, began, self.time.files())?;
                 (settings, Some(clock))
             }
             _ => (settings, None),
