@@ -140,7 +140,7 @@ fn one_box_becomes_a_scene() {
         println!("{}: {ours:.1} levels off the truth, the photograph {before:.1}", other.name);
         assert!(ours < 0.5 * before, "{}: {ours:.1} of {before:.1}", other.name);
         let untouched =
-            GrayImage::from_fn(hole.width(), hole.height(), |x, y| Luma([255 - filled.filled.get_pixel(x, y).0[0]]));
+            GrayImage::from_fn(hole.width(), hole.height(), |x, y| Luma([255 - filled.covered.get_pixel(x, y).0[0]]));
         assert_eq!(difference(&filled.image, &other.image, &untouched), 0.0, "beside the hole the photograph stays");
     }
     let outside = GrayImage::from_fn(hole.width(), hole.height(), |x, y| {

@@ -7,8 +7,10 @@ use image::{GrayImage, RgbImage};
 use super::{Error, View, decode, resample};
 
 /// Folder of the filled holes within a scene, `hole/NAME.png`: in proportion as large as the photographs; alpha is 255 in the
-/// hole, and around it colours go on for a few pixels.
+/// hole, [`DOUBTFUL`] where what is there is not to be trained on, and around it colours go on for a few pixels.
 pub const HOLE: &str = "hole";
+/// Alpha of a pixel of the hole that shows what may not be there.
+pub const DOUBTFUL: u8 = 128;
 /// File in [`HOLE`] that names the reference pictures which the holes were filled with: of each in a line the BLAKE3 hash of
 /// its bytes and its path below the scene.
 pub const MADE_WITH: &str = "made_with";
@@ -21,6 +23,8 @@ pub struct Hole {
     /// The photograph with its hole filled, as large as the view's own.
     pub image: RgbImage,
     /// 255 where `image` is not the photograph's, as large as it.
+    pub covered: GrayImage,
+    /// 255 where `image` is to be trained on though it is not the photograph's, as large as it.
     pub filled: GrayImage,
 }
 
@@ -52,21 +56,57 @@ pub(super) fn read(path: &Path, at: usize, view: &View) -> Result<Hole, Error> {
         return Err(Error::File { path: path.to_path_buf(), what });
     }
     let own = [picture.width(), picture.height()];
-    let split = |channels: [usize; 3]| {
-        let bytes = picture.pixels().flat_map(|p| channels.map(|c| p.0[c])).collect();
-        let image = RgbImage::from_raw(own[0], own[1], bytes).expect("three bytes per pixel");
-        resample::photograph(&image, size)
+    let of = |channels: &dyn Fn([u8; 4]) -> [u8; 3]| {
+        let bytes = picture.pixels().flat_map(|p| channels(p.0)).collect();
+        resample::photograph(&RgbImage::from_raw(own[0], own[1], bytes).expect("three bytes per pixel"), size)
     };
-    let (colors, alpha) = (split([0, 1, 2]), split([3, 3, 3]));
+    let colors = of(&|[r, g, b, _]| [r, g, b]);
+    let hole = of(&|[.., alpha]| [if alpha == DOUBTFUL { 255 } else { alpha }; 3]);
+    let doubtful = of(&|[.., alpha]| [if alpha == DOUBTFUL { 255 } else { 0 }; 3]);
     let mut image = view.image.clone();
-    let mut filled = GrayImage::new(size[0], size[1]);
-    let pixels = image.pixels_mut().zip(filled.pixels_mut());
-    for ((pixel, filled), (color, alpha)) in pixels.zip(colors.pixels().zip(alpha.pixels())) {
-        filled.0 = [if alpha.0[0] > 0 { 255 } else { 0 }];
-        let share = f64::from(alpha.0[0]) / 255.0;
-        for (to, from) in pixel.0.iter_mut().zip(color.0) {
-            *to = (share * f64::from(from) + (1.0 - share) * f64::from(*to)).round() as u8;
+    let [mut covered, mut filled] = [(); 2].map(|()| vec![0; image.pixels().len()]);
+    for (i, pixel) in image.pixels_mut().enumerate() {
+        let [hole, doubtful] = [&hole, &doubtful].map(|of| of.as_raw()[3 * i]);
+        let share = f64::from(hole) / 255.0;
+        let from = &colors.as_raw()[3 * i..3 * i + 3];
+        for (to, from) in pixel.0.iter_mut().zip(from) {
+            *to = (share * f64::from(*from) + (1.0 - share) * f64::from(*to)).round() as u8;
+        }
+        covered[i] = if hole > 0 { 255 } else { 0 };
+        filled[i] = if hole > 0 && 2 * u32::from(doubtful) <= u32::from(hole) { 255 } else { 0 };
+    }
+    let [covered, filled] =
+        [covered, filled].map(|bytes| GrayImage::from_raw(size[0], size[1], bytes).expect("a byte per pixel"));
+    Ok(Hole { view: at, image, covered, filled })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Camera;
+
+    /// Half of a hole is told and half is doubtful: all of it is covered, and trained on is the half that is told.
+    #[test]
+    fn what_is_doubtful_is_covered_and_not_trained_on() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let path = folder.path().join("view.png");
+        let alpha = |x: u32| [0, 255, DOUBTFUL, 0][x as usize / 2];
+        image::RgbaImage::from_fn(8, 4, |x, _| image::Rgba([200, 100, 50, alpha(x)])).save(&path).expect("a picture");
+        let camera = Camera {
+            rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            translation: [0.0; 3],
+            focal: [8.0; 2],
+            principal: [4.0, 2.0],
+            distortion: [0.0; 4],
+            size: [8, 4],
+        };
+        let image = RgbImage::from_pixel(8, 4, image::Rgb([10; 3]));
+        let view = View { name: "view".into(), camera, image, mask: None, weight: None, prior: None, depth: None };
+        let hole = read(&path, 0, &view).expect("a hole");
+        for x in 0..8 {
+            let is = [&hole.covered, &hole.filled].map(|of| of.get_pixel(x, 2).0[0] > 0);
+            assert_eq!(is, [alpha(x) > 0, alpha(x) == 255], "{x}");
+            assert_eq!(hole.image.get_pixel(x, 2).0[0], if is[0] { 200 } else { 10 }, "{x}");
         }
     }
-    Ok(Hole { view: at, image, filled })
 }

@@ -55,7 +55,7 @@ use config::STEREO_PRIOR;
 pub use config::{Config, NONE};
 pub use error::Error;
 pub(crate) use exposure::even_out;
-pub use hole::{HOLE, Hole, MADE_WITH};
+pub use hole::{DOUBTFUL, HOLE, Hole, MADE_WITH};
 pub(crate) use layout::{PICTURES, stem};
 pub use note::{Note, Notes};
 pub use picture::{decode, dimensions, jpeg, object_mask};
@@ -738,7 +738,7 @@ fn read_holes(
     let mut holes = holes.into_iter().collect::<Result<Vec<_>, Error>>()?;
     for hole in &holes {
         let mask = train[hole.view].mask.as_mut().expect("views without a mask were left out");
-        mask.iter_mut().zip(hole.filled.as_raw()).for_each(|(mask, filled)| *mask = (*mask).max(*filled));
+        mask.iter_mut().zip(hole.covered.as_raw()).for_each(|(mask, covered)| *mask = (*mask).max(*covered));
     }
     holes.retain(|hole| !references.iter().any(|r| r.view == hole.view));
     notes.push(format!("the holes of {} more views are filled ({HOLE}/)", holes.len()));

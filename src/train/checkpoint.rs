@@ -414,8 +414,12 @@ impl Fingerprint {
             parts.push((format!("reference picture of {}", scene.train[reference.view].name), hex(hasher)));
         }
         for hole in &scene.holes {
-            let hash = blake3::hash(hole.image.as_raw());
-            parts.push((format!("filled hole of {}", scene.train[hole.view].name), hash.to_hex().to_string()));
+            let mut hasher = blake3::Hasher::new();
+            hasher.update(hole.image.as_raw());
+            if hole.filled != hole.covered {
+                hasher.update(hole.filled.as_raw());
+            }
+            parts.push((format!("filled hole of {}", scene.train[hole.view].name), hex(hasher)));
         }
         let mut hasher = blake3::Hasher::new();
         hasher.update(&scene.radius.to_le_bytes());

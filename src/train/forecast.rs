@@ -461,7 +461,8 @@ fn resized(scene: &Scene, from: u32, to: u32) -> Scene {
     });
     let holes = scene.holes.iter().map(|hole| {
         let [w, h] = scaled([hole.image.width(), hole.image.height()]);
-        Hole { view: hole.view, image: RgbImage::new(w, h), filled: GrayImage::new(w, h) }
+        let blank = GrayImage::new(w, h);
+        Hole { view: hole.view, image: RgbImage::new(w, h), covered: blank.clone(), filled: blank }
     });
     Scene {
         train: scene.train.iter().map(view).collect(),

@@ -10,7 +10,7 @@ use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 
 use super::gradient::{self, Equation};
-use super::surface::{SAME, Sight, Sights, Window};
+use super::surface::{APART, SAME, Sight, Sights, Window};
 use crate::prepare::planes::{self, neighbours};
 use crate::scene::{Camera, resample};
 
@@ -26,6 +26,12 @@ const UNLIKE: f64 = 8.0;
 const HIDDEN: f64 = 1e3;
 /// Views with a point in the picture of which one alone is not believed.
 const MANY: usize = 16;
+/// Mean difference of the channels from the median up to which photographs agree on the colour of a point.
+const ALIKE: f64 = 0.04;
+/// Views that look through a guessed point of which so many make it doubtful.
+const THROUGH: usize = 2;
+/// Share of a hole that is doubtful from which on all that is guessed in it is.
+const DISTRUST: f64 = 0.25;
 /// Share of a pixel's sites that must have a source for it to be seen.
 const ENOUGH: f32 = 0.5;
 
@@ -47,6 +53,8 @@ pub struct Filling {
     pub guessed: Vec<bool>,
     /// `[pixel]` whether a photograph shows it.
     pub seen: Vec<bool>,
+    /// `[pixel]` whether its depth is likely wrong, and with it what is shown: photographs disagree about it, or look through it.
+    pub doubtful: Vec<bool>,
 }
 
 /// Bilinear, 0 to 1; nothing within half a pixel of the border and outside.
@@ -100,6 +108,8 @@ struct Witnesses {
     confirmed: bool,
     /// How many have it in the picture, hidden or not.
     framed: usize,
+    /// How many show what is farther away instead.
+    through: usize,
 }
 
 impl Witnesses {
@@ -108,22 +118,47 @@ impl Witnesses {
     fn believed(&self) -> bool {
         self.beside < self.show && (self.show > 1 || self.confirmed || self.framed < MANY)
     }
+
+    /// Whether the point is likely nowhere, though it be guessed or shown; of those that show it these are the differences from
+    /// their median colour.
+    fn doubt(&self, mut apart: Vec<f64>) -> bool {
+        if !self.believed() {
+            return self.through >= THROUGH;
+        }
+        if self.show == 1 {
+            return !self.confirmed;
+        }
+        apart.sort_unstable_by(f64::total_cmp);
+        apart.get(apart.len() / 2).is_some_and(|apart| *apart > ALIKE)
+    }
 }
 
-/// `[site]` in and next to a view's hole the photographs that show it and what each costs.
-fn candidates(sights: &Sights, of: usize) -> Vec<Vec<(usize, f64)>> {
+/// What photographs say of a site.
+#[derive(Clone, Default)]
+struct Told {
+    /// Those that show it, and what each costs.
+    shown: Vec<(usize, f64)>,
+    /// Whether its depth is likely wrong.
+    doubtful: bool,
+}
+
+/// What photographs say of each `[site]` in and next to a view's hole.
+fn candidates(sights: &Sights, of: usize) -> Vec<Told> {
     let own = &sights.0[of];
     let eye = DVec3::from(own.grid.camera.center());
-    let one = |site: usize| -> Vec<(usize, f64)> {
+    let one = |site: usize| -> Told {
         if !own.near_hole(site) || !own.depth[site].is_finite() {
-            return vec![];
+            return Told::default();
         }
         let point = own.point(site, own.depth[site]);
         let (to, distance) = ((point - eye).normalize(), point.distance(eye));
         let mut found: Vec<(usize, f64, [u8; 3])> = vec![];
         let mut witnesses = Witnesses::default();
         for (view, sight) in sights.0.iter().enumerate().filter(|(view, sight)| *view != of && sight.grid.trusted) {
-            witnesses.framed += usize::from(sight.see(point).is_some());
+            if let Some((there, z)) = sight.see(point) {
+                witnesses.framed += 1;
+                witnesses.through += usize::from(!sight.hole[there] && sight.grid.depth[there] > z * (1.0 + APART));
+            }
             let Some(there) = sight.shows(point, 1.5 * SAME) else { continue };
             let from = DVec3::from(sight.grid.camera.center());
             let angle = to.dot((point - from).normalize()).clamp(-1.0, 1.0).acos();
@@ -134,7 +169,7 @@ fn candidates(sights: &Sights, of: usize) -> Vec<Vec<(usize, f64)>> {
             witnesses.confirmed |= sight.grid.confirmed[there];
         }
         if !witnesses.believed() {
-            return vec![];
+            return Told { shown: vec![], doubtful: witnesses.doubt(vec![]) };
         }
         let middle: [f64; 3] = std::array::from_fn(|c| {
             let mut values: Vec<u8> = found.iter().map(|(_, _, color)| color[c]).collect();
@@ -142,15 +177,17 @@ fn candidates(sights: &Sights, of: usize) -> Vec<Vec<(usize, f64)>> {
             values.get(values.len() / 2).map_or(0.0, |v| f64::from(*v))
         });
         let unlike = |color: &[u8; 3]| (0..3).map(|c| (f64::from(color[c]) - middle[c]).abs()).sum::<f64>() / 765.0;
-        found.iter().map(|(view, cost, color)| (*view, cost + UNLIKE * unlike(color))).collect()
+        let apart: Vec<f64> = found.iter().map(|(_, _, color)| unlike(color)).collect();
+        let shown = found.iter().zip(&apart).map(|((view, cost, _), apart)| (*view, cost + UNLIKE * apart)).collect();
+        Told { shown, doubtful: witnesses.doubt(apart) }
     };
     (0..own.hole.len()).into_par_iter().map(one).collect()
 }
 
-/// `[site]` in and next to a view's hole the photograph that it is taken from.
-fn sources(sights: &Sights, of: usize) -> Vec<Option<usize>> {
+/// The photograph that each `[site]` in and next to a view's hole is taken from, by what is told of them.
+fn sources(sights: &Sights, of: usize, told: &[Told]) -> Vec<Option<usize>> {
     let own = &sights.0[of];
-    let candidates = candidates(sights, of);
+    let candidates: Vec<&[(usize, f64)]> = told.iter().map(|told| told.shown.as_slice()).collect();
     // Greedily: each next source is the one that makes the sum of the cheapest costs the least.
     let mut chosen: Vec<usize> = vec![];
     let mut best: Vec<f64> = candidates.iter().map(|c| if c.is_empty() { 0.0 } else { 10.0 }).collect();
@@ -275,7 +312,8 @@ fn alike(one: [f32; 3], other: [f32; 3]) -> bool {
 pub fn gather(sights: &Sights, photographs: &[Photograph<'_>], of: usize) -> Filling {
     let (own, sight) = (&photographs[of], &sights.0[of]);
     let size @ [w, h] = own.camera.size.map(|n| n as usize);
-    let sources = sources(sights, of);
+    let told = candidates(sights, of);
+    let sources = sources(sights, of, &told);
     let photographed = |i: usize| -> Vec<Shown> {
         let mut found: Vec<Shown> = vec![];
         let Some((place, point)) = shown(own, sight, i) else { return found };
@@ -302,7 +340,12 @@ pub fn gather(sights: &Sights, photographs: &[Photograph<'_>], of: usize) -> Fil
         rgb: own.picture.pixels().map(|p| p.0.map(|v| f32::from(v) / 255.0)).collect(),
         guessed: own.hole.as_raw().iter().map(|v| *v != 0).collect(),
         seen: vec![false; w * h],
+        doubtful: vec![false; w * h],
     };
+    for i in (0..w * h).filter(|i| hole(*i)) {
+        let site = shown(own, sight, i).and_then(|([x, y], _)| sight.grid.site(x.floor() as i64, y.floor() as i64));
+        filling.doubtful[i] = site.is_some_and(|site| told[site].doubtful);
+    }
     let inside: Vec<usize> = (0..w * h).filter(|i| hole(*i) && !colors[*i].is_empty()).collect();
     let mixed: Vec<[f32; 3]> = colors.par_iter().map(|shown| mean(shown)).collect();
     // Beside the hole a photograph differs from the others in brightness alone, or shows something else.
@@ -320,6 +363,20 @@ pub fn gather(sights: &Sights, photographs: &[Photograph<'_>], of: usize) -> Fil
         (filling.guessed[i], filling.seen[i]) = (false, true);
     }
     gradient::solve(&mut filling.rgb, &equations);
+    let doubts = filling.doubtful.iter().filter(|doubtful| **doubtful).count() as f64;
+    if doubts > DISTRUST * own.hole.as_raw().iter().filter(|hole| **hole != 0).count() as f64 {
+        // What is around such a hole is not known, either, and a guess goes on from there; but under the object lies what it
+        // stands on.
+        let supports = sight.supports(&sight.planes);
+        let stands = |i: usize| {
+            let ray = own.camera.unproject(own.camera.pixel_center(i))?;
+            let z = sight.depth_at(sight.grid.place(ray));
+            let point = DVec3::new(ray[0], ray[1], 1.0) * z;
+            supports.iter().any(|support| support.has(point)).then_some(())
+        };
+        let guessed: Vec<usize> = (0..w * h).filter(|i| filling.guessed[*i] && stands(*i).is_none()).collect();
+        guessed.into_iter().for_each(|i| filling.doubtful[i] = true);
+    }
     filling
 }
 
@@ -386,7 +443,8 @@ mod tests {
         let colors = |view: usize| (0..pixels).map(|i| pattern(&cameras[view], i)).collect::<Vec<_>>();
         let blank = Filled { rgb: vec![[0.9, 0.1, 0.1]; pixels], made: vec![false; pixels] };
         let filled = [(0, blank), (2, Filled { rgb: colors(2), made: hole(2) })];
-        let mut filling = Filling { rgb: colors(1), guessed: hole(1), seen: vec![false; pixels] };
+        let mut filling =
+            Filling { rgb: colors(1), guessed: hole(1), seen: vec![false; pixels], doubtful: vec![false; pixels] };
         let inside: Vec<usize> = (0..pixels).filter(|i| filling.guessed[*i]).collect();
         inside.iter().for_each(|i| filling.rgb[*i] = [0.0; 3]);
         repaint(&sights, &photographs, &filled, 1, &mut filling);
@@ -402,10 +460,22 @@ mod tests {
     /// shows but right beside the object paints nothing, either.
     #[test]
     fn who_is_no_witness() {
-        let believed = |show, beside, confirmed, framed| Witnesses { show, beside, confirmed, framed }.believed();
+        let believed =
+            |show, beside, confirmed, framed| Witnesses { show, beside, confirmed, framed, through: 0 }.believed();
         assert!(!believed(1, 0, false, MANY) && !believed(0, 0, false, 0));
         assert!(believed(1, 0, true, MANY) && believed(2, 0, false, MANY) && believed(1, 0, false, MANY - 1));
         assert!(!believed(3, 3, true, MANY) && !believed(1, 1, true, 2) && believed(3, 2, true, MANY));
+    }
+
+    /// What photographs disagree about, or look through, is doubtful; what is hidden from all is a guess like any other.
+    #[test]
+    fn what_is_doubtful() {
+        let of = |show, confirmed, through, apart: &[f64]| {
+            Witnesses { show, beside: 0, confirmed, framed: MANY - 1, through }.doubt(apart.to_vec())
+        };
+        assert!(!of(0, false, 0, &[]) && !of(0, false, THROUGH - 1, &[]) && of(0, false, THROUGH, &[]));
+        assert!(of(1, false, 0, &[0.0]) && !of(1, true, 0, &[0.0]));
+        assert!(!of(3, false, 5, &[0.0, 0.01, 0.3]) && of(3, true, 0, &[0.0, 0.1, 0.3]) && of(2, true, 0, &[0.0, 0.1]));
     }
 
     /// Next to a pixel without a colour the others' count alone, and nothing of it is mixed in.

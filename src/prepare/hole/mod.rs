@@ -37,7 +37,7 @@ use super::network::{self, Inpainting};
 use super::record::Batch;
 use super::{Error, Watch};
 use crate::multiview::Matched;
-use crate::scene::{self, Camera, HOLE, MADE_WITH, PriorKind, Scene, resample};
+use crate::scene::{self, Camera, DOUBTFUL, HOLE, MADE_WITH, PriorKind, Scene, resample};
 use color::{Filled, Filling, Photograph};
 use surface::{Sight, Sights};
 
@@ -54,7 +54,7 @@ const LEAST_HOLE: f64 = 0.4;
 const AT_ONCE: usize = 16;
 /// Name of the way in which holes are filled: a scene that was filled in another way is filled anew.
 pub const METHOD: &str =
-    "one surface, nothing where others look through it, no colour seen beside the object alone, no strange material";
+    "one surface, nothing where others look through it, no colour from the rim alone, doubts left to training";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 
@@ -180,12 +180,16 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
         sights.solve(*i, task.seed + *i as u64);
     }
     log::debug!("hole: every view has its surface");
-    let mut done = 0;
+    let (mut done, mut doubtful, mut all) = (0, 0, 0);
     for some in order.chunks(AT_ONCE) {
         let gathered: Vec<Filling> = some.par_iter().map(|i| color::gather(&sights, &photographs, *i)).collect();
         log::debug!("hole: {} views are gathered, {done} are filled", some.len());
         for (&i, mut filling) in some.iter().zip(gathered) {
             color::repaint(&sights, &photographs, &filled, i, &mut filling);
+            if !task.given.is_empty() || task.inpainting.is_some() {
+                // What a person or a network has painted is not for us to doubt.
+                filling.doubtful.iter_mut().zip(&filling.seen).for_each(|(doubtful, seen)| *doubtful &= seen);
+            }
             // What was made for this view the others get from it; what photographs show they look up themselves.
             let made: Vec<bool> = if task.given.contains_key(&i) {
                 photographs[i].hole.as_raw().iter().map(|v| *v != 0).collect()
@@ -203,8 +207,10 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
                 of_reference(task, of, &filling, &photographs[of], &sights, expected, &mut batch)?;
             }
             if !task.given.contains_key(&i) {
+                doubtful += filling.doubtful.iter().filter(|doubtful| **doubtful).count();
+                all += photographs[i].hole.as_raw().iter().filter(|hole| **hole != 0).count();
                 let name = &task.fine.train[i].name;
-                let picture = cut_out(&as_exposed(task, i, &filling.rgb), &photographs[i].hole);
+                let picture = cut_out(&as_exposed(task, i, &filling.rgb), &filling.doubtful, &photographs[i].hole);
                 batch.rgba(
                     format!("{HOLE}/{name}.png"),
                     &picture,
@@ -217,6 +223,12 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
             done += 1;
             watch.turn(n + 1 + done)?;
         }
+    }
+    let percent = (100.0 * doubtful as f64 / all.max(1) as f64).round();
+    if percent > 0.0 {
+        batch.notes.push(format!(
+            "{percent} % of the holes are left to training on the other photographs, which do not agree on how far away it is there"
+        ));
     }
     let name = |i: usize| reference_path(&task.scene.train[i].name);
     let mut made_with: Vec<String> = task.given.iter().map(|(i, hash)| format!("{hash} {}\n", name(*i))).collect();
@@ -268,8 +280,8 @@ fn reference(task: &Task<'_>, sights: &Sights, with_holes: &[usize]) -> Result<u
     Ok(best.map_or(with_holes[0], |(_, i)| i))
 }
 
-/// The filled hole as large as its box and a little around it: whole colours, alpha in the hole alone.
-fn cut_out(rgb: &[[f32; 3]], hole: &GrayImage) -> RgbaImage {
+/// The filled hole and a little around it: whole colours, alpha in the hole alone, [`DOUBTFUL`] where it is.
+fn cut_out(rgb: &[[f32; 3]], doubtful: &[bool], hole: &GrayImage) -> RgbaImage {
     /// Pixels around the hole whose colours are kept, so that a reduced picture mixes in none that is not there.
     const KEPT: u32 = 8;
     let (w, h) = hole.dimensions();
@@ -280,7 +292,7 @@ fn cut_out(rgb: &[[f32; 3]], hole: &GrayImage) -> RgbaImage {
             return Rgba([0; 4]);
         }
         let [r, g, b] = rgb[i].map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8);
-        Rgba([r, g, b, hole.as_raw()[i]])
+        Rgba([r, g, b, hole.as_raw()[i].min(if doubtful[i] { DOUBTFUL } else { 255 })])
     })
 }
 
