@@ -197,7 +197,7 @@ impl Time {
         })
     }
 
-    /// What the files take.
+    /// Steps and seconds that the files take.
     pub fn files(&self) -> Reserve {
         let baked = 1000.0 * self.work.files * REFINED + BAKED;
         Reserve { steps: if self.work.form == Form::Anchors { baked } else { 0.0 }, seconds: WRITTEN }

@@ -97,7 +97,7 @@ fn mean_focal(sight: &Sight) -> f64 {
     (fx * fy).sqrt()
 }
 
-/// What the views that show a point say about it.
+/// Counts of the views that show a point, or do not.
 #[derive(Default)]
 struct Witnesses {
     /// How many show it.
@@ -133,16 +133,16 @@ impl Witnesses {
     }
 }
 
-/// What photographs say of a site.
+/// A site as the photographs tell it.
 #[derive(Clone, Default)]
 struct Told {
-    /// Those that show it, and what each costs.
+    /// Photographs that show it, with the cost of each.
     shown: Vec<(usize, f64)>,
     /// Whether its depth is likely wrong.
     doubtful: bool,
 }
 
-/// What photographs say of each `[site]` in and next to a view's hole.
+/// Each `[site]` in and next to a view's hole as the photographs tell it.
 fn candidates(sights: &Sights, of: usize) -> Vec<Told> {
     let own = &sights.0[of];
     let eye = DVec3::from(own.grid.camera.center());
