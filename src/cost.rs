@@ -21,9 +21,12 @@ pub struct Counts {
     pub pairs: f64,
     /// Pairs up to where their tile ends: behind the last Gaussian that any of its pixels still sees.
     pub evaluated: f64,
-    /// These times the pixels of their tile; of a tile of 16 pixels a side those of its halves of eight rows that the Gaussian
-    /// reaches: a subgroup of 32 passes over the others.
+    /// These times the pixels of their tile; of a tile of 16 pixels a side those of its pairs of rows that the Gaussian reaches:
+    /// a subgroup of 32 passes over the others.
     pub samples: f64,
+    /// The same for the way back, where a subgroup of 32 has four rows; 0 in records of versions that did not count them.
+    #[serde(default)]
+    pub samples_back: f64,
     /// Samples that changed a pixel.
     pub blended: f64,
     /// Pairs with such a sample; 0 in records of versions that did not count them.
@@ -42,7 +45,7 @@ pub struct Counts {
 }
 
 impl Counts {
-    fn fields(&mut self) -> [&mut f64; 15] {
+    fn fields(&mut self) -> [&mut f64; 16] {
         let Self {
             anchors,
             offsets,
@@ -52,6 +55,7 @@ impl Counts {
             pairs,
             evaluated,
             samples,
+            samples_back,
             blended,
             seen,
             pixels,
@@ -69,6 +73,7 @@ impl Counts {
             pairs,
             evaluated,
             samples,
+            samples_back,
             blended,
             seen,
             pixels,

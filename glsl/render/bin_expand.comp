@@ -1,12 +1,15 @@
 #version 460
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_GOOGLE_include_directive : require
+#extension GL_KHR_shader_subgroup_arithmetic : require
 #include "tiles.glsl"
 // One (Gaussian, tile) pair per tile touched, Gaussian after Gaussian in depth order: pairs put by tile, in this order
-// within a tile, then leave every tile's list in depth order.
+// within a tile, then leave every tile's list in depth order. The pairs of a Gaussian that touches more than LONG tiles are
+// written by its whole subgroup, a row of tiles a thread: a thread alone would be at it long after all others.
 layout(local_size_x = 64) in;
 #include "thread.glsl"
 layout(constant_id = 0) const float ALPHA_MIN = 0.00392156862745098; // a Gaussian touches the pixels where its alpha reaches this
+layout(constant_id = 1) const uint LONG = 32u; // tiles; 2^32 - 1: a thread always writes its own
 layout(binding = 0, scalar) readonly buffer DrawnCount { uint drawn_count[]; }; // [1]
 layout(binding = 1, scalar) readonly buffer PairCount { uint pair_count[]; };   // [1] pairs; 0 when they do not fit
 layout(binding = 2, scalar) readonly buffer Order { uint order[]; };            // [rank] slot, nearest first
@@ -22,13 +25,50 @@ layout(push_constant, scalar) uniform Push {
   uvec2 grid; // tiles in x and y
   uint tile;  // side of a tile, px
 } push;
+
+// The subgroup's long runs, in lanes that all come here; `slot`, `first` and `n` of this lane's own run.
+void expand_long(uint slot, uint first, uint n) {
+  int tile = int(push.tile);
+  ivec2 grid = ivec2(push.grid);
+  int lane = int(gl_SubgroupInvocationID), lanes = int(gl_SubgroupSize);
+  bool waits = n > LONG;
+  for (;;) {
+    int next = subgroupMin(waits ? lane : lanes);
+    if (next == lanes) break;
+    bool own = lane == next;
+    waits = waits && !own;
+    uint s = subgroupAdd(own ? slot : 0u), p = subgroupAdd(own ? first : 0u), end = p + subgroupAdd(own ? n : 0u);
+    vec2 m = mean[s];
+    Support support = support_of(m, covariance[s], opacity[s], ALPHA_MIN, tile, grid);
+    for (int top = support.row0; top <= support.row1; top += lanes) {
+      int row = top + lane;
+      ivec2 columns = support_columns(support, m, min(row, support.row1), tile, grid);
+      uint count = row > support.row1 ? 0u : uint(max(columns.y - columns.x + 1, 0));
+      uint at = p + subgroupExclusiveAdd(count);
+      for (uint i = 0u; i < count && at + i < end; ++i) {
+        pair_tile[at + i] = uint(row * grid.x + columns.x) + i;
+        pair_slot[at + i] = s;
+      }
+      p += subgroupAdd(count);
+    }
+    for (p += uint(lane); p < end; p += uint(lanes)) {
+      pair_tile[p] = uint(grid.x * grid.y);
+      pair_slot[p] = s;
+    }
+  }
+}
+
 void main() {
   uint r = thread_index();
-  if (r >= drawn_count[0] || pair_count[0] == 0u) return;
-  uint s = order[r];
-  uint p = rank_first[r];
-  uint end = p + tiles[s];
-  first_pair[s] = p;
+  bool some = r < drawn_count[0] && pair_count[0] != 0u;
+  if (LONG == ~0u && !some) return;
+  uint s = some ? order[r] : 0u;
+  uint p = some ? rank_first[r] : 0u;
+  uint n = some ? tiles[s] : 0u;
+  if (some) first_pair[s] = p;
+  if (LONG != ~0u) expand_long(s, p, n);
+  if (!some || n > LONG) return;
+  uint end = p + n;
   // CPU drivers load what is read in a loop again for every lane: not the push constants, not the mean.
   int tile = int(push.tile);
   ivec2 grid = ivec2(push.grid);

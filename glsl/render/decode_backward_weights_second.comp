@@ -5,26 +5,26 @@
 // Sums the chunks' gradients of the second layer's weights in a fixed order: for each k runs of 32 chunks, then the runs.
 layout(local_size_x = 64) in;
 layout(constant_id = 0) const uint OFFSETS = 10u; // Gaussians per anchor
+layout(constant_id = 1) const uint LANES = 16u;   // threads that share a vec4's runs, as of decode_backward_weights
 #include "thread.glsl"
 #include "model.glsl"
 #include "decoder.glsl"
 layout(binding = 0, scalar) readonly buffer Segments { uint segments[]; };          // [K+2] of decode_lists
 layout(binding = 1, scalar) readonly buffer Partial { vec4 partial[]; };            // of decode_backward_second
 layout(binding = 2, scalar) writeonly buffer GradWeights { float grad_weights[]; }; // [W] every one of the second layer is written
+#include "chunk_sum.glsl"
 void main() {
-  uint t = thread_index(), k = t / SECOND_VEC4, i = t % SECOND_VEC4;
+  // Workgroups of each k of their own.
+  const uint GROUPS = (SECOND_VEC4 + SUM_WIDTH - 1u) / SUM_WIDTH;
+  uint k = group_index() / GROUPS, i = group_index() % GROUPS * SUM_WIDTH + sum_column();
   if (k >= OFFSETS) return;
   uint first = 0u, chunks = 0u, chunk = chunk_listed(segments[OFFSETS]);
   for (uint j = 0u; j <= k; ++j) {
     first += chunks;
     chunks = (segments[j + 1u] - segments[j] + chunk - 1u) / chunk;
   }
-  vec4 total = vec4(0.0);
-  for (uint begin = 0u; begin < chunks; begin += 32u) {
-    vec4 run = vec4(0.0);
-    for (uint c = begin; c < min(begin + 32u, chunks); ++c) run += partial[(first + c) * SECOND_VEC4 + i];
-    total += run;
-  }
+  vec4 total = chunk_sum(first, chunks, SECOND_VEC4, min(i, SECOND_VEC4 - 1u));
+  if (i >= SECOND_VEC4 || sum_lane() != 0u) return;
   for (uint c = 0u; c < 4u; ++c) {
     bool matrix = i < 11u * ROW_VEC4;
     uint output_ = matrix ? i / ROW_VEC4 : 4u * (i - 11u * ROW_VEC4) + c;

@@ -7,14 +7,14 @@
 // variant depth: NO_TRANSMITTANCE
 //
 // Front-to-back blending of a tile's Gaussians (3D Gaussian Splatting, equation 3): colour, depth and transmittance.
-// 16 x 16 tiles, 64 threads of 4 pixels; Gaussians pass through shared memory. A band of four rows is 16 threads': a subgroup
-// none of whose bands a Gaussian reaches passes over it. `depth` leaves transmittance out, `color`
-// also depth.
+// 16 x 16 tiles, a thread a pixel; Gaussians pass through shared memory. A band is a row, which is 16 threads': a subgroup
+// none of whose bands a Gaussian reaches passes over it. The longest list is what a picture waits for, and a thread of one
+// pixel is through with it sooner than one of four. `depth` leaves transmittance out, `color` also depth.
 #ifdef COLOR_ONLY
 #define NO_TRANSMITTANCE
 #endif
-const uint TILE = 16u, THREADS = 64u, ROWS = 4u;
-layout(local_size_x = 64) in;
+const uint TILE = 16u, ROWS = 1u;
+layout(local_size_x = 256) in;
 layout(constant_id = 0) const float ALPHA_MIN = 0.00392156862745098; // samples below are skipped
 layout(constant_id = 1) const float TRANSMITTANCE_MIN = 1e-4; // a pixel is finished before it falls below
 layout(binding = 0, scalar) readonly buffer Ranges { uvec2 ranges[]; };         // [tile + 1] first, one past last in the sorted list
@@ -70,7 +70,7 @@ void blend(vec2 m, vec3 q, float o, vec3 c, float z) {
   }
 }
 
-const uint BATCH = 64u;
+const uint BATCH = 128u;
 shared vec2 s_mean[BATCH];
 shared vec3 s_conic[BATCH];
 shared float s_opacity[BATCH];
@@ -99,7 +99,7 @@ void main() {
     uint i = base + t;
     if (t == 0u) s_live = 0u;
     barrier();
-    if (i < range.y) {
+    if (t < BATCH && i < range.y) {
       uint g = pair_slot[sorted[i]];
       s_mean[t] = mean[g];
       s_conic[t] = conic[g];

@@ -22,7 +22,7 @@
 //   dL/d(1/V) = -gp dy^2 / 2.
 // The factors before gp a, gp dy and their squares are the Gaussian's own: `Sums` are over pixels, `write` applies them.
 //
-// Threads: thread t of 64 has column t % 16 of the tile's 16 x 16 pixels, and rows 4 (t / 16) to 4 (t / 16) + 3. 32 Gaussians
+// Threads: thread t of 128 has column t % 16 of the tile's 16 x 16 pixels, and rows 2 (t / 16) and 2 (t / 16) + 1. BATCH Gaussians
 // at a time lie in shared memory, 4 are gone through together: `meet` twice leaves lane k of every four with the k-th's
 // sums over the four, further bits add the subgroup's other fours, and lanes 0 to 3 put them down. Then thread t adds what
 // the subgroups put down of Gaussian t, in their order, and writes it to the pair's own number: nothing is added
@@ -33,11 +33,11 @@
 #else
 #define WITH_DEPTH
 #endif
-const uint TILE = 16u, THREADS = 64u, ROWS = 4u;
-layout(local_size_x = 64) in;
+const uint TILE = 16u, THREADS = 128u, ROWS = 2u;
+layout(local_size_x = 128) in;
 layout(constant_id = 0) const float ALPHA_MIN = 0.00392156862745098; // samples below are skipped
 layout(constant_id = 1) const float TRANSMITTANCE_MIN = 1e-4; // a pixel is finished before it falls below
-layout(constant_id = 2) const uint SUBGROUPS = 16u; // subgroups of a wide tile's 64 threads; those of four are the most
+layout(constant_id = 2) const uint SUBGROUPS = 32u; // subgroups of a wide tile's 128 threads; those of four are the most
 layout(binding = 0, scalar) readonly buffer Ranges { uvec2 ranges[]; };         // [tile + 1] first, one past last in the sorted list
 layout(binding = 1, scalar) readonly buffer Sorted { uint sorted[]; };          // [pair] pair numbers by tile, nearest first
 layout(binding = 2, scalar) readonly buffer PairSlot { uint pair_slot[]; };     // [pair] slot of the Gaussian
@@ -155,7 +155,7 @@ Sums meet(Sums a, Sums b, uint bit) {
   return s;
 }
 
-const uint BATCH = 32u;
+const uint BATCH = SUBGROUPS > 16u ? 512u / SUBGROUPS : 32u; // what 32 KiB of shared memory hold the sums of
 const uint GROUP = 4u; // Gaussians whose sums meet: the fewest lanes a subgroup has
 shared uint s_live;
 shared vec2 s_mean[BATCH];

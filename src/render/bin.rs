@@ -10,7 +10,7 @@ use super::project::{Projected, listed};
 use super::slots::Slots;
 use super::tiling::Tiling;
 use crate::gpu::kernels::render::{bin_count, bin_depth_keys, bin_expand, bin_ranges, bin_rank, cpu};
-use crate::gpu::{Buffer, Check, Error, Gpu, Groups, Recorder, Reference};
+use crate::gpu::{Buffer, Check, Error, Form, Gpu, Groups, Recorder, Reference};
 use crate::math::tiles::Support;
 use crate::primitives::compact::Compact;
 use crate::primitives::dispatch::Shape;
@@ -97,6 +97,9 @@ impl Reference for bin_ranges::Kernel {
         }
     }
 }
+
+/// Tiles of a Gaussian above which a whole subgroup writes its pairs.
+const LONG: u32 = 32;
 
 /// Pairs of each run of `pairs` in `runs`.
 fn run_length(pairs: u32, runs: u32) -> usize {
@@ -339,7 +342,9 @@ impl Bin {
             pair_tile,
             pair_slot,
         };
-        let constants = bin_expand::Constants { alpha_min };
+        // On a CPU threads of a subgroup run in step: the longest is waited for in any case.
+        let long = if rec.gpu().form() == Form::Cpu { u32::MAX } else { LONG };
+        let constants = bin_expand::Constants { alpha_min, long };
         rec.run_with(bin_expand::Kernel, constants, buffers, bin_expand::Push { grid, tile }, drawn_groups);
         let last = grid[0] * grid[1];
         let (sorted, blended) = match &self.by_tile {
@@ -373,7 +378,7 @@ impl Bin {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::testing;
+    use crate::gpu::{Options, testing};
     use crate::render::method::DepthKey;
     use rand::{RngExt, SeedableRng};
 
@@ -385,7 +390,9 @@ mod tests {
         let mut random = |low: f32, high: f32| -> Vec<f32> { (0..n).map(|_| rng.random_range(low..high)).collect() };
         let (x, y, opacity) = (random(-9.0, 90.0), random(-9.0, 70.0), random(-0.1, 1.0));
         let mean: Vec<[f32; 2]> = std::iter::zip(x, y).map(|(x, y)| [x, y]).collect();
-        let (side, slope) = (random(0.31, 80.0), random(-0.9, 0.9));
+        let (mut side, slope) = (random(0.31, 80.0), random(-0.9, 0.9));
+        // Some cover the picture.
+        side.iter_mut().step_by(13).for_each(|side| *side *= 100.0);
         let covariance: Vec<[f32; 3]> = std::iter::zip(side, slope).map(|(s, r)| [s, r * (s - 0.3), s]).collect();
         // Some equal, some closer than coarse keys tell apart, some farther than they reach, some absent.
         let depth: Vec<f32> = (0..n)
@@ -448,17 +455,22 @@ mod tests {
 
     #[test]
     fn lists_are_complete_and_in_order() {
-        let gpu = testing::gpu();
+        for form in [Form::Cpu, Form::Gpu] {
+            lists_are_complete_and_in_order_on(&testing::gpu_with(Options { form: Some(form), ..Options::default() }));
+        }
+    }
+
+    fn lists_are_complete_and_in_order_on(gpu: &testing::TestGpu) {
         for tiling in [Tiling::Wide, Tiling::Narrow] {
             let method = Method::from(tiling);
             for n in [0, 1, 63, 64, 65, 1000] {
-                check(&gpu, n, method);
+                check(gpu, n, method);
             }
             for bits in [28, 31] {
-                check(&gpu, 999, Method { depth_key: DepthKey::new(0.2, bits), ..method });
+                check(gpu, 999, Method { depth_key: DepthKey::new(0.2, bits), ..method });
             }
             for alpha_min in [1e-3, 0.1] {
-                check(&gpu, 257, Method { alpha_min, ..method });
+                check(gpu, 257, Method { alpha_min, ..method });
             }
         }
     }

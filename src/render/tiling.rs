@@ -5,7 +5,7 @@ use crate::gpu::{Form, Gpu};
 /// Shape of the rasteriser's tiles.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Hash)]
 pub enum Tiling {
-    /// 16 x 16 pixels, 64 threads: any subgroup size.
+    /// 16 x 16 pixels, some threads of several subgroups: any subgroup size.
     Wide,
     /// 8 x 8 pixels, one subgroup of 8 threads: CPU drivers.
     Narrow,
@@ -30,10 +30,17 @@ impl Tiling {
             Self::Narrow => 8,
         }
     }
-    /// Threads per tile.
+    /// Threads per tile of the picture's pass.
     pub fn threads(self) -> u32 {
         match self {
-            Self::Wide => 64,
+            Self::Wide => 256,
+            Self::Narrow => 8,
+        }
+    }
+    /// Threads per tile of the way back, whose sums over a tile take the less the fewer they are.
+    pub fn threads_backward(self) -> u32 {
+        match self {
+            Self::Wide => 128,
             Self::Narrow => 8,
         }
     }

@@ -373,8 +373,8 @@ pub const TABLE: &[Formula] = &[
                     + splat_bytes(depth > 0.0) * c.drawn
                     + (24.0 + 8.0 * depth + 8.0 * transmittance) * c.pixels
                     + (36.0 + 4.0 * depth) * c.pairs,
-                (44.0 + 2.0 * depth + (9.0 + depth) / c.tile_side) * c.samples,
-                c.samples,
+                (44.0 + 2.0 * depth + (9.0 + depth) / c.tile_side) * c.samples_back,
+                c.samples_back,
             )
         },
     },

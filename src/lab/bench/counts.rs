@@ -70,8 +70,9 @@ pub fn count(words: &BTreeMap<&'static str, Vec<u32>>, schedule: &Schedule, meth
         pairs: first("pair_count").into(),
         evaluated: walked[0],
         samples: walked[1],
-        blended: walked[2],
-        seen: walked[3],
+        samples_back: walked[2],
+        blended: walked[3],
+        seen: walked[4],
         pixels: f64::from(known.size[0]) * f64::from(known.size[1]),
         tiles: tiles as f64,
         tile_side: tiling.side().into(),
@@ -103,9 +104,9 @@ struct Lists<'a> {
 const MOST_SAMPLES: u64 = 1 << 29;
 
 impl Lists<'_> {
-    /// Pairs up to where the tiles end; their samples, of wide tiles those in the halves of eight rows, 32 threads', that the
-    /// Gaussian reaches; samples that changed a pixel, and pairs with such a sample.
-    fn walk(&self, tiling: Tiling, size: [u32; 2], method: Method) -> [f64; 4] {
+    /// Pairs up to where the tiles end; their samples, of wide tiles those in the rows of 32 threads that the Gaussian reaches,
+    /// two on the way there and four on the way back; samples that changed a pixel, and pairs with such a sample.
+    fn walk(&self, tiling: Tiling, size: [u32; 2], method: Method) -> [f64; 5] {
         let [columns, rows] = tiling.grid(size);
         let tiles = columns * rows;
         let pairs: u64 = self.ranges.iter().take(tiles as usize).map(|[first, end]| u64::from(end - first)).sum();
@@ -114,7 +115,7 @@ impl Lists<'_> {
         let sums = chosen
             .par_iter()
             .map(|&tile| self.tile([tile % columns, tile / columns], tile, tiling.side(), size, method))
-            .reduce(|| [0; 4], |a, b| std::array::from_fn(|i| a[i] + b[i]));
+            .reduce(|| [0; 5], |a, b| std::array::from_fn(|i| a[i] + b[i]));
         // By pairs, not by tiles: a tile stands for others as full as it is.
         let walked: u64 =
             chosen.iter().map(|&t| self.ranges.get(t as usize).map_or(0, |[a, b]| u64::from(b - a))).sum();
@@ -123,8 +124,8 @@ impl Lists<'_> {
     }
 
     /// The rasteriser's decisions, in its own float32.
-    fn tile(&self, [column, row]: [u32; 2], tile: u32, side: u32, size: [u32; 2], method: Method) -> [u64; 4] {
-        let Some(&[first, end]) = self.ranges.get(tile as usize) else { return [0; 4] };
+    fn tile(&self, [column, row]: [u32; 2], tile: u32, side: u32, size: [u32; 2], method: Method) -> [u64; 5] {
+        let Some(&[first, end]) = self.ranges.get(tile as usize) else { return [0; 5] };
         let mut pixels = vec![];
         for y in row * side..((row + 1) * side).min(size[1]) {
             for x in column * side..((column + 1) * side).min(size[0]) {
@@ -132,12 +133,12 @@ impl Lists<'_> {
             }
         }
         // Wide tiles pass over what no row of a subgroup's can see.
-        let bands = if side == 16 { 2 } else { 1 };
+        let bands = if side == 16 { 8 } else { 1 };
         let rows = side / bands;
         let of_band: Vec<u64> = (0..bands)
             .map(|band| pixels.iter().filter(|(at, _)| (at[1] as u32 - row * side) / rows == band).count() as u64)
             .collect();
-        let (mut evaluated, mut samples, mut blended, mut seen) = (0, 0, 0, 0);
+        let (mut evaluated, mut samples, mut samples_back, mut blended, mut seen) = (0, 0, 0, 0, 0);
         for &pair in &self.sorted[first as usize..end as usize] {
             if pixels.is_empty() {
                 break;
@@ -152,7 +153,12 @@ impl Lists<'_> {
                 let bound = support_bound(opacity, method.alpha_min);
                 support_bands(mean[1], conic[2], bound, (row * side) as f32 + 0.5, rows, bands)
             };
-            samples += of_band.iter().enumerate().filter(|(b, _)| reached >> b & 1 == 1).map(|(_, n)| n).sum::<u64>();
+            let reaching =
+                |bands: u32| of_band.iter().zip(0..).filter(move |(_, b)| bands >> b & 1 == 1).map(|(n, _)| n);
+            samples += reaching(reached).sum::<u64>();
+            // Of a pair of bands both, where one is reached.
+            let either = (reached | reached >> 1) & 0x5555_5555;
+            samples_back += reaching(if bands == 1 { 1 } else { either | either << 1 }).sum::<u64>();
             pixels.retain_mut(|(at, transmittance)| {
                 let (dx, dy) = (at[0] - mean[0], at[1] - mean[1]);
                 let across = dx - conic[1] * dy;
@@ -171,7 +177,7 @@ impl Lists<'_> {
             });
             seen += u64::from(blended > before);
         }
-        [evaluated, samples, blended, seen]
+        [evaluated, samples, samples_back, blended, seen]
     }
 }
 
@@ -192,19 +198,19 @@ mod tests {
             opacity: &[0.7, 0.9, 0.5],
         };
         // First tile: 0.7 leaves 0.3; 0.9 would leave 0.03, below 0.2: every pixel ends there.
-        let [evaluated, samples, blended, seen] = lists.walk(Tiling::Narrow, [9, 8], method);
+        let [evaluated, samples, _, blended, seen] = lists.walk(Tiling::Narrow, [9, 8], method);
         assert_eq!((evaluated, samples, blended, seen), (2.0 + 1.0, 128.0 + 8.0, 64.0 + 8.0, 1.0 + 1.0));
         let never = Method { transmittance_min: 0.0, ..method };
-        let [evaluated, samples, blended, seen] = lists.walk(Tiling::Narrow, [9, 8], never);
+        let [evaluated, samples, _, blended, seen] = lists.walk(Tiling::Narrow, [9, 8], never);
         assert_eq!((evaluated, samples, blended, seen), (4.0, 200.0, 200.0, 4.0));
         // Below the alpha threshold nothing is blended, and nothing ends.
         let faint = Lists { opacity: &[1e-3; 3], ..lists };
-        assert_eq!(faint.walk(Tiling::Narrow, [9, 8], method), [4.0, 200.0, 0.0, 0.0]);
+        assert_eq!(faint.walk(Tiling::Narrow, [9, 8], method), [4.0, 200.0, 200.0, 0.0, 0.0]);
     }
 
     /// A Gaussian of the upper half, one of the lower and one of both.
     #[test]
-    fn wide_tiles_count_the_halves_that_are_reached() {
+    fn wide_tiles_count_the_rows_that_are_reached() {
         let lists = Lists {
             ranges: &[[0, 3], [3, 3]],
             sorted: &[0, 1, 2],
@@ -214,9 +220,10 @@ mod tests {
             opacity: &[0.5; 3],
         };
         let method = Method::from(Tiling::Wide);
-        // 16 columns and 12 rows: 128 samples above, 64 below.
-        let [evaluated, samples, ..] = lists.walk(Tiling::Wide, [16, 12], method);
-        assert_eq!((evaluated, samples), (3.0, 128.0 + 64.0 + 192.0));
+        // 16 columns and 12 rows, of which rows 0 to 5, 10 and 11, and 5 to 10 are reached: by twos, and by fours.
+        let [evaluated, samples, back, ..] = lists.walk(Tiling::Wide, [16, 12], method);
+        assert_eq!((evaluated, samples), (3.0, 16.0 * (6.0 + 2.0 + 8.0)));
+        assert_eq!(back, 16.0 * (8.0 + 4.0 + 8.0));
     }
 
     #[test]

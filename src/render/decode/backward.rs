@@ -214,6 +214,16 @@ impl Reference for decode_backward_weights_second::Kernel {
     }
 }
 
+/// Threads that share a vec4's sum over chunks: a GPU has more threads than there are sums, a CPU has not.
+pub(super) fn sum_lanes(form: Form) -> u32 {
+    if form == Form::Gpu { 16 } else { 1 }
+}
+
+/// Threads for the sums of so many vec4s, in whole workgroups of 64.
+pub(super) fn sum_threads(vec4s: usize, lanes: u32) -> usize {
+    vec4s.div_ceil(64 / lanes as usize) * 64
+}
+
 /// The backward stage: scratch for the gradients inside the decoder.
 #[derive(Debug)]
 pub struct DecodeBackward {
@@ -330,12 +340,13 @@ impl DecodeBackward {
             let constants = decode_backward_second::Constants { offsets, head };
             rec.run_with(kernel, constants, buffers, (), &forward.per_second);
         }
+        let lanes = sum_lanes(*form);
         let buffers = decode_backward_weights::Buffers { groups: count, partial: first, grad_weights };
-        let constants = decode_backward_weights::Constants { offsets };
-        rec.run_with(decode_backward_weights::Kernel, constants, buffers, (), FIRST_VEC4);
+        let constants = decode_backward_weights::Constants { offsets, lanes };
+        rec.run_with(decode_backward_weights::Kernel, constants, buffers, (), sum_threads(FIRST_VEC4, lanes));
         let buffers = decode_backward_weights_second::Buffers { segments, partial: second, grad_weights };
-        let constants = decode_backward_weights_second::Constants { offsets };
-        let threads = forward.layout.offsets * SECOND_VEC4;
+        let constants = decode_backward_weights_second::Constants { offsets, lanes };
+        let threads = forward.layout.offsets * sum_threads(SECOND_VEC4, lanes);
         rec.run_with(decode_backward_weights_second::Kernel, constants, buffers, (), threads);
     }
 }

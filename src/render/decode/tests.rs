@@ -1,7 +1,7 @@
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
 
-use super::backward::{chunks, listed_chunks};
+use super::backward::{chunks, listed_chunks, sum_threads};
 use super::*;
 use crate::gpu::Reference;
 use crate::gpu::kernels::render::{
@@ -251,13 +251,23 @@ fn kernels_match_their_twins() {
         twin(kernel, &gpu, of_head(0), case.clone(), (), chunks * SECOND_THREADS as usize);
         let by_head = |case, head| twin(decode_backward_second::Kernel::Cpu, &gpu, of_head(head), case, (), chunks * 2);
         let second = (0..3).fold(case, by_head).partial;
+        let bits = |values: &[f32]| values.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
         let case = decode_backward_weights::Arrays { groups: m.counted(), partial: first, grad_weights };
-        let constants = decode_backward_weights::Constants { offsets: k };
-        let grad_weights = twin(decode_backward_weights::Kernel, &gpu, constants, case, (), FIRST_VEC4).grad_weights;
+        let grad_weights = [16, 1].map(|lanes| {
+            let constants = decode_backward_weights::Constants { offsets: k, lanes };
+            let threads = sum_threads(FIRST_VEC4, lanes);
+            twin(decode_backward_weights::Kernel, &gpu, constants, case.clone(), (), threads).grad_weights
+        });
+        assert!(bits(&grad_weights[0]) == bits(&grad_weights[1]), "so many threads, another sum");
+        let [grad_weights, _] = grad_weights;
         let case = decode_backward_weights_second::Arrays { segments, partial: second, grad_weights };
-        let constants = decode_backward_weights_second::Constants { offsets: k };
-        let threads = offsets * SECOND_VEC4;
-        let all = twin(decode_backward_weights_second::Kernel, &gpu, constants, case, (), threads).grad_weights;
+        let all = [16, 1].map(|lanes| {
+            let constants = decode_backward_weights_second::Constants { offsets: k, lanes };
+            let threads = offsets * sum_threads(SECOND_VEC4, lanes);
+            twin(decode_backward_weights_second::Kernel, &gpu, constants, case.clone(), (), threads).grad_weights
+        });
+        assert!(bits(&all[0]) == bits(&all[1]), "so many threads, another sum");
+        let [all, _] = all;
         assert!(all[..layout.weights()].iter().all(|g| g.is_finite()), "every weight has a gradient");
     }
 }
@@ -281,8 +291,9 @@ fn long_chunks_match_their_twins() {
     let partial = twin(decode_backward_first::Kernel::Gpu, &gpu, (), case, (), parts * 240).partial;
     let grad_weights = vec![testing::UNWRITTEN; layout.weights() + 3];
     let case = decode_backward_weights::Arrays { groups, partial, grad_weights };
-    let constants = decode_backward_weights::Constants { offsets: 9 };
-    let grad_weights = twin(decode_backward_weights::Kernel, &gpu, constants, case, (), FIRST_VEC4).grad_weights;
+    let constants = decode_backward_weights::Constants { offsets: 9, lanes: 16 };
+    let threads = sum_threads(FIRST_VEC4, 16);
+    let grad_weights = twin(decode_backward_weights::Kernel, &gpu, constants, case, (), threads).grad_weights;
     let listed: Vec<u32> = (0..(count * offsets) as u32).collect();
     let segments: Vec<u32> = (0..=9).map(|k| k * count as u32).chain([count as u32]).collect();
     let chunks = listed_chunks(&segments, &listed, offsets).len();
@@ -297,8 +308,9 @@ fn long_chunks_match_their_twins() {
     let constants = decode_backward_second::Constants { offsets: 9, head: 0 };
     let partial = twin(decode_backward_second::Kernel::Cpu, &gpu, constants, case, (), chunks * 2).partial;
     let case = decode_backward_weights_second::Arrays { segments, partial, grad_weights };
-    let constants = decode_backward_weights_second::Constants { offsets: 9 };
-    twin(decode_backward_weights_second::Kernel, &gpu, constants, case, (), offsets * SECOND_VEC4);
+    let constants = decode_backward_weights_second::Constants { offsets: 9, lanes: 16 };
+    let threads = offsets * sum_threads(SECOND_VEC4, 16);
+    twin(decode_backward_weights_second::Kernel, &gpu, constants, case, (), threads);
 }
 
 struct Results {

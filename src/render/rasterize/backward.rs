@@ -170,7 +170,7 @@ pub struct Backward {
 
 /// Subgroups of a wide tile's workgroup: its shared memory has room for the sums of each.
 pub(super) fn subgroups(gpu: &Gpu) -> u32 {
-    (Tiling::Wide.threads() / gpu.info().subgroup_size).max(1)
+    (Tiling::Wide.threads_backward() / gpu.info().subgroup_size).max(1)
 }
 
 impl Backward {
@@ -219,7 +219,7 @@ impl Backward {
         let Method { tiling, alpha_min, transmittance_min, .. } = method.into();
         let size = picture.size;
         let grid = tiling.grid(size);
-        let threads = [grid[0] * tiling.threads(), grid[1], 1];
+        let threads = [grid[0] * tiling.threads_backward(), grid[1], 1];
         // Depth has gradients where the picture has it, the scratch is there for them, and a loss looks at it.
         let maps = picture.depth.as_ref().zip(gradient.depth).filter(|_| self.grad_depth.is_some());
         let left = maps.and(picture.transmittance.as_ref().zip(gradient.transmittance));

@@ -173,6 +173,7 @@ fn backward_matches_its_twin() {
                 let push = rasterize_backward::Push { size, tiles_x: grid[0] };
                 let constants = rasterize_backward::Constants { alpha_min, transmittance_min, subgroups };
                 let kernel = rasterize_backward::Kernel::from(tiling.form());
+                let threads = [grid[0] * tiling.threads_backward(), grid[1], 1];
                 testing::assert_twin_with(kernel, &gpu, constants, case, push, threads);
             }
         }
