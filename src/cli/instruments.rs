@@ -4,6 +4,7 @@ use std::path::Path;
 
 use image::{GrayImage, RgbImage};
 use indicatif::{ProgressBar, ProgressStyle};
+use rayon::prelude::*;
 
 use super::{index, pictures};
 use crate::config::Settings;
@@ -74,12 +75,17 @@ pub(super) fn measure(
     let mut renderer = Renderer::of(gpu, &model, &settings.render)?;
     let style = ProgressStyle::with_template("judging {wide_bar} {pos}/{len} views, {eta} left")?;
     let bar = ProgressBar::new((scene.train.len() + scene.test.len()) as u64).with_style(style);
+    // As many views at a time as there are threads: the device draws them, and the threads make and compare pictures.
+    let threads = rayon::current_num_threads();
     let mut draw = |views: &[View]| -> anyhow::Result<Vec<Drawn>> {
-        let mut one = |view: &View| {
+        let mut all = Vec::with_capacity(views.len());
+        for some in views.chunks(threads) {
             go_on()?;
-            Ok(Drawn::new(&renderer.render(&view.camera)?))
-        };
-        views.iter().map(|view| one(view).inspect(|_| bar.inc(1))).collect()
+            let rendered = some.iter().map(|view| renderer.render(&view.camera)).collect::<Result<Vec<_>, _>>()?;
+            all.par_extend(rendered.par_iter().map(Drawn::new));
+            bar.inc(some.len() as u64);
+        }
+        Ok(all)
     };
     let (train, test) = (draw(&scene.train)?, draw(&scene.test)?);
     bar.finish_and_clear();
@@ -89,16 +95,23 @@ pub(super) fn measure(
     let known = pairs().filter_map(|(drawn, view)| Some((&drawn.surface, view.depth.as_deref()?, view.mask.as_ref())));
     let factor = hole::unit(known).filter(|factor| (factor - 1.0).abs() > SAME_UNIT);
     let (mut judging, mut seen) = (judge.start(), vec![]);
-    for (drawn, view) in pairs() {
+    for some in pairs().collect::<Vec<_>>().chunks(threads) {
         go_on()?;
-        let map = seen_map(drawn.shown(view), &shown);
-        let metrics = judging.add(&view.name, &drawn.picture, &view.image, view.mask.as_ref(), Some(&map))?;
-        metrics.fitted = fitted(scene, view, &drawn.picture)?;
-        if let (Some(depth), Some(mask)) = (&view.depth, &view.mask) {
-            let depth: Vec<f32> = depth.iter().map(|z| z * factor.unwrap_or(1.0) as f32).collect();
-            metrics.geometry = hole::geometry(&drawn.surface, &depth, mask);
+        let compare = |(drawn, view): &(&Drawn, &View)| {
+            let map = seen_map(drawn.shown(view), &shown);
+            let mut metrics = judge.compare(&drawn.picture, &view.image, view.mask.as_ref(), Some(&map))?;
+            metrics.fitted = fitted(scene, view, &drawn.picture)?;
+            if let (Some(depth), Some(mask)) = (&view.depth, &view.mask) {
+                let depth: Vec<f32> = depth.iter().map(|z| z * factor.unwrap_or(1.0) as f32).collect();
+                metrics.geometry = hole::geometry(&drawn.surface, &depth, mask);
+            }
+            Ok((map, metrics))
+        };
+        let compared = some.par_iter().map(compare).collect::<Result<Vec<_>, evaluate::Error>>()?;
+        for ((drawn, view), (map, metrics)) in some.iter().zip(compared) {
+            judging.take(&view.name, metrics, [&drawn.picture, &view.image], view.mask.as_ref());
+            seen.push(map);
         }
-        seen.push(map);
     }
     go_on()?;
     let mut report = judging.report().with_residues(residues(scene, &train, &shown));
@@ -127,5 +140,5 @@ fn residues(scene: &Scene, train: &[Drawn], shown: &[Shown<'_>]) -> Vec<Residue>
         let residue = hole::residue(&train[at].picture, &view.image, &background, mask)?;
         Some(Residue { name: view.name.clone(), residue })
     };
-    (0..train.len()).filter_map(of).collect()
+    (0..train.len()).into_par_iter().filter_map(of).collect()
 }

@@ -156,9 +156,21 @@ impl Judging<'_> {
         seen: Option<&GrayImage>,
     ) -> Result<&mut Metrics, Error> {
         let metrics = self.judge.compare(rendered, truth, mask, seen)?;
+        Ok(self.take(name, metrics, [rendered, truth], mask))
+    }
+
+    /// Takes a view with its figures: those of [`Judge::compare`] of its rendered picture and photograph, which views may be
+    /// given to beside one another.
+    pub fn take(
+        &mut self,
+        name: &str,
+        metrics: Metrics,
+        pictures: [&RgbImage; 2],
+        mask: Option<&GrayImage>,
+    ) -> &mut Metrics {
         if let Some(inception) = &self.judge.inception {
             let cut = mask.and_then(|mask| self.judge.cut(mask));
-            for (i, picture) in [rendered, truth].into_iter().enumerate() {
+            for (i, picture) in pictures.into_iter().enumerate() {
                 self.full[i].push(inception.features(picture));
                 if let Some([x, y, width, height]) = cut {
                     let part = image::imageops::crop_imm(picture, x, y, width, height).to_image();
@@ -167,7 +179,7 @@ impl Judging<'_> {
             }
         }
         self.views.push(ViewMetrics { name: name.to_owned(), metrics });
-        Ok(&mut self.views.last_mut().expect("one was just added").metrics)
+        &mut self.views.last_mut().expect("one was just added").metrics
     }
 
     /// The figures of all views.

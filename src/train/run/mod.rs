@@ -15,7 +15,7 @@ use crate::primitives::finite::NOT_FINITE;
 use crate::primitives::limit::{COUNTERS, Counter};
 use crate::render::forward::Capacity;
 use crate::render::view::Rendered;
-use crate::scene::Scene;
+use crate::scene::{Scene, View};
 use crate::train::begin;
 use crate::train::checkpoint::{self, History, LastFigures, Model, Owner, State};
 use crate::train::order::Order;
@@ -23,8 +23,10 @@ use crate::train::photographs::{self, Photograph};
 use crate::train::plan::Plan;
 use crate::train::step::{Rates, Step};
 pub use error::Error;
+use image::RgbImage;
 use observer::StepsLeft;
 pub use observer::{Observer, Progress, Silent, Summary};
+use rayon::prelude::*;
 use serde::Serialize;
 use std::cell::OnceCell;
 use std::collections::VecDeque;
@@ -778,13 +780,16 @@ impl<'a> Run<'a> {
         if views.is_empty() {
             return Ok(None);
         }
-        let mut figures = vec![];
+        let mut pictures = vec![];
         self.step.draw(views.iter().map(|v| &v.camera), |i, rendered| {
-            let view = &views[i];
-            let metrics = evaluate::compare(&rendered.to_rgb8(), &view.image, view.mask.as_ref())?;
-            figures.push(ViewMetrics { name: view.name.clone(), metrics });
-            look(&view.name, &rendered)
+            pictures.push(rendered.to_rgb8());
+            look(&views[i].name, &rendered)
         })?;
+        let compare = |(view, picture): (&View, &RgbImage)| {
+            let metrics = evaluate::compare(picture, &view.image, view.mask.as_ref())?;
+            Ok(ViewMetrics { name: view.name.clone(), metrics })
+        };
+        let figures = views.par_iter().zip(&pictures).map(compare).collect::<Result<Vec<_>, evaluate::Error>>()?;
         Ok(Some(Report::new(figures)))
     }
 }
