@@ -22,12 +22,8 @@ impl Step {
         if self.statistics.is_none() && matches!(self.learnt, Learnt::Anchors { .. }) {
             return Ok(String::new());
         }
-        let gpu = self.gpu.clone();
-        // Plain Gaussians have room for all that come: nothing of the step changes but them.
-        if matches!(self.learnt, Learnt::Gaussians(_)) {
-            return gpu.stage(stage::GROWTH, || self.grow_and_prune(step));
-        }
         self.release();
+        let gpu = self.gpu.clone();
         let text = gpu.stage(stage::GROWTH, || self.grow_and_prune(step))?;
         self.furnish()?;
         Ok(text)
