@@ -7,10 +7,13 @@
 // variant fixed: FIXED_OFFSET FIXED_SCALING
 //
 // Back through the activations of the Gaussians that exist: gradients of offsets and log-scales, and of the second layer's
-// outputs. Those that touch no tile have none, but what is not a number among their values becomes one. One thread per visible anchor.
+// outputs. Those that touch no tile have none, but what is not a number among their values becomes one. A thread per visible
+// anchor; or, on GPUs, one for each of its Gaussians: those of neighbours write neighbouring outputs, and what they add up for the
+// anchor is added in their order, as by one thread.
 // The variants leave out the gradients of offsets or of log-scales that are not trained.
 layout(local_size_x = 64) in;
 layout(constant_id = 0) const uint OFFSETS = 10u; // Gaussians per anchor
+layout(constant_id = 1) const uint EACH = 0u;     // anchors of a workgroup with a thread for each Gaussian, at most 64 / OFFSETS; 0: a thread an anchor
 #include "thread.glsl"
 #include "model.glsl"
 #include "decoder.glsl"
@@ -44,64 +47,94 @@ layout(push_constant, scalar) uniform Push {
   float above; // Gaussians with an opacity above this exist
 } push;
 void put(uint from, uint row, float value) { grad_output[from + row / 4u][row % 4u] = value; }
-void main() {
-  uint v = thread_index(), n = groups[3];
-  float above = push.above;
-  if (v >= n) return;
-  uint anchor = visible[v], l = 6u * anchor, rows = head_row(3u, OFFSETS), to = v * (rows / 4u);
-  uint color_row = head_row(1u, OFFSETS), cov_row = head_row(2u, OFFSETS);
-#if !defined(FIXED_OFFSET) || !defined(FIXED_SCALING)
-  vec3 spread = exp_saturated(vec3(log_scaling[l], log_scaling[l + 1u], log_scaling[l + 2u]));
-#endif
-  vec3 size = exp_saturated(vec3(log_scaling[l + 3u], log_scaling[l + 4u], log_scaling[l + 5u]));
 #ifndef FIXED_SCALING
-  vec3 grad_spread = vec3(0.0), grad_size = vec3(0.0);
+vec3 grad_spread = vec3(0.0), grad_size = vec3(0.0);
+shared float s_sums[64u * 6u];
 #endif
-  for (uint k = 0u; k < OFFSETS; ++k) {
-    // Each thread goes on to its own next one that exists: of threads that run in step the loop then lasts as long as the
-    // most that any of them has, not K.
-    float o = 0.0;
-    while (k < OFFSETS && !((o = opacity[k * n + v]) > above)) ++k;
-    if (k >= OFFSETS) break;
-    uint slot = k * n + v;
-    bool has = drawn[slot] != 0u;
+
+// Of Gaussian k of visible anchor v, of opacity o.
+void back(uint v, uint n, uint anchor, uint k, float o, vec3 spread, vec3 size) {
+  uint rows = head_row(3u, OFFSETS), to = v * (rows / 4u), color_row = head_row(1u, OFFSETS), cov_row = head_row(2u, OFFSETS);
+  uint slot = k * n + v;
+  bool has = drawn[slot] != 0u;
 #if !defined(FIXED_OFFSET) || !defined(FIXED_SCALING)
-    vec3 gp = has ? grad_position[slot] : vec3(0.0);
+  vec3 gp = has ? grad_position[slot] : vec3(0.0);
 #endif
 #ifndef FIXED_OFFSET
-    grad_offset[anchor * OFFSETS + k] = gp * spread;
+  grad_offset[anchor * OFFSETS + k] = gp * spread;
 #endif
 #ifndef FIXED_SCALING
-    // By the displacement, which is finite where there is a Gaussian: the gradient of an offset of 0 may overflow, this not.
-    grad_spread += gp * (offset[anchor * OFFSETS + k] * spread);
+  // By the displacement, which is finite where there is a Gaussian: the gradient of an offset of 0 may overflow, this not.
+  grad_spread += gp * (offset[anchor * OFFSETS + k] * spread);
 #endif
-    put(to, k, (has ? grad_opacity[slot] : 0.0) * ((1.0 - o) * (1.0 + o)));
-    vec3 c = color[slot], gc = (has ? grad_color[slot] : vec3(0.0)) * c * (1.0 - c);
-    put(to, color_row + 3u * k, gc.x);
-    put(to, color_row + 3u * k + 1u, gc.y);
-    put(to, color_row + 3u * k + 2u, gc.z);
-    vec3 s = scale[slot], gs = (has ? grad_scale[slot] : vec3(0.0)) * s;
+  put(to, k, (has ? grad_opacity[slot] : 0.0) * ((1.0 - o) * (1.0 + o)));
+  vec3 c = color[slot], gc = (has ? grad_color[slot] : vec3(0.0)) * c * (1.0 - c);
+  put(to, color_row + 3u * k, gc.x);
+  put(to, color_row + 3u * k + 1u, gc.y);
+  put(to, color_row + 3u * k + 2u, gc.z);
+  vec3 s = scale[slot], gs = (has ? grad_scale[slot] : vec3(0.0)) * s;
 #ifndef FIXED_SCALING
-    grad_size += gs;
+  grad_size += gs;
 #endif
-    // The sigmoid is scale / size; of a size that underflowed to 0 the scale and its gradient are 0.
-    gs *= 1.0 - s / max(size, vec3(1e-37));
-    vec4 q = rotation[slot], gq = has ? grad_rotation[slot] : vec4(0.0);
-    float norm = rotation_norm[slot];
-    gq = norm < 1e-12 ? gq / 1e-12 : (gq - q * dot(q, gq)) / norm;
-    uint row = cov_row + 7u * k;
-    put(to, row, gs.x);
-    put(to, row + 1u, gs.y);
-    put(to, row + 2u, gs.z);
-    put(to, row + 3u, gq.x);
-    put(to, row + 4u, gq.y);
-    put(to, row + 5u, gq.z);
-    put(to, row + 6u, gq.w);
+  // The sigmoid is scale / size; of a size that underflowed to 0 the scale and its gradient are 0.
+  gs *= 1.0 - s / max(size, vec3(1e-37));
+  vec4 q = rotation[slot], gq = has ? grad_rotation[slot] : vec4(0.0);
+  float norm = rotation_norm[slot];
+  gq = norm < 1e-12 ? gq / 1e-12 : (gq - q * dot(q, gq)) / norm;
+  uint row = cov_row + 7u * k;
+  put(to, row, gs.x);
+  put(to, row + 1u, gs.y);
+  put(to, row + 2u, gs.z);
+  put(to, row + 3u, gq.x);
+  put(to, row + 4u, gq.y);
+  put(to, row + 5u, gq.z);
+  put(to, row + 6u, gq.w);
+}
+
+vec3 lengths(uint l) {
+  return exp_saturated(vec3(log_scaling[l], log_scaling[l + 1u], log_scaling[l + 2u]));
+}
+
+void main() {
+  uint n = groups[3];
+  float above = push.above;
+  if (EACH == 0u) {
+    uint v = thread_index();
+    if (v >= n) return;
+    uint anchor = visible[v];
+    vec3 spread = lengths(6u * anchor), size = lengths(6u * anchor + 3u);
+    for (uint k = 0u; k < OFFSETS; ++k) {
+      // Each thread goes on to its own next one that exists: of threads that run in step the loop then lasts as long as the
+      // most that any of them has, not K.
+      float o = 0.0;
+      while (k < OFFSETS && !((o = opacity[k * n + v]) > above)) ++k;
+      if (k >= OFFSETS) break;
+      back(v, n, anchor, k, o, spread, size);
+    }
+#ifndef FIXED_SCALING
+    for (uint i = 0u; i < 3u; ++i) {
+      grad_log_scaling[6u * anchor + i] = grad_spread[i];
+      grad_log_scaling[6u * anchor + 3u + i] = grad_size[i];
+    }
+#endif
+  } else {
+    uint t = gl_LocalInvocationID.x, a = t / OFFSETS, k = t % OFFSETS, v = group_index() * EACH + a;
+    bool some = a < EACH && v < n;
+    uint anchor = some ? visible[v] : 0u;
+    float o = some ? opacity[k * n + v] : 0.0;
+    if (some && o > above) back(v, n, anchor, k, o, lengths(6u * anchor), lengths(6u * anchor + 3u));
+#ifndef FIXED_SCALING
+    for (uint i = 0u; i < 3u; ++i) {
+      s_sums[6u * t + i] = grad_spread[i];
+      s_sums[6u * t + 3u + i] = grad_size[i];
+    }
+    barrier();
+    if (!some) return;
+    for (uint i = k; i < 6u; i += OFFSETS) {
+      float sum = 0.0;
+      for (uint j = 0u; j < OFFSETS; ++j) sum += s_sums[6u * (a * OFFSETS + j) + i];
+      grad_log_scaling[6u * anchor + i] = sum;
+    }
+#endif
   }
-#ifndef FIXED_SCALING
-  for (uint i = 0u; i < 3u; ++i) {
-    grad_log_scaling[l + i] = grad_spread[i];
-    grad_log_scaling[l + 3u + i] = grad_size[i];
-  }
-#endif
 }

@@ -214,6 +214,11 @@ impl Reference for decode_backward_weights_second::Kernel {
     }
 }
 
+/// Anchors whose Gaussians a workgroup has a thread for each of; 0 where they are too many for one.
+pub(super) fn each(offsets: u32) -> u32 {
+    64 / offsets
+}
+
 /// Threads that share a vec4's sum over chunks: a GPU has more threads than there are sums, a CPU has not.
 pub(super) fn sum_lanes(form: Form) -> u32 {
     if form == Form::Gpu { 16 } else { 1 }
@@ -312,7 +317,9 @@ impl DecodeBackward {
             grad_output,
         };
         let push = decode_backward::Push { above: forward.above };
-        rec.run_with(decode_backward::Kernel, decode_backward::Constants { offsets }, buffers, push, groups);
+        let each = if forward.form == Form::Gpu { each(offsets) } else { 0 };
+        let groups = if each > 0 { &forward.per_gaussian } else { groups };
+        rec.run_with(decode_backward::Kernel, decode_backward::Constants { offsets, each }, buffers, push, groups);
         if to.feature.is_none() && to.weights.is_none() {
             return;
         }

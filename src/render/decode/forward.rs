@@ -1,5 +1,6 @@
 //! The forward stage and its twins.
 
+use super::backward::each;
 use super::*;
 use crate::gpu::kernels::render::{
     decode, decode_backward_feature, decode_backward_first, decode_backward_hidden, decode_hidden, decode_input,
@@ -200,6 +201,7 @@ pub struct Decode {
     pub(super) per_hidden_backward: Groups,
     pub(super) per_feature: Groups,
     pub(super) per_first: Groups,
+    pub(super) per_gaussian: Groups,
     pub(super) per_listed: Groups,
     pub(super) per_second: Groups,
     pub(super) layout: Layout,
@@ -245,8 +247,8 @@ impl Decode {
             ]
             .map(|[threads, ..]| threads)
         };
-        let shapes = [GROUP, hidden, GROUP, GROUP, back, feature, first];
-        let [per_anchor, per_hidden, per_opacity, per_flag, per_hidden_backward, per_feature, per_first] =
+        let shapes = [GROUP, hidden, GROUP, GROUP, back, feature, first, GROUP];
+        let [per_anchor, per_hidden, per_opacity, per_flag, per_hidden_backward, per_feature, per_first, per_gaussian] =
             dispatch::several(gpu, "anchor groups", shapes)?;
         let [per_existing, per_listed, per_second] = dispatch::several(gpu, "listed groups", [GROUP; 3])?;
         Ok(Self {
@@ -276,6 +278,7 @@ impl Decode {
             per_hidden_backward,
             per_feature,
             per_first,
+            per_gaussian,
             per_listed,
             per_second,
             layout,
@@ -312,6 +315,7 @@ impl Decode {
             (&self.per_hidden_backward, parts(&self.per_hidden_backward, HEADS as u32)),
             (&self.per_feature, parts(&self.per_feature, 1)),
             (&self.per_first, of(BLOCK as u32, self.per_first.group)),
+            (&self.per_gaussian, of(each(offsets).max(1), GROUP)),
         ];
         dispatch::record_several(rec, visible_count, self.capacity, shapes);
     }

@@ -1,7 +1,7 @@
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
 
-use super::backward::{chunks, listed_chunks, sum_threads};
+use super::backward::{chunks, each, listed_chunks, sum_threads};
 use super::*;
 use crate::gpu::Reference;
 use crate::gpu::kernels::render::{
@@ -192,16 +192,26 @@ fn kernels_match_their_twins() {
             grad_log_scaling: Some(vec![testing::UNWRITTEN; m.log_scaling.len()]),
             grad_output: vec![[0.0; 4]; count * layout.rows() / 4 + 3],
         };
-        let constants = decode_backward::Constants { offsets: k };
         let push = decode_backward::Push { above };
         let c = case.clone();
         let fixed_offset = decode_backward::Arrays { grad_offset: None, ..c.clone() };
         let fixed_scaling = decode_backward::Arrays { offset: None, grad_log_scaling: None, ..c };
         let fixed = decode_backward::Arrays { grad_position: None, grad_offset: None, ..fixed_scaling.clone() };
-        for case in [fixed_offset, fixed_scaling, fixed] {
-            twin(decode_backward::Kernel, &gpu, constants, case, push, count);
-        }
-        let grad_output = twin(decode_backward::Kernel, &gpu, constants, case, push, count).grad_output;
+        // A thread an anchor, and one a Gaussian: the same sums.
+        let [grad_output, same] = [0, each(k)].map(|each| {
+            let constants = decode_backward::Constants { offsets: k, each };
+            let threads = if each == 0 { count } else { count.div_ceil(each as usize) * 64 };
+            for case in [&fixed_offset, &fixed_scaling, &fixed] {
+                twin(decode_backward::Kernel, &gpu, constants, case.clone(), push, threads);
+            }
+            let got = twin(decode_backward::Kernel, &gpu, constants, case.clone(), push, threads);
+            (
+                got.grad_output,
+                got.grad_log_scaling.expect("the case has it").iter().map(|v| v.to_bits()).collect::<Vec<_>>(),
+            )
+        });
+        assert!(grad_output.1 == same.1, "so many threads, another sum");
+        let (grad_output, _) = grad_output;
         let case = decode_backward_hidden::Arrays {
             groups: m.counted(),
             packed: packed.clone(),
