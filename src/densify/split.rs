@@ -6,15 +6,17 @@
 //! variance; its opacity is such that they take as much of a picture as it did (`half`). Which ones are split is drawn by
 //! opacity times deviation along that axis: the large ones that are seen leave the most to be told. (By the positions'
 //! gradients, one capture came out 0.4 dB worse with one seed.) Halves begin without a first moment and keep the second one,
-//! the pace of the one. It happens on the host, between steps, an array at a time, and depends on the model, the seed and the
-//! step alone.
+//! the pace of the one. It happens on the host, between steps, with the rows that change alone, and depends on the model, the
+//! seed and the step alone.
 
 use glam::{DMat3, DQuat};
 use rand::RngExt as _;
 use rand_pcg::Pcg64;
+use rayon::prelude::*;
 
 use super::Config;
-use crate::gpu::{Error, Gpu};
+use crate::gpu::kernels::densify::{prune_gather, split_scatter};
+use crate::gpu::{Buffer, Error, Gpu, Reference};
 use crate::model::gaussians::{NORM_EPSILON, Static, sigmoid};
 
 /// The seed of a round's random numbers.
@@ -60,8 +62,12 @@ fn draw(weights: &[f64], most: usize, round: Round) -> Vec<usize> {
     let mut generator = Pcg64::new(u128::from(round.seed) << 32 | u128::from(round.step), STREAM);
     let keys: Vec<f64> = weights.iter().map(|weight| generator.random::<f64>().ln() / weight).collect();
     let mut chosen: Vec<usize> = (0..weights.len()).filter(|i| weights[*i] > 0.0 && weights[*i].is_finite()).collect();
-    chosen.sort_by(|a, b| keys[*b].total_cmp(&keys[*a]));
-    chosen.truncate(most);
+    let first = |a: &usize, b: &usize| keys[*b].total_cmp(&keys[*a]).then(a.cmp(b));
+    if most < chosen.len() {
+        chosen.select_nth_unstable_by(most, first);
+        chosen.truncate(most);
+    }
+    chosen.sort_unstable_by(first);
     chosen
 }
 
@@ -75,7 +81,7 @@ pub const GROWTH: f64 = 0.05;
 /// `target`.
 fn splits(gpu: &Gpu, gaussians: &Static, faded: f64, target: usize, round: Round) -> Result<Vec<Split>, Error> {
     let count = gaussians.count;
-    let opacity: Vec<f64> = gaussians.logit.read(gpu, count)?.into_iter().map(sigmoid).collect();
+    let opacity: Vec<f64> = gaussians.logit.read(gpu, count)?.into_par_iter().map(sigmoid).collect();
     let log_scale = gaussians.log_scale.read(gpu, count)?;
     let quaternion = gaussians.quaternion.read(gpu, count)?;
     let longest = |i: usize| -> (usize, f64) {
@@ -84,7 +90,7 @@ fn splits(gpu: &Gpu, gaussians: &Static, faded: f64, target: usize, round: Round
         (axis, f64::from(of[axis]).exp())
     };
     let weight = |i: usize| if opacity[i] < faded { 0.0 } else { opacity[i] * longest(i).1 };
-    let weights: Vec<f64> = (0..opacity.len()).map(weight).collect();
+    let weights: Vec<f64> = (0..opacity.len()).into_par_iter().map(weight).collect();
     let places: Vec<usize> = (0..opacity.len()).filter(|i| opacity[*i] < faded).chain(opacity.len()..target).collect();
     let split = |(source, place): (usize, usize)| {
         let (axis, deviation) = longest(source);
@@ -98,15 +104,23 @@ fn splits(gpu: &Gpu, gaussians: &Static, faded: f64, target: usize, round: Round
     Ok(draw(&weights, places.len(), round).into_iter().zip(places).map(split).collect())
 }
 
-/// Makes two rows of one in each of the splits: values and both moments of the parameter at `which` of
-/// [`Static::parameters`].
+impl Reference for split_scatter::Kernel {
+    fn reference(host: split_scatter::Host<'_>, push: split_scatter::Push, (): ()) {
+        let width = push.width as usize;
+        for (row, &place) in host.from.chunks(width).zip(&host.places[..push.rows as usize]) {
+            host.to[place as usize * width..][..width].copy_from_slice(row);
+        }
+    }
+}
+
+/// Makes two rows of one: of each of the splits a row of the parameter at `which` of [`Static::parameters`], values and both
+/// moments, and behind them as many more, the other halves.
 fn apply(splits: &[Split], tensors: &mut [Vec<f32>; 3], width: usize, which: usize) {
-    for Split { source, place, axis, shift, logit } in splits {
-        let row = |i: usize| i * width..(i + 1) * width;
-        tensors[1][row(*source)].fill(0.0);
-        tensors.iter_mut().for_each(|tensor| tensor.copy_within(row(*source), place * width));
-        for (i, side) in [(*source, 1.0), (*place, -1.0)] {
-            let half = &mut tensors[0][row(i)];
+    tensors[1].fill(0.0);
+    tensors.iter_mut().for_each(|tensor| tensor.extend_from_within(..));
+    let (sources, places) = tensors[0].split_at_mut(splits.len() * width);
+    for (halves, side) in [(sources, 1.0), (places, -1.0)] {
+        for (half, Split { axis, shift, logit, .. }) in halves.chunks_mut(width).zip(splits) {
             match which {
                 POSITION => half.iter_mut().zip(shift).for_each(|(v, by)| *v = (f64::from(*v) + side * by) as f32),
                 LOG_SCALE => half[*axis] += DEVIATION.ln() as f32,
@@ -115,6 +129,28 @@ fn apply(splits: &[Split], tensors: &mut [Vec<f32>; 3], width: usize, which: usi
             }
         }
     }
+}
+
+/// Rows of a parameter's buffer on the host.
+fn rows(gpu: &Gpu, buffer: &Buffer<f32>, at: &Buffer<u32>, width: u32) -> Result<Vec<f32>, Error> {
+    let rows = at.len() as u32;
+    let words = rows as usize * width as usize;
+    let found: Buffer<u32> = gpu.buffer("split_rows", words)?;
+    let mut rec = gpu.recorder()?;
+    let buffers = prune_gather::Buffers { kept: at, from: &buffer.view(), to: &found };
+    rec.run(prune_gather::Kernel, buffers, prune_gather::Push { rows, width }, words);
+    rec.submit()?.wait()?;
+    gpu.read(&found.view())
+}
+
+/// Puts rows into a parameter's buffer.
+fn put(gpu: &Gpu, buffer: &Buffer<f32>, at: &Buffer<u32>, width: u32, values: &[f32]) -> Result<(), Error> {
+    let from: Buffer<f32> = gpu.upload("split_rows", values)?;
+    let mut rec = gpu.recorder()?;
+    let buffers = split_scatter::Buffers { places: at, from: &from.view(), to: &buffer.view() };
+    rec.run(split_scatter::Kernel, buffers, split_scatter::Push { rows: at.len() as u32, width }, values.len());
+    rec.submit()?.wait()?;
+    Ok(())
 }
 
 /// Splits Gaussians into the places of those that have faded below `config.min_opacity`, and into new ones: [`GROWTH`] of
@@ -131,13 +167,18 @@ pub fn run(gpu: &Gpu, gaussians: &mut Static, config: &Config, round: Round) -> 
     // Places come in ascending order.
     let Some(last) = splits.last().map(|split| split.place) else { return Ok(0) };
     let now = count.max(last + 1);
+    let sources: Vec<u32> = splits.iter().map(|split| split.source as u32).collect();
+    let places = splits.iter().map(|split| split.place as u32);
+    let both = gpu.upload("split_places", &sources.iter().copied().chain(places).collect::<Vec<_>>())?;
+    let sources = gpu.upload("split_sources", &sources)?;
     for (which, parameter) in gaussians.parameters().into_iter().enumerate() {
-        let width = parameter.width as usize;
-        let [value, first, root] = parameter.tensors().map(|tensor| gpu.read_range(tensor, count * width));
+        let width = parameter.width;
+        let [value, first, root] = parameter.tensors().map(|tensor| rows(gpu, tensor, &sources, width));
         let mut tensors = [value?, first?, root?];
-        tensors.iter_mut().for_each(|tensor| tensor.resize(now * width, 0.0));
-        apply(&splits, &mut tensors, width, which);
-        parameter.tensors().into_iter().zip(&tensors).try_for_each(|(to, tensor)| gpu.write(to, tensor))?;
+        apply(&splits, &mut tensors, width as usize, which);
+        for (to, tensor) in parameter.tensors().into_iter().zip(&tensors) {
+            put(gpu, to, &both, width, tensor)?;
+        }
     }
     gaussians.count = now as u32;
     Ok(splits.iter().filter(|split| split.place < count).count() as u32)
@@ -228,6 +269,20 @@ mod tests {
             assert!(differ < color * opacity * most(opacity) + 0.01, "{opacity}: {differ}");
             let ratio = sum(&halves) / sum(&whole);
             assert!((ratio - 1.0).abs() < 0.01, "{opacity}: {ratio}");
+        }
+    }
+
+    #[test]
+    fn rows_are_put_in_their_places() {
+        let gpu = testing::gpu();
+        for (rows, width) in [(0, 3), (1, 1), (21, 3), (64, 4), (100, 12)] {
+            let case = split_scatter::Arrays {
+                places: (0..rows as u32).map(|row| 2 * row + 1).collect(),
+                from: (0..(rows * width) as u32).collect(),
+                to: vec![0xdead_beef; (2 * rows + 2) * width],
+            };
+            let push = split_scatter::Push { rows: rows as u32, width: width as u32 };
+            testing::assert_twin(split_scatter::Kernel, &gpu, case, push, rows * width);
         }
     }
 
