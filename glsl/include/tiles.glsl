@@ -66,3 +66,10 @@ ivec2 support_columns(Support s, vec2 mean, int row, int tile, ivec2 tiles) {
   int c1 = min(int(floor((x1 - 0.5) / float(tile))), tiles.x - 1);
   return ivec2(c0, c1);
 }
+
+// Where long lists are cut: before every CUT-th place of all tiles' lists in a row. A cut inside a tile's list has a number, its place
+// divided by CUT, and the state of the tile's 256 pixels there, plane by plane: colour, transmittance (-1 for a pixel that is
+// finished, or beside the picture), depth. The way back begins at every one of them at once.
+const uint CUT = 512u;
+const uint CUT_PLANES = 5u;
+uint cut_state_at(uint cut, uint plane, uint pixel) { return (cut * CUT_PLANES + plane) * 256u + pixel; }

@@ -32,6 +32,7 @@ layout(binding = 9, scalar) writeonly buffer DepthMap { float depth_map[]; };   
 #ifndef NO_TRANSMITTANCE
 layout(binding = 10, scalar) writeonly buffer Transmittance { float transmittance[]; }; // [pixel] what is left of the background
 #endif
+layout(binding = 11, scalar) writeonly buffer CutState { float cut_state[]; };  // [cut, 5, 256] the tile's pixels before each cut in its list
 layout(push_constant, scalar) uniform Push {
   uvec2 size;      // picture, px
   uint tiles_x;    // tiles in x
@@ -81,6 +82,18 @@ shared float s_depth[BATCH];
 #endif
 shared uint s_live;
 
+// What the way back begins with at a cut.
+void put_cut(uint cut, uint t) {
+  [[unroll]] for (uint r = 0u; r < ROWS; r++) {
+    uint p = (t / TILE * ROWS + r) * TILE + t % TILE;
+    [[unroll]] for (uint c = 0u; c < 3u; c++) cut_state[cut_state_at(cut, c, p)] = live[r] ? sum_rgb[r][c] : 0.0;
+    cut_state[cut_state_at(cut, 3u, p)] = live[r] ? T[r] : -1.0;
+#ifndef COLOR_ONLY
+    cut_state[cut_state_at(cut, 4u, p)] = live[r] ? sum_z[r] : 0.0;
+#endif
+  }
+}
+
 void main() {
   uint tile = gl_WorkGroupID.y * push.tiles_x + gl_WorkGroupID.x;
   uint t = gl_LocalInvocationID.x, band = 1u << (t / TILE);
@@ -95,11 +108,15 @@ void main() {
     live[r] = first.x < push.size.x && first.y + r < push.size.y;
   }
   uvec2 range = ranges[tile];
-  for (uint base = range.x; base < range.y; base += BATCH) {
+  // The first batch is as short as makes the others begin at multiples of their length: one begins at every cut.
+  uint n = BATCH - range.x % BATCH, cut = range.x / CUT + 1u;
+  for (uint base = range.x; base < range.y; base += n, n = BATCH) {
+    n = min(n, range.y - base);
     uint i = base + t;
+    if (base == cut * CUT) put_cut(cut++, t);
     if (t == 0u) s_live = 0u;
     barrier();
-    if (t < BATCH && i < range.y) {
+    if (t < n) {
       uint g = pair_slot[sorted[i]];
       s_mean[t] = mean[g];
       s_conic[t] = conic[g];
@@ -116,7 +133,6 @@ void main() {
     if (any_live) atomicOr(s_live, 1u);
     barrier();
     if (s_live == 0u) break;
-    uint n = min(BATCH, range.y - base);
     for (uint k = 0u; k < n; k++) {
       if ((s_bands[k] & band) == 0u) continue;
 #ifdef COLOR_ONLY
@@ -127,6 +143,8 @@ void main() {
     }
     barrier();
   }
+  // Where all are finished, they are at the cuts behind.
+  for (; cut * CUT < range.y; cut++) put_cut(cut, t);
   [[unroll]] for (uint r = 0u; r < ROWS; r++) {
     if (first.x < push.size.x && first.y + r < push.size.y) {
       uint p = (first.y + r) * push.size.x + first.x;

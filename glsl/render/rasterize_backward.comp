@@ -5,6 +5,8 @@
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_vote : require
 #extension GL_KHR_shader_subgroup_shuffle : require
+#include "thread.glsl"
+#include "tiles.glsl"
 // variant color: COLOR_ONLY
 // variant depth: NO_TRANSMITTANCE
 //
@@ -27,7 +29,8 @@
 // sums over the four, further bits add the subgroup's other fours, and lanes 0 to 3 put them down. Then thread t adds what
 // the subgroups put down of Gaussian t, in their order, and writes it to the pair's own number: nothing is added
 // atomically. A subgroup none of whose bands of rows a Gaussian reaches has no sums of it to make. Every pair of the list is written, also behind the last one blended.
-// `depth` is for losses on colour and depth, `color` for losses on colour alone.
+// A workgroup has a tile's list up to the first cut in it, or from a cut to the next: a picture does not wait for its longest
+// list. `depth` is for losses on colour and depth, `color` for losses on colour alone.
 #ifdef COLOR_ONLY
 #define NO_TRANSMITTANCE
 #else
@@ -61,6 +64,8 @@ layout(binding = 16, scalar) writeonly buffer PairDepth { float pair_depth[]; };
 layout(binding = 17, scalar) readonly buffer Transmittance { float transmittance[]; }; // [pixel] as rendered
 layout(binding = 18, scalar) readonly buffer GradTransmittance { float grad_transmittance[]; }; // [pixel]
 #endif
+layout(binding = 19, scalar) readonly buffer CutTile { uint cut_tile[]; };      // [cut] one more than the tile in whose list it lies, or 0; of cut 0 how many follow
+layout(binding = 20, scalar) readonly buffer CutState { float cut_state[]; };   // [cut, 5, 256] the tile's pixels there
 layout(push_constant, scalar) uniform Push {
   uvec2 size;   // picture, px
   uint tiles_x; // tiles in x
@@ -125,8 +130,6 @@ Sums sums_of(vec2 m, vec3 q, float o, vec3 c, float z) {
   return s;
 }
 
-#include "tiles.glsl"
-
 void write(uint p, vec3 q, Sums s) {
   float gx = q.x * s.first.x;
   pair_mean[p] = vec2(gx, q.z * s.first.y - q.y * gx);
@@ -182,9 +185,18 @@ Sums shared_sums(uint k, uint band) {
 }
 
 void main() {
-  uint tile = gl_WorkGroupID.y * push.tiles_x + gl_WorkGroupID.x;
+  // Tiles, and then cuts.
+  uint part = group_index(), tiles = push.tiles_x * ((push.size.y + TILE - 1u) / TILE), tile = part, cut = 0u;
+  if (part >= tiles) {
+    cut = part - tiles + 1u;
+    if (cut > cut_tile[0]) return;
+    tile = cut_tile[cut] - 1u;
+    if (tile >= tiles) return;
+  }
+  uvec2 range = ranges[tile], corner = uvec2(tile % push.tiles_x, tile / push.tiles_x) * TILE;
+  uint base = cut > 0u ? cut * CUT : range.x, last = min(range.y, (base / CUT + 1u) * CUT);
   uint t = gl_LocalInvocationID.x, band = 1u << (t / TILE);
-  uvec2 first = gl_WorkGroupID.xy * TILE + uvec2(t % TILE, t / TILE * ROWS);
+  uvec2 first = corner + uvec2(t % TILE, t / TILE * ROWS);
   pixel = vec2(first) + 0.5;
   [[unroll]] for (uint r = 0u; r < ROWS; r++) {
     T[r] = 1.0;
@@ -199,12 +211,19 @@ void main() {
 #ifndef NO_TRANSMITTANCE
     total += transmittance[p] * grad_transmittance[p];
 #endif
+    if (cut > 0u) {
+      uint at = (t / TILE * ROWS + r) * TILE + t % TILE;
+      T[r] = cut_state[cut_state_at(cut, 3u, at)];
+      live[r] = T[r] >= 0.0;
+      [[unroll]] for (uint c = 0u; c < 3u; c++) total -= cut_state[cut_state_at(cut, c, at)] * g_rgb[r][c];
+#ifdef WITH_DEPTH
+      total -= cut_state[cut_state_at(cut, 4u, at)] * g_z[r];
+#endif
+    }
     remaining[r] = total;
   }
-  uvec2 range = ranges[tile];
-  uint base = range.x;
-  for (; base < range.y; base += BATCH) {
-    uint n = min(BATCH, range.y - base);
+  for (; base < last; base += BATCH) {
+    uint n = min(BATCH, last - base);
     if (t == 0u) s_live = 0u;
     barrier();
     if (any_live()) atomicOr(s_live, 1u);
@@ -215,7 +234,7 @@ void main() {
       s_mean[t] = mean[g];
       s_conic[t] = conic[g];
       s_opacity[t] = some ? opacity[g] : 0.0;
-      float top = float(gl_WorkGroupID.y * TILE) + 0.5;
+      float top = float(corner.y) + 0.5;
       s_bands[t] = some ? support_bands(s_mean[t].y, s_conic[t].z, support_bound(s_opacity[t], ALPHA_MIN), top, ROWS, TILE / ROWS) : 0u;
       s_color[t] = color[g];
 #ifdef WITH_DEPTH
@@ -266,10 +285,10 @@ void main() {
     barrier();
   }
   // Behind the last Gaussian that any pixel of the tile can still see.
-  for (uint i = base + t; i < range.y; i += THREADS) write(sorted[i], vec3(0.0), NO_SUMS);
+  for (uint i = base + t; i < last; i += THREADS) write(sorted[i], vec3(0.0), NO_SUMS);
   // Pairs that were counted but touch no tile stand behind the last tile (see bin_expand): the gather reads them too.
-  if (tile == 0u) {
-    uvec2 none = ranges[gl_NumWorkGroups.x * gl_NumWorkGroups.y];
+  if (part == 0u) {
+    uvec2 none = ranges[tiles];
     for (uint i = none.x + t; i < none.y; i += THREADS) write(sorted[i], vec3(0.0), NO_SUMS);
   }
 }

@@ -181,7 +181,9 @@ pub(super) fn run_words(
 
 impl std::fmt::Display for Difference {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { pass, tensor, components, error, scale, cosine, norm_ratio, exceeded, allowed, worst, .. } = self;
+        let Self {
+            pass, tensor, components, error, scale, cosine, norm_ratio, exceeded, allowed, worst, vanished, ..
+        } = self;
         write!(
             f,
             "{pass:<36} {tensor:<24} {components:>10}  error {error:9.2e} of {scale:9.2e}  1-cos {:8.1e}  norm {norm_ratio:.6}",
@@ -189,6 +191,9 @@ impl std::fmt::Display for Difference {
         )?;
         if let Some((at, got, want)) = worst {
             write!(f, "  {exceeded} beyond (allowed {allowed}), worst [{at}] {got:e} instead of {want:e}")?;
+        }
+        if *vanished > 0 && !self.ok() {
+            write!(f, "  {vanished} are zero and should not be")?;
         }
         Ok(())
     }

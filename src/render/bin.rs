@@ -88,6 +88,11 @@ impl Reference for bin_ranges::Kernel {
     fn reference(host: bin_ranges::Host<'_>, (): (), (): ()) {
         let sorted = &host.sorted_tile[..host.pair_count[0] as usize];
         for (i, &tile) in sorted.iter().enumerate() {
+            match i {
+                0 => host.cut_tile[0] = (sorted.len() as u32 - 1) / CUT,
+                _ if !(i as u32).is_multiple_of(CUT) => {}
+                _ => host.cut_tile[i / CUT as usize] = if sorted[i - 1] == tile { tile + 1 } else { 0 },
+            }
             if i == 0 || sorted[i - 1] != tile {
                 host.ranges[tile as usize][0] = i as u32;
             }
@@ -160,6 +165,23 @@ pub struct Binned<'a> {
     pub ranges: &'a Buffer<[u32; 2]>,
     /// Where narrow tiles' pictures note what they are made of.
     pub blended: Option<Blended<'a>>,
+    /// Where wide tiles' long lists are cut.
+    pub cuts: Option<Cuts<'a>>,
+}
+
+/// Places of a cut in wide tiles' lists: the way back begins at all of them at once.
+pub const CUT: u32 = 512;
+/// Values of a cut: five of each of a tile's 256 pixels.
+pub const CUT_VALUES: usize = 5 * 256;
+
+/// The cuts of wide tiles' lists, before every [`CUT`]-th place of all lists in a row.
+#[derive(Clone, Copy)]
+pub struct Cuts<'a> {
+    /// `[cut]` one more than the tile that has pairs on both sides of it, or 0; the first says how many follow.
+    pub tile: &'a Buffer<u32>,
+    /// `[cut, 5, 256]` colour, transmittance (-1: finished) and depth of its pixels there, written by the forward and read by
+    /// the backward pass.
+    pub state: &'a Buffer<f32>,
 }
 
 /// The pairs of which a pixel took something, written by the forward and read by the backward pass of narrow tiles.
@@ -200,7 +222,7 @@ pub struct Bin {
 /// How pairs come into their tiles' lists.
 enum ByTile {
     /// A radix sort: any number of threads.
-    Sort { sort: Sort, groups: Groups },
+    Sort { sort: Sort, groups: Groups, cut_tile: Buffer<u32>, cut_state: Buffer<f32> },
     /// A counting sort with few threads, for CPUs.
     Tally(Tally),
 }
@@ -274,7 +296,13 @@ impl Bin {
             scan: Scan::new(gpu, slots)?,
             by_tile: match method.tiling {
                 Tiling::Wide => {
-                    ByTile::Sort { sort: Sort::new(gpu, pairs)?, groups: dispatch::groups(gpu, "pair_groups", 64)? }
+                    let cuts = pairs.div_ceil(CUT).max(1) as usize;
+                    ByTile::Sort {
+                        sort: Sort::new(gpu, pairs)?,
+                        groups: dispatch::groups(gpu, "pair_groups", 64)?,
+                        cut_tile: gpu.buffer("cut_tile", cuts)?,
+                        cut_state: gpu.buffer("cut_state", cuts * CUT_VALUES)?,
+                    }
                 }
                 Tiling::Narrow => ByTile::Tally(Tally::new(gpu, tiles, p)?),
             },
@@ -347,16 +375,18 @@ impl Bin {
         let constants = bin_expand::Constants { alpha_min, long };
         rec.run_with(bin_expand::Kernel, constants, buffers, bin_expand::Push { grid, tile }, drawn_groups);
         let last = grid[0] * grid[1];
-        let (sorted, blended) = match &self.by_tile {
-            ByTile::Sort { sort, groups } => {
+        let (sorted, blended, cuts) = match &self.by_tile {
+            ByTile::Sort { sort, groups, cut_tile, cut_state } => {
                 let pairs = Pairs { keys: pair_tile, values: sorted };
                 let bits = 32 - last.leading_zeros();
                 let sorted = sort.record_indices(rec, pairs, Count::Device(pair_count), 0..bits);
                 rec.zero(ranges);
+                // Without pairs nothing is written.
+                rec.zero(cut_tile);
                 dispatch::record(rec, pair_count, groups, self.pairs, 1);
-                let buffers = bin_ranges::Buffers { pair_count, sorted_tile: sorted.keys, ranges };
+                let buffers = bin_ranges::Buffers { pair_count, sorted_tile: sorted.keys, ranges, cut_tile };
                 rec.run(bin_ranges::Kernel, buffers, (), groups);
-                (sorted.values, None)
+                (sorted.values, None, Some(Cuts { tile: cut_tile, state: cut_state }))
             }
             ByTile::Tally(Tally { runs, run_pairs, run_first, placed, scan, blended, blended_count }) => {
                 let (runs, tiles) = (*runs, last + 1);
@@ -368,10 +398,10 @@ impl Bin {
                 rec.run(cpu::bin_tally_ranges::Kernel, buffers, cpu::bin_tally_ranges::Push { tiles, runs }, tiles);
                 let buffers = cpu::bin_place::Buffers { pair_count, pair_tile, run_first, sorted };
                 rec.run(cpu::bin_place::Kernel, buffers, cpu::bin_place::Push { runs }, runs);
-                (sorted, Some(Blended { pairs: blended, count: blended_count }))
+                (sorted, Some(Blended { pairs: blended, count: blended_count }), None)
             }
         };
-        Binned { conic, tiles, drawn, pair_count, first_pair, pair_slot, sorted, ranges, blended }
+        Binned { conic, tiles, drawn, pair_count, first_pair, pair_slot, sorted, ranges, blended, cuts }
     }
 }
 

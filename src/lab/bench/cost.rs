@@ -295,8 +295,9 @@ pub const TABLE: &[Formula] = &[
     Formula {
         pass: "render/rasterize",
         variants: &["color", "depth"],
-        derivation: "per tile a range 8, per pair up to the tile's end 8, per Gaussian drawn 36, per pixel rgb 12 B; with depth \
-                     4 more per Gaussian and 8 per pixel. Per sample (pixel and pair up to the tile's end, in rows it reaches) an exponential and 25 \
+        derivation: "per tile a range 8, per pair up to the tile's end 8, per Gaussian drawn 36, per pixel rgb 12 B, \
+                     and at a cut for every 512 pairs 16 B for each of 256 pixels: 8 a pair; with depth 4 more per Gaussian, 8 per pixel \
+                     and 2 per pair. Per sample (pixel and pair up to the tile's end, in rows it reaches) an exponential and 25 \
                      operations: dy 1, across 2, power 6, alpha 2, after 2, decisions 6, weight 2, colour 3, transmittance 1; \
                      with depth 1 more",
         work: |c, d| {
@@ -305,7 +306,8 @@ pub const TABLE: &[Formula] = &[
                 8.0 * c.tiles
                     + 8.0 * c.evaluated
                     + splat_bytes(depth > 0.0) * c.drawn
-                    + (12.0 + 8.0 * depth) * c.pixels,
+                    + (12.0 + 8.0 * depth) * c.pixels
+                    + (8.0 + 2.0 * depth) * c.pairs,
                 (25.0 + depth) * c.samples,
                 c.samples,
             )
@@ -358,7 +360,8 @@ pub const TABLE: &[Formula] = &[
         pass: "render/rasterize_backward",
         variants: &["color", "depth"],
         derivation: "per tile a range 8, per pair up to the tile's end 8 and behind it 4, per Gaussian drawn 36, per pixel rgb \
-                     12 and its gradient 12, per pair 36 B of gradients; with depth 4 more per Gaussian and pair and 8 per pixel, \
+                     12 and its gradient 12, per pair 36 B of gradients and 8 of \
+                     cuts; with depth 4 more per Gaussian, 6 per pair and 8 per pixel, \
                      with transmittance 8 per pixel. Per sample an exponential and 44 operations: sample 21 as forward, \
                      product with the colour 3, colour 3, remainder 1, gradient of alpha 6, opacity 1, exponent 1, mean 4, \
                      conic 3, transmittance 1; with depth 2 more; and the sum over the tile's columns: 9 (10) additions per \
@@ -372,7 +375,7 @@ pub const TABLE: &[Formula] = &[
                     + 4.0 * (c.pairs - c.evaluated)
                     + splat_bytes(depth > 0.0) * c.drawn
                     + (24.0 + 8.0 * depth + 8.0 * transmittance) * c.pixels
-                    + (36.0 + 4.0 * depth) * c.pairs,
+                    + (44.0 + 6.0 * depth) * c.pairs,
                 (44.0 + 2.0 * depth + (9.0 + depth) / c.tile_side) * c.samples_back,
                 c.samples_back,
             )

@@ -39,8 +39,8 @@ fn backward(
         for x in 0..size[0] {
             let up = upstream((y * size[0] + x) as usize);
             let mut remaining = up.total;
-            splats.walk([x, y], tile, tiles_x, |pair, slot, s, before, w| {
-                let pair = &mut pairs[pair];
+            splats.walk([x, y], tile, tiles_x, |at, slot, s, before, w| {
+                let pair = &mut pairs[splats.sorted[at] as usize];
                 let mut v: f64 = (0..3).map(|c| f64::from(splats.color[slot][c]) * up.rgb[c]).sum();
                 v += depth.map_or(0.0, |d| f64::from(d[slot]) * up.z);
                 pair.depth += w * up.z;
@@ -213,13 +213,14 @@ impl Backward {
         gradient: PictureGradient<'_>,
     ) {
         let Projected { mean, depth, opacity, color, .. } = gaussians;
-        let Binned { ranges, sorted, pair_slot, conic, tiles, drawn, pair_count, first_pair, blended, .. } = binned;
+        let Binned { ranges, sorted, pair_slot, conic, tiles, drawn, pair_count, first_pair, blended, cuts, .. } =
+            binned;
         let Slots { list: drawn, count: drawn_count, groups: drawn_groups } = drawn;
         let Self { pair_mean, pair_conic, pair_opacity, pair_color, .. } = self;
         let Method { tiling, alpha_min, transmittance_min, .. } = method.into();
         let size = picture.size;
         let grid = tiling.grid(size);
-        let threads = [grid[0] * tiling.threads_backward(), grid[1], 1];
+        let parts = grid[0] * grid[1] + cuts.map_or(0, |cuts| cuts.tile.len() as u32 - 1);
         // Depth has gradients where the picture has it, the scratch is there for them, and a loss looks at it.
         let maps = picture.depth.as_ref().zip(gradient.depth).filter(|_| self.grad_depth.is_some());
         let left = maps.and(picture.transmittance.as_ref().zip(gradient.transmittance));
@@ -248,13 +249,21 @@ impl Backward {
             pair_opacity,
             pair_color,
             pair_depth,
+            cut_tile: cuts.map(|cuts| cuts.tile),
+            cut_state: cuts.map(|cuts| cuts.state),
             blended: blended.map(|lists| lists.pairs),
             blended_count: blended.map(|lists| lists.count),
             marks,
         };
         let constants = rasterize_backward::Constants { alpha_min, transmittance_min, subgroups: subgroups(rec.gpu()) };
         let push = rasterize_backward::Push { size, tiles_x: grid[0] };
-        rec.run_with(rasterize_backward::Kernel::from(tiling.form()), constants, buffers, push, threads);
+        let kernel = rasterize_backward::Kernel::from(tiling.form());
+        // Narrow tiles are a workgroup each in their places, wide ones and the cuts of their lists one behind the other.
+        let threads = tiling.threads_backward();
+        match cuts {
+            Some(_) => rec.run_with(kernel, constants, buffers, push, (parts * threads) as usize),
+            None => rec.run_with(kernel, constants, buffers, push, [grid[0] * threads, grid[1], 1]),
+        }
         let buffers = rasterize_gather::Buffers {
             drawn_count,
             drawn,

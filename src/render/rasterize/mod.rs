@@ -63,35 +63,35 @@ struct Splats<'a> {
 }
 
 impl Splats<'_> {
-    /// Calls `blend(pair, slot, sample, transmittance before, weight)` for everything blended at a pixel; returns the
-    /// transmittance that is left.
+    /// Calls `blend(place in the list, slot, sample, transmittance before, weight)` for everything blended at a pixel; returns
+    /// the transmittance that is left, and the place from which on nothing is.
     fn walk(
         &self,
         pixel: [u32; 2],
         tile: u32,
         tiles_x: u32,
         mut blend: impl FnMut(usize, usize, &Sample, f64, f64),
-    ) -> f64 {
+    ) -> (f64, usize) {
         let [first, end] = self.ranges[(pixel[1] / tile * tiles_x + pixel[0] / tile) as usize];
         let centre = pixel.map(|v| v as f32 + 0.5);
         let mut transmittance = 1.0;
         // The decision to stop is made on the float32 product, as in the kernel.
         let mut rounded = 1f32;
-        for &pair in &self.sorted[first as usize..end as usize] {
-            let slot = self.pair_slot[pair as usize] as usize;
+        for at in first as usize..end as usize {
+            let slot = self.pair_slot[self.sorted[at] as usize] as usize;
             let s = sample(centre, self.mean[slot], self.conic[slot], self.opacity[slot], self.alpha_min);
             if !s.visible {
                 continue;
             }
             let after = rounded * (1.0 - s.alpha as f32);
             if after < self.transmittance_min {
-                break;
+                return (transmittance, at);
             }
-            blend(pair as usize, slot, &s, transmittance, s.alpha * transmittance);
+            blend(at, slot, &s, transmittance, s.alpha * transmittance);
             transmittance *= 1.0 - s.alpha;
             rounded = after;
         }
-        transmittance
+        (transmittance, end as usize)
     }
 }
 
