@@ -237,6 +237,11 @@ impl Builder<'_> {
                     other => panic!("{other:?}"),
                 };
                 let args: Vec<u32> = i.operands[1..].iter().map(|o| self.registers[self.at(o) as usize]).collect();
+                if op == Op::Select {
+                    let [which, x, y] = args[..] else { panic!("{i:?}") };
+                    self.registers[at] = if which == 0 { y } else { x };
+                    return;
+                }
                 let [x, y] = args[..] else { panic!("{i:?}") };
                 self.registers[at] = match op {
                     Op::IAdd => x.wrapping_add(y),
