@@ -14,9 +14,10 @@ layout(binding = 1, scalar) readonly buffer Partial { vec4 partial[]; };        
 layout(binding = 2, scalar) writeonly buffer GradWeights { float grad_weights[]; }; // [W] every one of the second layer is written
 #include "chunk_sum.glsl"
 void main() {
-  // Workgroups of each k of their own.
+  // Threads that share a sum need workgroups of one k: they have as many runs to wait for.
   const uint GROUPS = (SECOND_VEC4 + SUM_WIDTH - 1u) / SUM_WIDTH;
-  uint k = group_index() / GROUPS, i = group_index() % GROUPS * SUM_WIDTH + sum_column();
+  uint at = group_index() * SUM_WIDTH + sum_column(), each = LANES == 1u ? SECOND_VEC4 : GROUPS * SUM_WIDTH;
+  uint k = at / each, i = at % each;
   if (k >= OFFSETS) return;
   uint first = 0u, chunks = 0u, chunk = chunk_listed(segments[OFFSETS]);
   for (uint j = 0u; j <= k; ++j) {

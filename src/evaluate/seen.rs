@@ -20,6 +20,8 @@ pub struct Surface {
     size: [usize; 2],
     /// `[row-major pixel]` depth z, scene units; NaN where less than half of the pixel is covered, or nothing is known.
     depth: Vec<f32>,
+    /// `[row-major pixel]` the largest depth around a pixel: the edge of a surface is a pixel wide. NaN where it shows none.
+    around: Vec<f32>,
     /// A point farther by more than this share is hidden.
     behind: f64,
 }
@@ -36,7 +38,7 @@ impl Surface {
             let coverage = 1.0 - t;
             if coverage >= SURFACE { z / coverage } else { f32::NAN }
         };
-        Self { size, depth: depth.iter().zip(transmittance).map(normalised).collect(), behind: BEHIND }
+        Self::of(size, depth.iter().zip(transmittance).map(normalised).collect(), BEHIND)
     }
 
     /// Of the depth of a photograph of `size` (width, height) that was measured or is known, `[row-major pixel]` z in scene
@@ -48,7 +50,24 @@ impl Surface {
         let size = size.map(|n| n as usize);
         assert!(depth.len() == size[0] * size[1], "one depth per pixel");
         let known = |z: &f32| if z.is_finite() && *z > 0.0 { *z } else { f32::NAN };
-        Self { size, depth: depth.iter().map(known).collect(), behind: BEHIND_MEASURED }
+        Self::of(size, depth.iter().map(known).collect(), BEHIND_MEASURED)
+    }
+
+    /// Every point of every view is asked for, so that what is around each pixel is looked for once.
+    fn of(size: [usize; 2], depth: Vec<f32>, behind: f64) -> Self {
+        let [w, h] = size;
+        let largest = |at: usize| -> f32 {
+            let (x, y) = (at % w, at / w);
+            if depth[at].is_nan() {
+                return f32::NAN;
+            }
+            let rows = y.saturating_sub(1)..(y + 2).min(h);
+            let near = rows.flat_map(|y| (x.saturating_sub(1)..(x + 2).min(w)).map(move |x| y * w + x));
+            // `max` leaves NaN out.
+            near.map(|i| depth[i]).fold(f32::NEG_INFINITY, f32::max)
+        };
+        let around = (0..w * h).into_par_iter().map(largest).collect();
+        Self { size, depth, around, behind }
     }
 
     /// `[row-major pixel]` depth z, scene units; NaN where there is no surface.
@@ -79,18 +98,6 @@ impl Surface {
         }
         depth
     }
-
-    /// The largest depth around a pixel: the edge of a surface is a pixel wide. `None` where the pixel shows none.
-    fn around(&self, [x, y]: [usize; 2]) -> Option<f32> {
-        let [w, h] = self.size;
-        if self.depth[y * w + x].is_nan() {
-            return None;
-        }
-        let rows = y.saturating_sub(1)..(y + 2).min(h);
-        let near = rows.flat_map(|y| (x.saturating_sub(1)..(x + 2).min(w)).map(move |x| y * w + x));
-        // `max` leaves NaN out.
-        Some(near.map(|i| self.depth[i]).fold(f32::NEG_INFINITY, f32::max))
-    }
 }
 
 /// A view as the trained model shows it.
@@ -109,6 +116,11 @@ impl Shown<'_> {
     pub(super) fn sees(&self, point: [f64; 3]) -> Option<[f64; 2]> {
         let [px, py] = self.camera.within(point)?;
         let [x, y, z] = self.camera.to_camera(point);
+        let surface = self.surface.around[py as usize * self.surface.size[0] + px as usize];
+        // Nothing is behind what is not there: NaN.
+        if z > f64::from(surface) * (1.0 + self.surface.behind) {
+            return None;
+        }
         if self.camera.distortion != [0.0; 4] {
             // Beyond a lens's fold, rays from outside the picture come back into it.
             let ray = self.camera.unproject([px, py])?;
@@ -117,9 +129,7 @@ impl Shown<'_> {
                 return None;
             }
         }
-        let behind = |surface: f32| z > f64::from(surface) * (1.0 + self.surface.behind);
-        let hidden = self.surface.around([px as usize, py as usize]).is_some_and(behind);
-        (!hidden).then_some([px, py])
+        Some([px, py])
     }
 
     /// Whether this view's photograph shows a world point, past its mask.
@@ -184,7 +194,7 @@ mod tests {
         assert_eq!(surface.depth()[..2], [4.0, 4.0]);
         assert!(surface.depth()[2].is_nan(), "a quarter covered");
         assert_eq!(surface.filled(), [4.0, 4.0, 4.0]);
-        assert_eq!((surface.around([1, 0]), surface.around([2, 0])), (Some(4.0), None));
+        assert!(surface.around[1] == 4.0 && surface.around[2].is_nan());
         assert!(Surface::new([2, 1], &[0.0; 2], &[1.0; 2]).filled().iter().all(|z| z.is_nan()));
     }
 

@@ -70,7 +70,7 @@ impl Default for Config {
             reference_share: 0.18,
             log_interval: 100,
             eval_interval: 5_000,
-            checkpoint_interval: 1_000,
+            checkpoint_interval: 2_500,
             sentinel_interval: 50,
             corrections: vec![],
             coarse: Coarse::default(),

@@ -229,6 +229,12 @@ pub(super) fn sum_threads(vec4s: usize, lanes: u32) -> usize {
     vec4s.div_ceil(64 / lanes as usize) * 64
 }
 
+/// Threads for the sums of each k's second layer: in whole workgroups of its own, where threads share them.
+pub(super) fn second_sum_threads(offsets: usize, lanes: u32) -> usize {
+    let each = if lanes == 1 { SECOND_VEC4 } else { sum_threads(SECOND_VEC4, lanes) };
+    offsets * each
+}
+
 /// The backward stage: scratch for the gradients inside the decoder.
 #[derive(Debug)]
 pub struct DecodeBackward {
@@ -353,7 +359,7 @@ impl DecodeBackward {
         rec.run_with(decode_backward_weights::Kernel, constants, buffers, (), sum_threads(FIRST_VEC4, lanes));
         let buffers = decode_backward_weights_second::Buffers { segments, partial: second, grad_weights };
         let constants = decode_backward_weights_second::Constants { offsets, lanes };
-        let threads = forward.layout.offsets * sum_threads(SECOND_VEC4, lanes);
+        let threads = second_sum_threads(forward.layout.offsets, lanes);
         rec.run_with(decode_backward_weights_second::Kernel, constants, buffers, (), threads);
     }
 }

@@ -1,7 +1,7 @@
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
 
-use super::backward::{chunks, each, listed_chunks, sum_threads};
+use super::backward::{chunks, each, listed_chunks, second_sum_threads, sum_threads};
 use super::*;
 use crate::gpu::Reference;
 use crate::gpu::kernels::render::{
@@ -273,7 +273,7 @@ fn kernels_match_their_twins() {
         let case = decode_backward_weights_second::Arrays { segments, partial: second, grad_weights };
         let all = [16, 1].map(|lanes| {
             let constants = decode_backward_weights_second::Constants { offsets: k, lanes };
-            let threads = offsets * sum_threads(SECOND_VEC4, lanes);
+            let threads = second_sum_threads(offsets, lanes);
             twin(decode_backward_weights_second::Kernel, &gpu, constants, case.clone(), (), threads).grad_weights
         });
         assert!(bits(&all[0]) == bits(&all[1]), "so many threads, another sum");
@@ -319,7 +319,7 @@ fn long_chunks_match_their_twins() {
     let partial = twin(decode_backward_second::Kernel::Cpu, &gpu, constants, case, (), chunks * 2).partial;
     let case = decode_backward_weights_second::Arrays { segments, partial, grad_weights };
     let constants = decode_backward_weights_second::Constants { offsets: 9, lanes: 16 };
-    let threads = offsets * sum_threads(SECOND_VEC4, 16);
+    let threads = second_sum_threads(offsets, 16);
     twin(decode_backward_weights_second::Kernel, &gpu, constants, case, (), threads);
 }
 
