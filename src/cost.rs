@@ -24,7 +24,7 @@ pub struct Counts {
     /// These times the pixels of their tile; of a tile of 16 pixels a side those of its pairs of rows that the Gaussian reaches:
     /// a subgroup of 32 passes over the others.
     pub samples: f64,
-    /// The same for the way back, where a subgroup of 32 has four rows; 0 in records of versions that did not count them.
+    /// Samples of the way back, where a subgroup of 32 has four rows; 0 in records of versions that did not count them.
     #[serde(default)]
     pub samples_back: f64,
     /// Samples that changed a pixel.

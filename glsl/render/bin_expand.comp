@@ -26,7 +26,7 @@ layout(push_constant, scalar) uniform Push {
   uint tile;  // side of a tile, px
 } push;
 
-// The subgroup's long runs, in lanes that all come here; `slot`, `first` and `n` of this lane's own run.
+// Writes the subgroup's long runs; all of its lanes come here. `slot`, `first` and `n` are of this lane's own run.
 void expand_long(uint slot, uint first, uint n) {
   int tile = int(push.tile);
   ivec2 grid = ivec2(push.grid);

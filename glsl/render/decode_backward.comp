@@ -52,7 +52,7 @@ vec3 grad_spread = vec3(0.0), grad_size = vec3(0.0);
 shared float s_sums[64u * 6u];
 #endif
 
-// Of Gaussian k of visible anchor v, of opacity o.
+// Writes the gradients of Gaussian k of visible anchor v, which has opacity o.
 void back(uint v, uint n, uint anchor, uint k, float o, vec3 spread, vec3 size) {
   uint rows = head_row(3u, OFFSETS), to = v * (rows / 4u), color_row = head_row(1u, OFFSETS), cov_row = head_row(2u, OFFSETS);
   uint slot = k * n + v;

@@ -82,7 +82,7 @@ shared float s_depth[BATCH];
 #endif
 shared uint s_live;
 
-// What the way back begins with at a cut.
+// Keeps the state of the pixels at a cut, with which the way back begins there.
 void put_cut(uint cut, uint t) {
   [[unroll]] for (uint r = 0u; r < ROWS; r++) {
     uint p = (t / TILE * ROWS + r) * TILE + t % TILE;

@@ -185,7 +185,7 @@ Sums shared_sums(uint k, uint band) {
 }
 
 void main() {
-  // Tiles, and then cuts.
+  // The parts are the tiles, and then the cuts.
   uint part = group_index(), tiles = push.tiles_x * ((push.size.y + TILE - 1u) / TILE), tile = part, cut = 0u;
   if (part >= tiles) {
     cut = part - tiles + 1u;

@@ -53,7 +53,7 @@ void add(uint p) {
 #ifndef MARKED
 const uint LONG = 16u;
 
-// The sums of the subgroup's long runs, in lanes that all come here; `first` and `n` of this lane's own run.
+// Sums the subgroup's long runs; all of its lanes come here. `first` and `n` are of this lane's own run.
 void add_long(uint first, uint n) {
   uint lane = gl_SubgroupInvocationID;
   bool waits = n > LONG;
