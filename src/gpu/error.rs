@@ -12,7 +12,7 @@ pub enum Error {
     NoLoader(String),
     /// The loader lists no device at all.
     #[error(
-        "no Vulkan device was found: install a driver (Debian: mesa-vulkan-drivers has lavapipe, which needs no GPU), and look whether VK_DRIVER_FILES or VK_ICD_FILENAMES names one that is not there"
+        "no Vulkan device was found: install a driver (Debian: mesa-vulkan-drivers has lavapipe, which needs no GPU; in a container NVIDIA's also needs libgl1 and libegl1), and look whether VK_DRIVER_FILES or VK_ICD_FILENAMES names one that is not there"
     )]
     NoDevice,
     /// `--device` names none of the devices.
