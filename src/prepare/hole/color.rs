@@ -467,7 +467,7 @@ mod tests {
         assert!(!believed(3, 3, true, MANY) && !believed(1, 1, true, 2) && believed(3, 2, true, MANY));
     }
 
-    /// What photographs disagree about, or look through, is doubtful; what is hidden from all is a guess like any other.
+    /// A point is doubtful where photographs disagree about it or look through it; one that is hidden from all is a guess like any other.
     #[test]
     fn what_is_doubtful() {
         let of = |show, confirmed, through, apart: &[f64]| {
