@@ -52,6 +52,9 @@ pub struct Record {
     /// What the settings were that were made to fit the device.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub asked: Option<Asked>,
+    /// Hash of what the run was begun with, where a command has to know it again ([`crate::prepare::record::Inputs`]).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub inputs: Option<String>,
 }
 
 /// The settings that are reduced where the device has no room for them, as they were asked for.
@@ -93,6 +96,7 @@ impl Record {
             command: command.join(" "),
             complete: None,
             asked: None,
+            inputs: None,
         }
     }
 

@@ -303,6 +303,7 @@ mod tests {
             command: "gscream-vk train 'garden & <gate>'".into(),
             complete,
             asked: None,
+            inputs: None,
         }
     }
 

@@ -194,7 +194,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             None => (settings, None),
         };
         let board = args.view.map(|address| show(address, &name, &scene, &settings)).transpose()?;
-        let manner = Manner { began: Some(began), board, go_on: begun, clock, stop: Stop::default() };
+        let manner = Manner { began: Some(began), board, go_on: begun, clock, ..Manner::default() };
         eprintln!("device: {} ({})", gpu.info().name, gpu.info().driver);
         let Trained { summary, report, mut written } =
             train(gpu, &scene, &settings, &name, &folder, &manner, &Judge::default())?;
@@ -312,6 +312,8 @@ pub(super) struct Manner {
     pub clock: Option<minutes::Clock>,
     /// Ends as by Ctrl-C once this is set.
     pub stop: Stop,
+    /// What a new run is made of, as its record keeps it.
+    pub inputs: Option<String>,
 }
 
 /// A wish to end, of others than the terminal.
@@ -359,7 +361,8 @@ pub(super) fn train(
     clear(folder)?;
     let path = folder.join(SETTINGS);
     atomic::write(&path, settings.to_toml()).with_context(|| format!("{}: cannot be written", path.display()))?;
-    let record = Record { asked: reduced.map(|_| Asked::of(asked)), ..Record::new(&gpu.info().name, name) };
+    let (asked, inputs) = (reduced.map(|_| Asked::of(asked)), manner.inputs.clone());
+    let record = Record { asked, inputs, ..Record::new(&gpu.info().name, name) };
     record.write(folder)?;
     for left in &run.step().plan.left_out {
         eprintln!("left out: {} ({})", left.what, left.why);

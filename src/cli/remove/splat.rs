@@ -8,7 +8,7 @@ use anyhow::{Context as _, bail};
 use serde::Serialize;
 
 use super::Args;
-use super::work::{Audience, Job, Places, Record, Source};
+use super::work::{Audience, Job, Places, Source};
 use crate::cli::export::{Cameras, FIGURES, STEM};
 use crate::cli::folders::MODEL;
 use crate::config::{Settings, SettingsArgs};
@@ -216,8 +216,7 @@ impl Job<'_> {
             format!("model.frozen={frozen}"),
         ];
         settings.set.splice(0..0, own);
-        let mut record = Record::read(root);
-        self.train(gpu, &mut record, audience, &settings)?;
+        self.train(gpu, audience, &settings)?;
         let Stored::Gaussians(cloud) = Stored::load(&run.join(MODEL))? else {
             bail!("{}: holds no plain Gaussians; were settings of the form changed?", run.display());
         };

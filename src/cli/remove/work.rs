@@ -113,8 +113,6 @@ impl Audience for Nobody {}
 #[derive(Default, Serialize, Deserialize)]
 pub(super) struct Record {
     version: String,
-    /// The hash of what the run was begun with.
-    train: String,
     /// The hash of what the files for viewers were made of.
     export: String,
 }
@@ -266,7 +264,7 @@ impl Job<'_> {
             return self.splice(gpu, source, audience);
         }
         let mut record = Record::read(root);
-        self.train(gpu, &mut record, audience, &self.args.settings)?;
+        self.train(gpu, audience, &self.args.settings)?;
         let mut inputs = Inputs::default().with(self.args.export_steps.to_le_bytes());
         // Plain Gaussians have no decoders.
         for name in [POINT_CLOUD, WEIGHTS].into_iter().filter(|name| run.join(MODEL).join(name).is_file()) {
@@ -283,15 +281,10 @@ impl Job<'_> {
         record.write(root)
     }
 
-    pub(super) fn train(
-        &self,
-        gpu: &Gpu,
-        record: &mut Record,
-        audience: &dyn Audience,
-        settings: &SettingsArgs,
-    ) -> anyhow::Result<()> {
+    /// Trains, unless the run that is there was made of the same; one that was begun with it is gone on with.
+    pub(super) fn train(&self, gpu: &Gpu, audience: &dyn Audience, settings: &SettingsArgs) -> anyhow::Result<()> {
         let Args { device, minutes, .. } = self.args;
-        let Places { root, scene: folder, run, .. } = &self.places;
+        let Places { scene: folder, run, .. } = &self.places;
         let began = self.time.began();
         let given = SceneArgs { scene: folder.clone(), settings: settings.clone() };
         let name = given.name();
@@ -301,7 +294,7 @@ impl Job<'_> {
         let time = minutes.unwrap_or(0.0).to_le_bytes();
         let inputs = Inputs::default().with(fingerprint).with(loaded.settings.to_toml()).with(time).finish();
         let there = RunRecord::read(run).ok();
-        let same = record.train == inputs;
+        let same = there.as_ref().is_some_and(|there| there.inputs.as_ref() == Some(&inputs));
         if let Some(there) = &there {
             match there.complete {
                 Some(steps) if same => {
@@ -314,20 +307,17 @@ impl Job<'_> {
                 _ => {}
             }
         }
-        record.train = inputs;
-        record.write(root)?;
-        let begun = same && there.is_some();
-        if begun {
+        if same {
             train::go_on_without(run, &mut loaded)?;
         }
-        let work::Ready { scene, settings } = if begun && !checkpoint::list(run).is_empty() {
+        let work::Ready { scene, settings } = if same && !checkpoint::list(run).is_empty() {
             loaded.as_read()
         } else {
             audience.begin("points", 0);
             loaded.ready(gpu)?
         };
         let (settings, clock) = match minutes {
-            Some(time) if !begun => {
+            Some(time) if !same => {
                 let (settings, clock) = minutes::fitted(gpu, &scene, &settings, *time, began, self.time.files())?;
                 (settings, Some(clock))
             }
@@ -337,7 +327,8 @@ impl Job<'_> {
         let board = audience.looks().then(|| Board::new("training", &scene, iterations));
         board.iter().for_each(|board| audience.board(board));
         audience.begin("train", iterations.into());
-        let manner = Manner { began: Some(began), board, go_on: begun, clock, stop: audience.stop() };
+        let manner =
+            Manner { began: Some(began), board, go_on: same, clock, stop: audience.stop(), inputs: Some(inputs) };
         let Trained { summary, report, .. } =
             train::train(gpu, &scene, &settings, &name, run, &manner, &Judge::default())?;
         if let Some(report) = report {
