@@ -28,6 +28,11 @@ const HIDDEN: f64 = 1e3;
 const MANY: usize = 16;
 /// Mean difference of the channels from the median up to which photographs agree on the colour of a point.
 const ALIKE: f64 = 0.04;
+/// What all photographs have right beside the object is believed where so many sites within so many sites of it, that others show
+/// farther from the object, are of its colour, and of its depth up to this part.
+const LIKE_RIM: usize = 3;
+const RIM: i64 = 12;
+const NEAR_RIM: f64 = 0.25;
 /// Views that look through a guessed point of which so many make it doubtful.
 const THROUGH: usize = 2;
 /// Share of a hole that is doubtful from which on all that is guessed in it is.
@@ -113,16 +118,21 @@ struct Witnesses {
 }
 
 impl Witnesses {
-    /// Whether to believe them. One of many, whose depth nobody confirms, is wrong about what it shows. Where all have the
-    /// point right beside the object, they show the object's rim as likely: masks end too early in places.
-    fn believed(&self) -> bool {
-        self.beside < self.show && (self.show > 1 || self.confirmed || self.framed < MANY)
+    /// Whether they are enough. One of many, whose depth nobody confirms, is wrong about what it shows.
+    fn suffice(&self) -> bool {
+        self.show > 1 || self.show == 1 && (self.confirmed || self.framed < MANY)
     }
 
-    /// Whether the point is likely nowhere, though it be guessed or shown; of those that show it these are the differences from
-    /// their median colour.
-    fn doubt(&self, mut apart: Vec<f64>) -> bool {
-        if !self.believed() {
+    /// Whether all have the point right beside the object: they show the object's rim as likely, for masks end too early in
+    /// places.
+    fn is_rim(&self) -> bool {
+        self.beside == self.show
+    }
+
+    /// Whether the point is likely nowhere, though it be guessed or, as they are `believed`, shown; of those that show it these
+    /// are the differences from their median colour.
+    fn doubt(&self, believed: bool, mut apart: Vec<f64>) -> bool {
+        if !believed {
             return self.through >= THROUGH;
         }
         if self.show == 1 {
@@ -142,46 +152,105 @@ struct Told {
     doubtful: bool,
 }
 
+/// What is asked of a site's witnesses.
+struct Asked {
+    /// Photographs that show it, with the cost of each.
+    shown: Vec<(usize, f64)>,
+    witnesses: Witnesses,
+    /// The median of the colours that are shown, 0 to 255, and that of those that are shown farther from the object.
+    middle: [f64; 3],
+    clear: Option<[f64; 3]>,
+    /// `[photograph]` the difference from it.
+    apart: Vec<f64>,
+}
+
+impl Asked {
+    fn told(self, believed: bool) -> Told {
+        let doubtful = self.witnesses.doubt(believed, self.apart);
+        Told { shown: if believed { self.shown } else { vec![] }, doubtful }
+    }
+}
+
+/// Mean difference of the channels of two colours, as a part of their range.
+fn unlike(one: [f64; 3], other: [f64; 3]) -> f64 {
+    (0..3).map(|c| (one[c] - other[c]).abs()).sum::<f64>() / 765.0
+}
+
+/// The median of each channel, the upper one of two; nothing of no colours.
+fn middle(colors: impl Iterator<Item = [f64; 3]> + Clone) -> Option<[f64; 3]> {
+    colors.clone().next()?;
+    Some(std::array::from_fn(|c| {
+        let mut values: Vec<f64> = colors.clone().map(|color| color[c]).collect();
+        values.sort_unstable_by(f64::total_cmp);
+        values[values.len() / 2]
+    }))
+}
+
+/// The witnesses of a site in or next to a view's hole; nothing elsewhere.
+fn asked(sights: &Sights, of: usize, site: usize) -> Option<Asked> {
+    let own = &sights.0[of];
+    if !own.near_hole(site) || !own.depth[site].is_finite() {
+        return None;
+    }
+    let eye = DVec3::from(own.grid.camera.center());
+    let point = own.point(site, own.depth[site]);
+    let (to, distance) = ((point - eye).normalize(), point.distance(eye));
+    let mut found: Vec<(usize, f64, [f64; 3])> = vec![];
+    let mut clear: Vec<[f64; 3]> = vec![];
+    let mut witnesses = Witnesses::default();
+    for (view, sight) in sights.0.iter().enumerate().filter(|(view, sight)| *view != of && sight.grid.trusted) {
+        if let Some((there, z)) = sight.see(point) {
+            witnesses.framed += 1;
+            witnesses.through += usize::from(!sight.hole[there] && sight.grid.depth[there] > z * (1.0 + APART));
+        }
+        let Some(there) = sight.shows(point, 1.5 * SAME) else { continue };
+        let from = DVec3::from(sight.grid.camera.center());
+        let angle = to.dot((point - from).normalize()).clamp(-1.0, 1.0).acos();
+        let finer = (mean_focal(sight) * distance / (mean_focal(own) * point.distance(from))).ln();
+        let color = sight.grid.colors[there].map(f64::from);
+        found.push((view, ANGLE * angle + COARSER * (-finer).max(0.0), color));
+        let beside = sight.near_hole(there);
+        clear.extend((!beside).then_some(color));
+        witnesses.show += 1;
+        witnesses.beside += usize::from(beside);
+        witnesses.confirmed |= sight.grid.confirmed[there];
+    }
+    let middle = middle(found.iter().map(|(.., color)| *color)).unwrap_or_default();
+    let clear = self::middle(clear.into_iter());
+    let apart: Vec<f64> = found.iter().map(|(_, _, color)| unlike(*color, middle)).collect();
+    let shown = found.iter().zip(&apart).map(|((view, cost, _), apart)| (*view, cost + UNLIKE * apart)).collect();
+    Some(Asked { shown, witnesses, middle, clear, apart })
+}
+
 /// Each `[site]` in and next to a view's hole as the photographs tell it.
 fn candidates(sights: &Sights, of: usize) -> Vec<Told> {
     let own = &sights.0[of];
-    let eye = DVec3::from(own.grid.camera.center());
-    let one = |site: usize| -> Told {
-        if !own.near_hole(site) || !own.depth[site].is_finite() {
-            return Told::default();
-        }
-        let point = own.point(site, own.depth[site]);
-        let (to, distance) = ((point - eye).normalize(), point.distance(eye));
-        let mut found: Vec<(usize, f64, [u8; 3])> = vec![];
-        let mut witnesses = Witnesses::default();
-        for (view, sight) in sights.0.iter().enumerate().filter(|(view, sight)| *view != of && sight.grid.trusted) {
-            if let Some((there, z)) = sight.see(point) {
-                witnesses.framed += 1;
-                witnesses.through += usize::from(!sight.hole[there] && sight.grid.depth[there] > z * (1.0 + APART));
-            }
-            let Some(there) = sight.shows(point, 1.5 * SAME) else { continue };
-            let from = DVec3::from(sight.grid.camera.center());
-            let angle = to.dot((point - from).normalize()).clamp(-1.0, 1.0).acos();
-            let finer = (mean_focal(sight) * distance / (mean_focal(own) * point.distance(from))).ln();
-            found.push((view, ANGLE * angle + COARSER * (-finer).max(0.0), sight.grid.colors[there]));
-            witnesses.show += 1;
-            witnesses.beside += usize::from(sight.near_hole(there));
-            witnesses.confirmed |= sight.grid.confirmed[there];
-        }
-        if !witnesses.believed() {
-            return Told { shown: vec![], doubtful: witnesses.doubt(vec![]) };
-        }
-        let middle: [f64; 3] = std::array::from_fn(|c| {
-            let mut values: Vec<u8> = found.iter().map(|(_, _, color)| color[c]).collect();
-            values.sort_unstable();
-            values.get(values.len() / 2).map_or(0.0, |v| f64::from(*v))
-        });
-        let unlike = |color: &[u8; 3]| (0..3).map(|c| (f64::from(color[c]) - middle[c]).abs()).sum::<f64>() / 765.0;
-        let apart: Vec<f64> = found.iter().map(|(_, _, color)| unlike(color)).collect();
-        let shown = found.iter().zip(&apart).map(|((view, cost, _), apart)| (*view, cost + UNLIKE * apart)).collect();
-        Told { shown, doubtful: witnesses.doubt(apart) }
+    let sites = 0..own.hole.len();
+    let asked: Vec<Option<Asked>> = sites.clone().into_par_iter().map(|site| asked(sights, of, site)).collect();
+    // What a site looks like that is surely none of the object.
+    let known = |site: usize| match &asked[site] {
+        Some(asked) => asked.clear.filter(|_| asked.witnesses.suffice()),
+        None => (!own.hole[site]).then(|| own.grid.colors[site].map(f64::from)),
     };
-    (0..own.hole.len()).into_par_iter().map(one).collect()
+    let known: Vec<Option<[f64; 3]>> = sites.clone().map(known).collect();
+    let looks_like_what_is_near = |site: usize, color: [f64; 3]| {
+        let alike = |near: &usize| {
+            (own.depth[*near] / own.depth[site] - 1.0).abs() <= NEAR_RIM
+                && known[*near].is_some_and(|known| unlike(known, color) <= ALIKE)
+        };
+        own.grid.around(site, RIM).filter(alike).nth(LIKE_RIM - 1).is_some()
+    };
+    let believed: Vec<bool> = sites
+        .into_par_iter()
+        .map(|site| {
+            asked[site].as_ref().is_some_and(|asked| {
+                let witnesses = &asked.witnesses;
+                witnesses.suffice() && (!witnesses.is_rim() || looks_like_what_is_near(site, asked.middle))
+            })
+        })
+        .collect();
+    let told = asked.into_iter().zip(believed);
+    told.map(|(asked, believed)| asked.map_or_else(Told::default, |asked| asked.told(believed))).collect()
 }
 
 /// The photograph that each `[site]` in and next to a view's hole is taken from, by what is told of them.
@@ -236,7 +305,7 @@ const SEAM: f64 = 0.15;
 fn shown(own: &Photograph<'_>, sight: &Sight, i: usize) -> Option<([f64; 2], DVec3)> {
     let ray = own.camera.unproject(own.camera.pixel_center(i))?;
     let place = sight.grid.place(ray);
-    let z = sight.depth_at(place);
+    let z = sight.smooth_depth_at(place);
     z.is_finite().then(|| (place, DVec3::from(own.camera.along(ray, z))))
 }
 
@@ -456,26 +525,67 @@ mod tests {
         }
     }
 
-    /// A rim that one of many views takes for the floor behind it paints nothing; of few views each is needed. What no view
-    /// shows but right beside the object paints nothing, either.
+    /// A rim that one of many views takes for the floor behind it paints nothing; of few views each is needed.
     #[test]
     fn who_is_no_witness() {
-        let believed =
-            |show, beside, confirmed, framed| Witnesses { show, beside, confirmed, framed, through: 0 }.believed();
-        assert!(!believed(1, 0, false, MANY) && !believed(0, 0, false, 0));
-        assert!(believed(1, 0, true, MANY) && believed(2, 0, false, MANY) && believed(1, 0, false, MANY - 1));
-        assert!(!believed(3, 3, true, MANY) && !believed(1, 1, true, 2) && believed(3, 2, true, MANY));
+        let of = |show, beside, confirmed, framed| Witnesses { show, beside, confirmed, framed, through: 0 };
+        let suffice = |show, confirmed, framed| of(show, 0, confirmed, framed).suffice();
+        assert!(!suffice(1, false, MANY) && !suffice(0, false, 0));
+        assert!(suffice(1, true, MANY) && suffice(2, false, MANY) && suffice(1, false, MANY - 1));
+        assert!(of(3, 3, true, MANY).is_rim() && of(1, 1, true, 2).is_rim() && !of(3, 2, true, MANY).is_rim());
     }
 
     /// A point is doubtful where photographs disagree about it or look through it; one that is hidden from all is a guess like any other.
     #[test]
     fn what_is_doubtful() {
         let of = |show, confirmed, through, apart: &[f64]| {
-            Witnesses { show, beside: 0, confirmed, framed: MANY - 1, through }.doubt(apart.to_vec())
+            let witnesses = Witnesses { show, beside: 0, confirmed, framed: MANY - 1, through };
+            witnesses.doubt(witnesses.suffice(), apart.to_vec())
         };
         assert!(!of(0, false, 0, &[]) && !of(0, false, THROUGH - 1, &[]) && of(0, false, THROUGH, &[]));
         assert!(of(1, false, 0, &[0.0]) && !of(1, true, 0, &[0.0]));
         assert!(!of(3, false, 5, &[0.0, 0.01, 0.3]) && of(3, true, 0, &[0.0, 0.1, 0.3]) && of(2, true, 0, &[0.0, 0.1]));
+    }
+
+    /// What all views have right beside the object is believed where it looks like the wall that they show farther off, and not
+    /// where it has the object's own colour.
+    #[test]
+    fn a_rim_that_looks_like_the_wall_is_the_wall() {
+        use super::super::surface::tests::{SIZE, views};
+        let (wall, object) = ([150u8, 145, 140], [30u8, 60, 160]);
+        let told = |rim: [u8; 3]| {
+            // A picture that hangs on the wall: all views have the same of the wall right beside it.
+            let (mut grids, cameras, _) = views(0.0);
+            let on_picture = |camera: &Camera, i: usize| {
+                let [x, y, _] = camera.lift(camera.pixel_center(i), 4.0).expect("a ray");
+                x.abs() < 0.5 && y.abs() < 0.5
+            };
+            let mask = |camera: &Camera| {
+                let inside = |x, y| on_picture(camera, (y * SIZE[0] + x) as usize);
+                GrayImage::from_fn(SIZE[0], SIZE[1], |x, y| image::Luma([if inside(x, y) { 255 } else { 0 }]))
+            };
+            let masks: Vec<GrayImage> = cameras.iter().map(mask).collect();
+            for (grid, mask) in grids.iter_mut().zip(&masks) {
+                let near = |i: usize| grid.around(i, 1).any(|j| mask.as_raw()[j] != 0);
+                let color = |i: usize| match (mask.as_raw()[i] != 0, near(i)) {
+                    (true, _) => object,
+                    (false, true) => rim,
+                    (false, false) => wall,
+                };
+                let colors = (0..(SIZE[0] * SIZE[1]) as usize).map(color).collect();
+                grid.colors = colors;
+            }
+            let mut sights = Sights::new(grids, &cameras, &masks, &masks);
+            (0..5).for_each(|of| sights.solve(of, 1));
+            let rims = (0..sights.0[2].hole.len())
+                .filter(|site| asked(&sights, 2, *site).is_some_and(|a| a.witnesses.suffice() && a.witnesses.is_rim()));
+            let rims: Vec<usize> = rims.collect();
+            let told = candidates(&sights, 2);
+            (rims.iter().filter(|site| !told[**site].shown.is_empty()).count(), rims.len())
+        };
+        let (painted, count) = told(wall);
+        assert!(count > 4 && painted == count, "{painted} of {count}");
+        assert_eq!(told(object).0, 0);
     }
 
     /// Next to a pixel without a colour the others' count alone, and nothing of it is mixed in.

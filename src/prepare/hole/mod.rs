@@ -53,8 +53,8 @@ const LEAST_HOLE: f64 = 0.4;
 /// Views whose pictures are filled at once: each is held as float32.
 const AT_ONCE: usize = 16;
 /// Name of the way in which holes are filled: a scene that was filled in another way is filled anew.
-pub const METHOD: &str =
-    "one surface, nothing where others look through it, no colour from the rim alone, doubts left to training";
+pub const METHOD: &str = "one surface with smooth ends, nothing where others look through it, no colour from a rim that looks like nothing near it, \
+     lights joined, doubts left to training";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 
@@ -356,7 +356,7 @@ fn of_reference(
         batch.npy(
             format!("reference/{name}_depth.npy"),
             camera.size,
-            known_depth(&sights.0[of], camera),
+            known_depth(&sights.0[of], camera, task.scene.unit),
             "depth measured between the photographs; in the hole that of the surface behind the object",
         );
     }
@@ -376,13 +376,13 @@ fn of_reference(
 }
 
 /// `[pixel]` depth z of a view without the object at the size of a camera: in the hole that of its surface, elsewhere what
-/// other views confirm; NaN where they do not.
-fn known_depth(sight: &Sight, camera: &Camera) -> Vec<f32> {
+/// other views confirm; NaN where they do not. In the model's units, of which the sight counts `unit` as one.
+fn known_depth(sight: &Sight, camera: &Camera, unit: f64) -> Vec<f32> {
     let w = camera.size[0] as usize;
     let one = |i: usize| {
         let place = sight.grid.place(camera.unproject([(i % w) as f64 + 0.5, (i / w) as f64 + 0.5])?);
         let site = sight.grid.site(place[0].floor() as i64, place[1].floor() as i64)?;
-        (sight.hole[site] || sight.grid.confirmed[site]).then(|| sight.depth_at(place) as f32)
+        (sight.hole[site] || sight.grid.confirmed[site]).then(|| (sight.depth_at(place) * unit) as f32)
     };
     (0..w * camera.size[1] as usize).into_par_iter().map(|i| one(i).unwrap_or(f32::NAN)).collect()
 }

@@ -79,6 +79,36 @@ struct Claim {
     surface: u8,
 }
 
+/// A surface as it goes on around one of its sites.
+struct Patch {
+    at: [i64; 2],
+    inverse: f64,
+    /// Change of the inverse depth per site, across and down.
+    slopes: [f64; 2],
+}
+
+impl Patch {
+    /// The inverse depth at a place whose sites have whole numbers.
+    fn inverse_at(&self, [x, y]: [f64; 2]) -> f64 {
+        self.inverse + self.slopes[0] * (x - self.at[0] as f64) + self.slopes[1] * (y - self.at[1] as f64)
+    }
+
+    /// Whether a site of this inverse depth is of the surface. One that is seen at a grazing angle goes on in equal steps.
+    fn has(&self, site: [i64; 2], inverse: f64) -> bool {
+        let goes_on = self.inverse_at(site.map(|v| v as f64));
+        (inverse - self.inverse).abs().min((inverse - goes_on).abs()) <= 2.0 * SAME * self.inverse
+    }
+}
+
+/// A quadratic B-spline: what a site counts at a distance, 0 from one and a half on.
+fn spline(apart: f64) -> f64 {
+    match apart.abs() {
+        near if near <= 0.5 => 0.75 - near * near,
+        far if far < 1.5 => 0.5 * (1.5 - far).powi(2),
+        _ => 0.0,
+    }
+}
+
 impl Sight {
     /// A view whose photograph has this camera and whose object, with its margin, has this mask, as large as the camera's
     /// picture.
@@ -111,40 +141,71 @@ impl Sight {
 
     /// Depth z at a place in sites, linear in its inverse between sites of one surface; NaN where nothing is known.
     pub fn depth_at(&self, place: [f64; 2]) -> f64 {
-        let inverse =
-            |column: i64, row: i64| self.grid.site(column, row).map_or(f64::NAN, |site| 1.0 / self.depth[site]);
-        let at = place.map(|v| v.floor() as i64);
-        let nearest = inverse(at[0], at[1]);
-        if nearest.is_nan() {
-            return f64::NAN;
-        }
-        // Of two sides the flatter one: on the other another surface may begin.
-        let slope = |before: f64, after: f64| match (nearest - before, after - nearest) {
-            (one, other) if other.is_nan() || one.abs() < other.abs() => one,
-            (_, other) => other,
+        self.depth_from(place.map(|v| v.floor() as i64), place)
+    }
+
+    /// The same where surfaces end in smooth lines: the surface is that of most of the nine sites around the place, the nearer
+    /// ones counting more. [`Sight::depth_at`] has the nearest site's, so that an end is a staircase of sites.
+    pub fn smooth_depth_at(&self, place: [f64; 2]) -> f64 {
+        let own = place.map(|v| v.floor() as i64);
+        let Some(surface) = self.surface_from(own) else { return f64::NAN };
+        let near: Vec<([i64; 2], f64, f64)> = (-1..=1)
+            .flat_map(|dy| (-1..=1).map(move |dx| [own[0] + dx, own[1] + dy]))
+            .map(|at| {
+                (at, self.inverse(at), spline(place[0] - at[0] as f64 - 0.5) * spline(place[1] - at[1] as f64 - 0.5))
+            })
+            .filter(|(_, inverse, _)| inverse.is_finite())
+            .collect();
+        let share = |surface: &Patch| {
+            near.iter().filter(|(at, inverse, _)| surface.has(*at, *inverse)).map(|(.., weight)| weight).sum::<f64>()
         };
-        let slopes = [
-            slope(inverse(at[0] - 1, at[1]), inverse(at[0] + 1, at[1])),
-            slope(inverse(at[0], at[1] - 1), inverse(at[0], at[1] + 1)),
-        ]
-        .map(|slope| if slope.is_nan() { 0.0 } else { slope });
+        let half = 0.5 * near.iter().map(|(.., weight)| weight).sum::<f64>();
+        if share(&surface) >= half {
+            return self.depth_from(own, place);
+        }
+        // Of surfaces that have as much the first one.
+        let all = near.iter().filter_map(|(at, ..)| Some((*at, share(&self.surface_from(*at)?))));
+        let most = all.reduce(|best, next| if next.1 > best.1 + 1e-9 { next } else { best });
+        self.depth_from(most.map_or(own, |(at, _)| at), place)
+    }
+
+    /// The inverse depth of a site; NaN where there is none, and where nothing is known.
+    fn inverse(&self, [column, row]: [i64; 2]) -> f64 {
+        self.grid.site(column, row).map_or(f64::NAN, |site| 1.0 / self.depth[site])
+    }
+
+    /// The surface of a site, as it goes on around it.
+    fn surface_from(&self, at: [i64; 2]) -> Option<Patch> {
+        let inverse = self.inverse(at);
+        // Of two sides the flatter one: on the other another surface may begin.
+        let slope = |before: [i64; 2], after: [i64; 2]| {
+            let slope = match (inverse - self.inverse(before), self.inverse(after) - inverse) {
+                (one, other) if other.is_nan() || one.abs() < other.abs() => one,
+                (_, other) => other,
+            };
+            if slope.is_nan() { 0.0 } else { slope }
+        };
+        let slopes = [slope([at[0] - 1, at[1]], [at[0] + 1, at[1]]), slope([at[0], at[1] - 1], [at[0], at[1] + 1])];
+        inverse.is_finite().then_some(Patch { at, inverse, slopes })
+    }
+
+    /// Depth z at a place in sites of the surface that a site near it is on.
+    fn depth_from(&self, at: [i64; 2], place: [f64; 2]) -> f64 {
+        let Some(surface) = self.surface_from(at) else { return f64::NAN };
         let [x, y] = place.map(|v| v - 0.5);
         let (mut sum, mut total) = (0.0, 0.0);
         for (dx, dy) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
-            let (u, v) = (x.floor() as i64 + dx, y.floor() as i64 + dy);
-            let there = inverse(u, v);
-            // A surface that is seen at a grazing angle goes on in equal steps.
-            let goes_on = nearest + slopes[0] * (u - at[0]) as f64 + slopes[1] * (v - at[1]) as f64;
-            if (there - nearest).abs().min((there - goes_on).abs()) <= 2.0 * SAME * nearest {
+            let site @ [u, v] = [x.floor() as i64 + dx, y.floor() as i64 + dy];
+            let there = self.inverse(site);
+            if surface.has(site, there) {
                 let weight = (1.0 - (x - u as f64).abs()) * (1.0 - (y - v as f64).abs());
                 sum += weight * there;
                 total += weight;
             }
         }
         // Where a surface ends its sites beyond the place are missing.
-        let here = nearest + slopes[0] * (x - at[0] as f64) + slopes[1] * (y - at[1] as f64);
-        let known = sum + (1.0 - total) * here;
-        1.0 / if known > 0.0 { known } else { nearest }
+        let known = sum + (1.0 - total) * surface.inverse_at([x, y]);
+        1.0 / if known > 0.0 { known } else { surface.inverse }
     }
 
     /// The site at which a world point is seen without the object: what is there is at most this part of the depth before or
@@ -159,14 +220,13 @@ impl Sight {
         self.agrees(point, part).filter(|site| !self.hole[*site])
     }
 
-    /// The surface at a place in sites: that of most of the four sites around it, the nearer ones counting more.
+    /// The surface at a place in sites: that of most of the nine sites around it, the nearer ones counting more.
     pub fn surface_at(&self, place: [f64; 2]) -> u8 {
-        let [x, y] = place.map(|v| v - 0.5);
+        let own = place.map(|v| v.floor() as i64);
         let mut votes: Vec<(u8, f64)> = vec![];
-        for (dx, dy) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
-            let (u, v) = (x.floor() + f64::from(dx), y.floor() + f64::from(dy));
-            let Some(site) = self.grid.site(u as i64, v as i64) else { continue };
-            let weight = (1.0 - (x - u).abs()) * (1.0 - (y - v).abs());
+        for at in (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| [own[0] + dx, own[1] + dy])) {
+            let Some(site) = self.grid.site(at[0], at[1]) else { continue };
+            let weight = spline(place[0] - at[0] as f64 - 0.5) * spline(place[1] - at[1] as f64 - 0.5);
             match votes.iter_mut().find(|(surface, _)| *surface == self.surface[site]) {
                 Some((_, sum)) => *sum += weight,
                 None => votes.push((self.surface[site], weight)),
@@ -635,6 +695,27 @@ pub(super) mod tests {
             let (found, true_depth) = (sight.depth_at([20.2, row]), floor(row));
             assert!((found / true_depth - 1.0).abs() < 1e-9, "row {row}: {found}, {true_depth}");
         }
+    }
+
+    /// A near surface ends before a far one in an oblique line: its end is no staircase of sites, and a pole as wide as a site stays.
+    #[test]
+    fn surfaces_end_in_smooth_lines() {
+        let (mut grids, cameras, masks) = views(0.0);
+        let line = |x: f64| 9.3 + 0.31 * x;
+        for (site, depth) in grids[0].depth.iter_mut().enumerate() {
+            let [x, y] = [site as u32 % SIZE[0], site as u32 / SIZE[0]];
+            *depth = if f64::from(y) + 0.5 > line(f64::from(x) + 0.5) || x == 40 { 2.0 } else { 4.0 };
+        }
+        let sight = Sight::new(grids.swap_remove(0), &cameras[0], &masks[0]);
+        let places = || (20..380).flat_map(|x| (20..300).map(move |y| [f64::from(x) / 10.0, f64::from(y) / 10.0]));
+        let wrong = |depth: &dyn Fn([f64; 2]) -> f64| {
+            let of = |place: &[f64; 2]| (depth(*place) - if place[1] > line(place[0]) { 2.0 } else { 4.0 }).abs() > 0.5;
+            let off = places().filter(of).map(|[x, y]| (y - line(x)).abs());
+            off.fold((0usize, 0f64), |(count, most), off| (count + 1, most.max(off)))
+        };
+        let (stairs, smooth) = (wrong(&|place| sight.depth_at(place)), wrong(&|place| sight.smooth_depth_at(place)));
+        assert!(smooth.0 * 4 < stairs.0 * 3 && smooth.1 < 0.4, "{smooth:?}, {stairs:?}");
+        assert!((sight.smooth_depth_at([40.5, 12.5]) / 2.0 - 1.0).abs() < 0.01);
     }
 
     /// Later views were solved a little nearer: what the first told stays, for whoever asks next.

@@ -44,6 +44,9 @@ const SAMPLES: usize = 128;
 const SHORTEST: f64 = 0.06;
 /// Sum of the differences of the channels from which on a copy shows something else than what is known there.
 const ANOTHER: f32 = 0.3;
+/// What surroundings of one thing in two lights may differ by: the mean of the channels, and what is left of them without it.
+const SHADED: f32 = 0.25;
+const HUE: f32 = 0.12;
 /// Mean difference of the channels up to which surroundings are of one material in another light, which costs nothing: copies
 /// take the light of their place.
 const LIGHT: f32 = 0.05;
@@ -296,25 +299,22 @@ struct Materials {
 }
 
 impl Texture {
-    /// The mean of what is known around each `[pixel]`; NaN where nothing is.
-    fn around(&self) -> Vec<[f32; 3]> {
+    /// The mean of what is known around a pixel; NaN where nothing is.
+    fn mean_around(&self, pixel: usize) -> [f32; 3] {
         let [w, h] = self.size;
-        let mean = |i: usize| {
-            let (x, y) = (i % w, i / w);
-            let rows = y.saturating_sub(SURROUNDINGS)..(y + SURROUNDINGS + 1).min(h);
-            let near = rows
-                .flat_map(|v| (x.saturating_sub(SURROUNDINGS)..(x + SURROUNDINGS + 1).min(w)).map(move |u| v * w + u));
-            let known: Vec<usize> = near.filter(|j| self.source[*j]).collect();
-            let n = known.len() as f32;
-            std::array::from_fn(|c| known.iter().map(|j| self.rgb[*j][c]).sum::<f32>() / n)
-        };
-        (0..w * h).into_par_iter().map(mean).collect()
+        let (x, y) = (pixel % w, pixel / w);
+        let rows = y.saturating_sub(SURROUNDINGS)..(y + SURROUNDINGS + 1).min(h);
+        let near =
+            rows.flat_map(|v| (x.saturating_sub(SURROUNDINGS)..(x + SURROUNDINGS + 1).min(w)).map(move |u| v * w + u));
+        let known: Vec<usize> = near.filter(|j| self.source[*j]).collect();
+        let n = known.len() as f32;
+        std::array::from_fn(|c| known.iter().map(|j| self.rgb[*j][c]).sum::<f32>() / n)
     }
 
     /// Finds what may be copied into each part of the hole: nothing of a material that is nowhere beside it, where there is enough of
     /// those that are. What a surface is covered with elsewhere does not begin just where the object hides it.
     fn materials(&self) -> Materials {
-        let around = self.around();
+        let around: Vec<[f32; 3]> = (0..self.hole.len()).into_par_iter().map(|i| self.mean_around(i)).collect();
         let known: Vec<usize> = (0..self.source.len()).filter(|i| self.source[*i]).collect();
         let (mut of, mut all) = (vec![0; self.hole.len()], vec![]);
         let mut left = self.hole.clone();
@@ -482,6 +482,22 @@ fn refine(texture: &Texture, columns: usize, cells: &[usize], large: Shift, by: 
     found.filter(|(error, _)| error.is_finite()).map_or(large, |(_, shift)| shift)
 }
 
+impl Texture {
+    /// Whether two pixels that may be copied show one thing, be it in two lights: what is left of their difference without that
+    /// of their surroundings is small.
+    fn is_one(&self, one: usize, other: usize) -> bool {
+        if self.apart(one, other) <= ANOTHER {
+            return true;
+        }
+        let means = [one, other].map(|at| self.mean_around(at));
+        let off: [f32; 3] = std::array::from_fn(|c| means[0][c] - means[1][c]);
+        let light = off.iter().sum::<f32>() / 3.0;
+        let hue: f32 = off.iter().map(|off| (off - light).abs()).sum();
+        let left: f32 = (0..3).map(|c| (self.rgb[one][c] - self.rgb[other][c] - off[c]).abs()).sum();
+        light.abs() <= SHADED && hue <= HUE && left <= ANOTHER
+    }
+}
+
 /// Gives the copied pixels the colours whose gradients are those of the copies, and that go on from what is known.
 fn join(texture: &mut Texture, copied: &[Option<usize>]) {
     let original = &texture.rgb;
@@ -494,7 +510,7 @@ fn join(texture: &mut Texture, copied: &[Option<usize>]) {
             let Some(j) = neighbour else { continue };
             // A copy goes on in another light, or there is something else, and it ends: beside the hole and at a seam.
             let goes_on = |from: Option<usize>, shift: Shift, there: usize| {
-                from.and_then(|at| texture.source(at, shift)).is_none_or(|on| texture.apart(on, there) <= ANOTHER)
+                from.and_then(|at| texture.source(at, shift)).is_none_or(|on| texture.is_one(on, there))
             };
             let back = shift.map(|v| -v);
             let [here, there] = [i, j].map(|pixel| copied[pixel].unwrap_or(pixel));
@@ -626,6 +642,29 @@ mod tests {
         let inside = || (0..before.len()).filter(|i| before[*i]);
         let count = inside().filter(mixed).count();
         assert!(count * 25 < inside().count(), "{count} of {}", inside().count());
+    }
+
+    /// Speckled stone, in the shade on one side of the hole and in the sun on the other: copies of both meet without a step.
+    #[test]
+    fn of_one_stone_in_two_lights_there_is_no_step() {
+        let size = [200, 120];
+        let hole = |x: usize, _: usize| (60..140).contains(&x);
+        let speck = |x: usize, y: usize| (x * 7919 + y * 104_729 + x * y * 31) % 97;
+        let color = |x: usize, y: usize| {
+            let light = if x < 100 { 0.0 } else { 0.16 };
+            [0.56, 0.53, 0.47].map(|c| c + light + 0.0004 * speck(x, y) as f32)
+        };
+        let (mut stone, _) = texture(size, hole, color);
+        assert!(fill(&mut stone) && !stone.hole.contains(&true));
+        let mean = |x: usize, y: usize| -> f32 {
+            (0..4).flat_map(|v| (0..4).map(move |u| (y + v) * size[0] + x + u)).map(|i| stone.rgb[i][1]).sum::<f32>()
+                / 16.0
+        };
+        for y in (0..116).step_by(4) {
+            let steps = (62..130).map(|x| (mean(x + 4, y) - mean(x, y)).abs());
+            let largest = steps.fold(0.0, f32::max);
+            assert!(largest < 0.08, "{largest} in row {y}");
+        }
     }
 
     #[test]
