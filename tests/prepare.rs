@@ -12,12 +12,12 @@ use gscream_vk::scene::{self, Camera, Scene, synthetic};
 use image::{GrayImage, Luma, Rgb, RgbImage};
 use tempfile::TempDir;
 
-const VIEWS: u32 = 10;
+pub(crate) const VIEWS: u32 = 10;
 const OPTIONS: synthetic::Options =
     synthetic::Options { seed: 2, width: 112, height: 84, train_views: VIEWS, test_views: 2, points: 2000 };
 
 /// `full/`: a small built-in scene with everything it has; `photos/`: its photographs and its model alone.
-fn capture() -> TempDir {
+pub(crate) fn capture() -> TempDir {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let full = folder.path().join("full");
     synthetic::write(&full, &OPTIONS).expect("a writable folder");
@@ -31,15 +31,15 @@ fn capture() -> TempDir {
     folder
 }
 
-fn mask(path: &Path) -> GrayImage {
+pub(crate) fn mask(path: &Path) -> GrayImage {
     image::open(path).expect("a mask").into_luma8()
 }
 
-fn name(view: u32) -> String {
+pub(crate) fn name(view: u32) -> String {
     format!("train_{view:03}")
 }
 
-fn truth(folder: &TempDir, view: u32) -> PathBuf {
+pub(crate) fn truth(folder: &TempDir, view: u32) -> PathBuf {
     folder.path().join("full/masks").join(name(view) + ".png")
 }
 
@@ -54,7 +54,7 @@ fn bounds(mask: &GrayImage, more: u32) -> [u32; 4] {
 
 /// Keeps what is said.
 #[derive(Default)]
-struct Lines(Vec<String>);
+pub(crate) struct Lines(pub Vec<String>);
 
 impl Watch for Lines {
     fn say(&mut self, line: &str) {
@@ -198,7 +198,7 @@ fn one_box_becomes_a_scene() {
 // ---------------------------------------------------------------- transforms.json
 
 /// nerfstudio's file of these cameras.
-fn transforms(views: &[(String, Camera)]) -> serde_json::Value {
+pub(crate) fn transforms(views: &[(String, Camera)]) -> serde_json::Value {
     let frames: Vec<_> = views
         .iter()
         .map(|(name, camera)| {

@@ -82,6 +82,15 @@ fn one_command_removes_an_object_and_is_not_repeated() {
     let (_, said) = run(&format!("{command} --seed 7"));
     let trained = fs::read_to_string(settings).expect("settings");
     assert!(said.contains("trained again") && trained.contains("seed = 7"), "{said}");
+    fs::remove_dir_all(out.join("run/model")).expect("a model");
+    let (_, said) = run(&format!("{command} --seed 7"));
+    assert!(said.contains("the model of the run is gone; trained again"), "{said}");
+    // A file of the user's under an export's name stays.
+    fs::write(out.join("scene.glb"), "mine").expect("writable");
+    let output = program(folder, &format!("{command} --seed 7")).output().expect("it starts");
+    assert!(String::from_utf8_lossy(&output.stderr).contains("is not as an export left it"), "{output:?}");
+    assert_eq!(fs::read(out.join("scene.glb")).expect("a file"), b"mine");
+    fs::remove_file(out.join("scene.glb")).expect("writable");
     // With a limit the plan is said first; the least is named where it is too little; a moment is enough for what is left.
     let within = |minutes: &str| {
         let settings = "--preset demo --fit-steps 150 --export-steps 10 --set train.eval_interval=0 --seed 6";

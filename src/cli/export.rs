@@ -17,6 +17,7 @@ use crate::folder::{self, Lock};
 use crate::formats::{gltf, ply, sog, splat, spz};
 use crate::gpu::Gpu;
 use crate::model::stored::Stored;
+use crate::prepare::record;
 use crate::render::widen;
 use crate::scene::{Camera, Scene, path};
 
@@ -221,6 +222,8 @@ impl Cameras {
 struct File {
     name: String,
     bytes: usize,
+    /// BLAKE3 of its bytes, as hexadecimal digits.
+    hash: String,
     #[serde(flatten)]
     loss: measure::Loss,
 }
@@ -248,6 +251,9 @@ struct Figures {
     seconds: f64,
     loss: serde_json::Map<String, serde_json::Value>,
     files: Vec<File>,
+    /// Files that were there before, as they were left: of other formats, or replaced by this export.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    before: Vec<Listed>,
     #[serde(flatten)]
     cameras: Cameras,
 }
@@ -347,6 +353,55 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// What export.json says of a file.
+#[derive(Serialize, Deserialize)]
+struct Listed {
+    name: String,
+    bytes: u64,
+    hash: Option<String>,
+}
+
+/// Whether the usual files of an export are in a folder, each as its export left it.
+pub(super) fn is_whole(folder: &Path) -> bool {
+    let [files, _] = listed(folder);
+    Format::USUAL.iter().all(|format| files.iter().any(|own| own.name == format.file() && own.is_there(folder)))
+}
+
+/// The files of the last export and those before them.
+fn listed(folder: &Path) -> [Vec<Listed>; 2] {
+    #[derive(Deserialize)]
+    struct Files {
+        files: Vec<Listed>,
+        #[serde(default)]
+        before: Vec<Listed>,
+    }
+    let text = std::fs::read(folder.join(FIGURES)).unwrap_or_default();
+    serde_json::from_slice(&text).map_or_else(|_| [vec![], vec![]], |Files { files, before }| [files, before])
+}
+
+impl Listed {
+    /// Whether the file is in the folder as it was left.
+    fn is_there(&self, folder: &Path) -> bool {
+        let path = folder.join(&self.name);
+        let size = std::fs::metadata(&path).map(|file| file.len());
+        let same = |hash: &String| record::hash(&path).is_ok_and(|found| found == *hash);
+        size.is_ok_and(|size| size == self.bytes) && self.hash.as_ref().is_none_or(same)
+    }
+}
+
+/// The files that exports have left in a folder, as they are there. Refuses to write over others.
+fn keep_others(folder: &Path, formats: &[Format]) -> anyhow::Result<Vec<Listed>> {
+    let own: Vec<Listed> = listed(folder).into_iter().flatten().filter(|own| own.is_there(folder)).collect();
+    let mut names = formats.iter().map(|format| format.file());
+    if let Some(name) = names.find(|name| folder.join(name).exists() && !own.iter().any(|own| own.name == *name)) {
+        bail!(
+            "{}: is not as an export left it, and would be written over: move it away, or choose another --out",
+            folder.join(name).display()
+        );
+    }
+    Ok(own)
+}
+
 /// Writes the files into a folder of which the caller holds the lock. `on_gpu` opens the device, or has it.
 pub(super) fn export(
     args: &Args,
@@ -372,6 +427,7 @@ pub(super) fn export(
         format!("{}: a model alone does not know its cameras; name the scene with --scene", args.model.display())
     })?;
     let scene = shared::load_scene_of_model(scene, &mut settings)?;
+    let before = keep_others(folder, &args.formats())?;
     folder::sweep(folder, |name| name == FIGURES || Format::value_variants().iter().any(|own| own.file() == name));
     on_gpu(Box::new(|gpu| {
         let began = Instant::now();
@@ -399,14 +455,16 @@ pub(super) fn export(
             let loss = made.yardstick.of_cloud(gpu, &read_back, times, &settings.render)?;
             let name = format.file();
             made.losses.push((format!("{name}, {}", size(bytes.len())), loss));
-            written.push((File { name, bytes: bytes.len(), loss }, bytes));
+            let hash = blake3::hash(&bytes).to_hex().to_string();
+            written.push((File { name, bytes: bytes.len(), hash, loss }, bytes));
         }
         let (files, contents): (Vec<File>, Vec<Vec<u8>>) = written.into_iter().unzip();
-        let figures = figures(args, gpu.info().name.clone(), &scene, &made, files, began);
+        let figures = figures(args, gpu.info().name.clone(), &scene, &made, (files, before), began);
         let text = serde_json::to_string_pretty(&figures)? + "\n";
         let named =
             figures.files.iter().zip(&contents).map(|(file, bytes)| (folder.join(&file.name), bytes.as_slice()));
-        let named: Vec<_> = named.chain([(folder.join(FIGURES), text.as_bytes())]).collect();
+        // What lists the files is there before them: whenever it ends, they are known for those of an export.
+        let named: Vec<_> = std::iter::once((folder.join(FIGURES), text.as_bytes())).chain(named).collect();
         export::write(&named)?;
         report(&made, &figures, &args.formats());
         let names: Vec<&str> = figures.files.iter().map(|file| file.name.as_str()).collect();
@@ -415,7 +473,14 @@ pub(super) fn export(
     }))
 }
 
-fn figures(args: &Args, device: String, scene: &Scene, made: &Export, files: Vec<File>, began: Instant) -> Figures {
+fn figures(
+    args: &Args,
+    device: String,
+    scene: &Scene,
+    made: &Export,
+    (files, before): (Vec<File>, Vec<Listed>),
+    began: Instant,
+) -> Figures {
     let command: Vec<String> = std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect();
     let stages = made.losses.iter().take(made.losses.len() - files.len());
     let loss = stages.filter_map(|(name, loss)| Some((name.clone(), serde_json::to_value(loss).ok()?)));
@@ -443,6 +508,7 @@ fn figures(args: &Args, device: String, scene: &Scene, made: &Export, files: Vec
         seconds: began.elapsed().as_secs_f64(),
         loss: loss.collect(),
         files,
+        before,
         cameras: Cameras { background: BLACK, focus, cameras: cameras.collect() },
     }
 }

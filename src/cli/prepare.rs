@@ -167,17 +167,29 @@ fn named(text: &str) -> Result<(String, String), String> {
     Ok((name.to_owned(), value.to_owned()))
 }
 
+/// A name and a file: of the places where the text may be parted, for a name may have a = in it, the first one behind which the
+/// name of a file stands.
+fn named_file(text: &str) -> Result<(String, PathBuf), String> {
+    let parts = text.match_indices('=').map(|(at, _)| (&text[..at], &text[at + 1..]));
+    let found = parts.into_iter().find(|(name, file)| !name.is_empty() && Path::new(file).is_file());
+    let found = found.map(|(name, file)| (name.to_owned(), PathBuf::from(file)));
+    found.map_or_else(|| named(text).map(|(name, file)| (name, file.into())), Ok)
+}
+
 fn mask(text: &str) -> Result<(String, Evidence), String> {
-    named(text).map(|(name, file)| (name, Evidence::Mask(file.into())))
+    named_file(text).map(|(name, file)| (name, Evidence::Mask(file)))
 }
 
 fn strokes(text: &str) -> Result<(String, Evidence), String> {
-    named(text).map(|(name, file)| (name, Evidence::Strokes(file.into())))
+    named_file(text).map(|(name, file)| (name, Evidence::Strokes(file)))
 }
 
 /// A view's name and whole numbers of pixels.
 fn pixels(text: &str) -> Result<(String, Vec<u32>), String> {
-    let (name, numbers) = named(text)?;
+    let (name, numbers) = match text.rsplit_once('=') {
+        Some((name, numbers)) if !name.is_empty() && !numbers.is_empty() => (name.to_owned(), numbers.to_owned()),
+        _ => named(text)?,
+    };
     let number = |word: &str| word.trim().parse().map_err(|_| format!("'{word}' is no whole number of pixels"));
     let numbers = numbers.split(',').map(number).collect::<Result<_, _>>()?;
     Ok((name, numbers))
@@ -302,5 +314,24 @@ impl Watch for Bars {
 
     fn interrupted(&mut self) -> Option<Signal> {
         signals::caught()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A photograph may be called `x=y`, and a mask's file, too.
+    #[test]
+    fn names_may_have_an_equals_sign() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let file = folder.path().join("a=b.png");
+        std::fs::write(&file, "").expect("writable");
+        let path = file.display();
+        assert_eq!(mask(&format!("x=y={path}")), Ok(("x=y".into(), Evidence::Mask(file.clone()))));
+        assert_eq!(mask(&format!("x={path}")), Ok(("x".into(), Evidence::Mask(file.clone()))));
+        assert_eq!(mask("x=not/there.png"), Ok(("x".into(), Evidence::Mask("not/there.png".into()))));
+        assert_eq!(pixels("x=y=1,2"), Ok(("x=y".into(), vec![1, 2])));
+        assert!(mask("x").is_err() && mask("=a.png").is_err() && pixels("x=").is_err());
     }
 }

@@ -144,6 +144,8 @@ pub fn make(scene: &Scene, splats: &mut Splats, masks: &[GrayImage], watch: &mut
                 *value = f32::NAN;
             }
         }
+        // Files count in the model's units.
+        depth.iter_mut().for_each(|z| *z = (f64::from(*z) * scene.unit) as f32);
         known += depth.iter().filter(|v| v.is_finite()).count() as u64;
         all += depth.len() as u64;
         batch.npy(

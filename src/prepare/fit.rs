@@ -68,7 +68,10 @@ impl Observer for Bar<'_> {
 pub fn make(gpu: &Gpu, scene: &Scene, settings: Settings, watch: &mut dyn Watch) -> Result<(Batch, Fit), Error> {
     let work = tempfile::tempdir().map_err(|source| Error::Io { path: std::env::temp_dir(), source })?;
     let mut run = Run::new(gpu, scene, &settings)?;
-    let summary = run.train(work.path(), &mut Bar(watch))?;
+    let summary = run.train(work.path(), &mut Bar(watch)).map_err(|error| match error.signal() {
+        Some(signal) => Error::Interrupted { signal },
+        None => error.cause().into(),
+    })?;
     drop(run);
     let mut batch = Batch::default();
     let model = work.path().join("model");
@@ -78,7 +81,9 @@ pub fn make(gpu: &Gpu, scene: &Scene, settings: Settings, watch: &mut dyn Watch)
         batch.bytes(format!("{FOLDER}/{name}"), bytes, "a short fit to the photographs");
     }
     batch.figures.insert("anchors".into(), f64::from(summary.anchors));
-    Ok((batch, Fit { model: Stored::load(&model)?, settings }))
+    let mut model = Stored::load(&model)?;
+    model.rescale(1.0 / scene.unit);
+    Ok((batch, Fit { model, settings }))
 }
 
 /// A fit that is there already: the splat whose pictures the photographs are.
@@ -91,12 +96,14 @@ pub struct Ready {
 }
 
 impl Fit {
-    /// The fit in a scene's folder.
+    /// The fit in a scene's folder, whose files count in the model's units, in units of `unit` of these.
     ///
     /// # Errors
     /// Files that cannot be read.
-    pub fn read(root: &Path, settings: Settings) -> Result<Self, Error> {
-        Ok(Self { model: Stored::load(&root.join(FOLDER))?, settings })
+    pub fn read(root: &Path, settings: Settings, unit: f64) -> Result<Self, Error> {
+        let mut model = Stored::load(&root.join(FOLDER))?;
+        model.rescale(1.0 / unit);
+        Ok(Self { model, settings })
     }
 
     /// The positions of the anchors or of the plain Gaussians, scene units.

@@ -284,6 +284,16 @@ fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(
     });
     // Mistakes in what the user named are found before anything is written.
     let networks = Networks::open(request)?;
+    let marked = |name: &str| request.object.iter().any(|(named, _)| scene::stem(named) == name);
+    for (name, path) in capture.photographs.iter().filter(|(name, _)| marked(name)) {
+        if scene::is_turned(path)? {
+            let [w, h] = picture_size(path)?;
+            watch.say(&format!(
+                "{name}: its EXIF data turns it where it is shown; cameras, masks, boxes and clicks are of its pixels as they are \
+                 stored, {w}x{h}"
+            ));
+        }
+    }
     let mut object = given(&capture, request)?;
     let _lock = crate::folder::Lock::take(&request.out)?;
     let mut folder = Folder::open(&request.out)?;
@@ -297,7 +307,10 @@ fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(
         ));
     }
     let depth = request.depth;
-    let mut preparation = Preparation { gpu, request, folder: &mut folder, watch, depth, networks, matched: None };
+    // A splat and the cameras that it is seen from have one unit.
+    let unit = if request.ready.is_some() { 1.0 } else { 0.0 };
+    let mut preparation =
+        Preparation { gpu, request, folder: &mut folder, watch, depth, networks, matched: None, unit };
     if request.wants(Step::Poses) {
         preparation.poses(&capture)?;
     }
@@ -363,6 +376,8 @@ struct Preparation<'a> {
     networks: Networks,
     /// The matched photographs, once they were asked for.
     matched: Option<Matched>,
+    /// Of how many of the model's units lengths are counted; 0 until the scene has been read.
+    unit: f64,
 }
 
 /// The networks that the user named, and the hashes of their files.
@@ -431,11 +446,14 @@ impl Preparation<'_> {
 
     /// The scene at the size of the fit, without anything but photographs, cameras and points.
     fn small(&mut self) -> Result<Scene, Error> {
-        self.load(self.request.fit_side, false)
+        let scene = self.load(self.request.fit_side, false)?;
+        self.unit = scene.unit;
+        Ok(scene)
     }
 
     /// The photographs with their cameras, the longer side of the largest at most about `side` pixels, without the object's
-    /// shadow where it has been found and that is wanted.
+    /// shadow where it has been found and that is wanted. Lengths are counted in a unit of the scene's own: the model's may be
+    /// any.
     fn load(&self, side: u32, relight: bool) -> Result<Scene, Error> {
         let images = self.folder.root().join(poses::IMAGES);
         let mut longest = 1;
@@ -452,6 +470,7 @@ impl Preparation<'_> {
         };
         let mut scene = scene::load(self.folder.root(), &config)?;
         scene.test.clear();
+        scene::normalize(&mut scene, self.unit);
         Ok(scene)
     }
 
@@ -463,7 +482,7 @@ impl Preparation<'_> {
         let fingerprint = serde_json::to_string(&Fingerprint::of(scene)).expect("names and hashes");
         let inputs = Inputs::default().with(fingerprint).with(settings.to_toml()).finish();
         if self.skips(Step::Fit, &inputs)? {
-            return Fit::read(self.folder.root(), settings);
+            return Fit::read(self.folder.root(), settings, scene.unit);
         }
         if !self.request.wants(Step::Fit) && self.folder.record().steps.contains_key(Step::Fit.name()) {
             self.watch.say("fit: the photographs or the settings have changed since; the fit is made again");

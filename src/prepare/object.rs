@@ -1,6 +1,6 @@
 //! What the user says that the object is, and the masks that this makes.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use image::GrayImage;
@@ -104,6 +104,8 @@ pub(super) fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<Str
             .find(|(name, evidence)| scene::stem(name) == stem && kind(evidence))
             .map(|(_, evidence)| evidence)
     };
+    // Views of which a mask or a box was named: of several the object is what any of them covers.
+    let mut named: BTreeSet<String> = BTreeSet::new();
     for (name, evidence) in &request.object {
         let stem = scene::stem(name).to_owned();
         let option = evidence.option();
@@ -173,7 +175,18 @@ pub(super) fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<Str
                  has it nearer to the middle"
             )));
         }
-        all.insert(stem, Given { mask, ..given });
+        let joins = matches!(evidence, Evidence::Mask(_) | Evidence::Box(_)) && !marked;
+        let given = match all.remove(&stem) {
+            Some(mut before) if joins && named.contains(&stem) => {
+                before.mask.iter_mut().zip(mask.as_raw()).for_each(|(one, other)| *one = (*one).max(*other));
+                Given { mask: before.mask, from: format!("{}, {}", before.from, given.from) }
+            }
+            _ => Given { mask, ..given },
+        };
+        if joins {
+            named.insert(stem.clone());
+        }
+        all.insert(stem, given);
     }
     Ok(all)
 }
@@ -209,9 +222,16 @@ fn of_marks(request: &Request, stem: &str, photograph: &Path, size: [u32; 2]) ->
     let picture = resample::photograph(&scene::photograph(photograph, 1)?, click::working(size));
     let mask = click::mask(&picture, &marks, &Cues::default());
     if mask.as_raw().iter().all(|v| *v == 0) {
-        return Err(Error::Request(format!(
-            "--not {stem}: says nothing without a --click, --lasso or --box in the same view; say where the object is"
-        )));
+        let says_where = marks.iter().any(|mark| !matches!(mark, Mark::Background { .. }));
+        return Err(Error::Request(if says_where {
+            format!(
+                "{stem}: nothing at its marks differs from what is around them; draw the --lasso or --box closer, or give a mask"
+            )
+        } else {
+            format!(
+                "--not {stem}: says nothing without a --click, --lasso or --box in the same view; say where the object is"
+            )
+        }));
     }
     let own = [mask.width(), mask.height()];
     let mask = masks::threshold(&masks::parts(&mask, own), own, size, 0.5);

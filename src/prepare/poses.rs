@@ -18,8 +18,8 @@ use serde::Deserialize;
 use super::lens::{self, Pinhole};
 use super::program;
 use super::record::{self, Batch, Inputs};
-use super::{Error, Watch};
-use crate::scene::{self, Camera, colmap, undistort};
+use super::{Error, Step, Watch};
+use crate::scene::{self, Camera, HOLE, colmap, undistort};
 use crate::statistics::median;
 
 /// Where a scene keeps its photographs and its model.
@@ -125,17 +125,31 @@ pub fn find(folder: &Path) -> Result<Capture, Error> {
         return Err(Error::File { path: folder.to_owned(), what: "there is no such folder".into() });
     }
     let transforms = folder.join("transforms.json");
-    let model = model_files(folder);
+    let made = Made::of(folder)?;
+    let model = model_files(folder).filter(|files| !files.iter().any(|file| made.has(file)));
     if model.is_none() && transforms.is_file() {
         return from_transforms(folder, &transforms);
     }
     let images = ["images", "images_2", "images_4", "images_8"].map(|name| folder.join(name));
-    let images = images.into_iter().find(|path| path.is_dir()).unwrap_or_else(|| folder.to_owned());
-    let photographs = scene::pictures(&images)?;
+    let has_photographs = |path: &PathBuf| {
+        Ok::<_, Error>(path.is_dir() && scene::pictures(path)?.values().any(|picture| !made.has(picture)))
+    };
+    let mut found = None;
+    for path in images {
+        if has_photographs(&path)? {
+            found = Some(path);
+            break;
+        }
+    }
+    let images = found.unwrap_or_else(|| folder.to_owned());
+    let mut photographs = scene::pictures(&images)?;
+    if images == folder {
+        photographs.retain(|_, path| !made.has(path) && !is_beside(folder, path));
+    }
     if photographs.is_empty() {
         return Err(scene::Error::NoImages { scene: folder.to_owned() }.into());
     }
-    let masks = if images == folder { BTreeMap::new() } else { existing(&folder.join("masks"))? };
+    let masks = existing(&folder.join("masks"))?;
     let masks = masks.into_iter().map(|(name, path)| (name, (path, false))).collect();
     let pinholes = if model.is_some() { pinholes(folder, &photographs)? } else { BTreeMap::new() };
     let source = model.map_or(Source::Photographs(images), Source::Colmap);
@@ -148,6 +162,47 @@ pub fn find(folder: &Path) -> Result<Capture, Error> {
         pinholes,
         renamed: vec![],
     })
+}
+
+/// Folders of pictures that are no photographs, where these lie in the capture's own folder.
+const BESIDE: [&str; 9] =
+    ["masks", "test_masks", "test_images", "depth", "disparity", "reference", HOLE, "relight", "prepare"];
+/// Files that say that a folder is the program's own.
+const MADE: [&str; 4] = [record::RECORD, "remove.json", "run.json", "export.json"];
+
+/// Whether a picture below a folder of photographs is none of them: of a folder of masks or the like, or of one that the program
+/// has made there.
+fn is_beside(folder: &Path, picture: &Path) -> bool {
+    let below = picture.strip_prefix(folder).unwrap_or(picture);
+    let is_named = |name: &std::ffi::OsStr| BESIDE.iter().any(|beside| name == *beside);
+    let first = below.components().next().filter(|_| below.components().count() > 1);
+    let within = picture.ancestors().skip(1).take_while(|path| *path != folder);
+    first.is_some_and(|first| is_named(first.as_os_str()))
+        || within.into_iter().any(|path| MADE.iter().any(|name| path.join(name).is_file()))
+}
+
+/// The files that the step poses has written into a folder and that are as it left them.
+struct Made(BTreeSet<PathBuf>);
+
+impl Made {
+    fn of(folder: &Path) -> Result<Self, Error> {
+        if !folder.join(record::RECORD).is_file() {
+            return Ok(Self(BTreeSet::new()));
+        }
+        let own = record::Folder::open(folder)?;
+        let files = own.record().steps.get(Step::Poses.name()).map(|step| step.files.keys());
+        let mut made = BTreeSet::new();
+        for path in files.into_iter().flatten() {
+            if !own.is_users(path)? {
+                made.insert(folder.join(path));
+            }
+        }
+        Ok(Self(made))
+    }
+
+    fn has(&self, file: &Path) -> bool {
+        self.0.contains(file)
+    }
 }
 
 /// The pinholes of the photographs whose lenses training does not project with.
@@ -453,6 +508,15 @@ impl Capture {
         let option = |name: &str, value: &std::ffi::OsStr| [OsString::from(name), value.to_owned()];
         let (database, models) = (option("--database_path", database.as_ref()), models);
         let pictures = option("--image_path", images.as_ref());
+        // Below the photographs may lie masks and what the program has made.
+        let list = work.path().join("photographs.txt");
+        let names: Vec<String> = self
+            .photographs
+            .values()
+            .filter_map(|path| Some(path.strip_prefix(images).ok()?.to_string_lossy().into_owned() + "\n"))
+            .collect();
+        std::fs::write(&list, names.concat()).map_err(|source| Error::Io { path: list.clone(), source })?;
+        let listed = option("--image_list_path", list.as_ref());
         let camera = [
             option("--ImageReader.single_camera", single.as_ref()),
             option("--ImageReader.camera_model", "SIMPLE_RADIAL".as_ref()),
@@ -460,7 +524,7 @@ impl Capture {
         watch.say("poses: features of the photographs (colmap feature_extractor)");
         let on_cpu =
             without_gpu("feature_extractor", ["--FeatureExtraction.use_gpu", "--SiftExtraction.use_gpu"], watch)?;
-        run("feature_extractor", &[&database, &pictures, camera.as_flattened(), &on_cpu].concat(), watch)?;
+        run("feature_extractor", &[&database, &pictures, &listed, camera.as_flattened(), &on_cpu].concat(), watch)?;
         // All pairs, as long as there are not too many of them; then those of neighbouring names.
         let matcher = if self.photographs.len() <= 200 { "exhaustive_matcher" } else { "sequential_matcher" };
         watch.say(&format!("poses: matches between the photographs (colmap {matcher})"));

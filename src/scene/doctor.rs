@@ -291,7 +291,7 @@ fn mask_findings(scene: &Scene, report: &mut Report) {
     if mean > 0.5 {
         let percent = 100.0 * mean;
         let message = format!(
-            "the masks cover {percent:.0} % of the pictures: they seem to be 0 on the object; --set scene.invert_masks=true"
+            "the masks cover {percent:.0} % of the pictures: they seem to be 0 on the object: invert the masks, or say --set scene.invert_masks=true where train is to read them so"
         );
         report.add(Severity::Problem, "masks", None, message);
         return;

@@ -49,7 +49,7 @@ use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 
 pub use camera::{Camera, distort, undistort};
-pub use condition::{condition, footprint};
+pub use condition::{condition, footprint, normalize};
 pub(crate) use condition::{on_object, samples};
 use config::STEREO_PRIOR;
 pub use config::{Config, NONE};
@@ -58,7 +58,7 @@ pub(crate) use exposure::even_out;
 pub use hole::{DOUBTFUL, HOLE, Hole, MADE_WITH};
 pub(crate) use layout::{PICTURES, stem};
 pub use note::{Note, Notes};
-pub use picture::{decode, dimensions, jpeg, object_mask};
+pub use picture::{decode, dimensions, is_turned, jpeg, object_mask};
 pub(crate) use priors::rank_correlation;
 pub use priors::read as read_prior;
 pub use priors::{Prior, PriorKind, in_own_range, own_range};

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use image::codecs::jpeg::JpegEncoder;
+use image::metadata::Orientation;
 use image::{ColorType, DynamicImage, GrayImage, ImageDecoder, ImageReader, Limits, RgbImage};
 
 use super::Error;
@@ -56,6 +57,16 @@ fn open(path: &Path) -> Result<impl ImageDecoder, Error> {
 /// No picture, or one that is too large to be read.
 pub fn dimensions(path: &Path) -> Result<[u32; 2], Error> {
     open(path).map(|decoder| decoder.dimensions().into())
+}
+
+/// Whether the picture's EXIF data says that it is to be turned or mirrored when it is shown. It is read as it is stored.
+///
+/// # Errors
+/// As [`dimensions`].
+pub fn is_turned(path: &Path) -> Result<bool, Error> {
+    let mut decoder = open(path)?;
+    let orientation = decoder.orientation();
+    Ok(orientation.is_ok_and(|orientation| orientation != Orientation::NoTransforms))
 }
 
 /// Decodes a picture by its content, whatever its extension says.

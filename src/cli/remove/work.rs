@@ -271,7 +271,7 @@ impl Job<'_> {
             inputs = inputs.with(record::hash(&run.join(MODEL).join(name))?);
         }
         let inputs = inputs.finish();
-        if record.export == inputs && export::files().all(|name| root.join(name).is_file()) {
+        if record.export == inputs && export::is_whole(root) {
             eprintln!("export: nothing has changed");
             return Ok(());
         }
@@ -294,13 +294,17 @@ impl Job<'_> {
         let time = minutes.unwrap_or(0.0).to_le_bytes();
         let inputs = Inputs::default().with(fingerprint).with(loaded.settings.to_toml()).with(time).finish();
         let there = RunRecord::read(run).ok();
-        let same = there.as_ref().is_some_and(|there| there.inputs.as_ref() == Some(&inputs));
+        let made = there.as_ref().is_some_and(|there| there.inputs.as_ref() == Some(&inputs));
+        let is_lost = |there: &RunRecord| there.complete.is_some() && !run.join(MODEL).join(POINT_CLOUD).is_file();
+        let lost = made && there.as_ref().is_some_and(is_lost);
+        let same = made && !lost;
         if let Some(there) = &there {
             match there.complete {
                 Some(steps) if same => {
                     eprintln!("train: nothing has changed ({steps} steps)");
                     return Ok(());
                 }
+                _ if lost => eprintln!("train: the model of the run is gone; trained again"),
                 _ if !same => {
                     eprintln!("train: the masks, the photographs or the settings have changed; trained again")
                 }

@@ -18,7 +18,7 @@ const POINTS: usize = 20_000;
 const GRID: f64 = 32.0;
 
 /// Divides all lengths of the scene by `unit`, or for 0 by the one found from it, and remembers it.
-pub(super) fn normalize(scene: &mut Scene, unit: f64) {
+pub fn normalize(scene: &mut Scene, unit: f64) {
     let unit = if unit > 0.0 { unit } else { find(scene).unwrap_or(1.0) };
     if unit == 1.0 {
         return;

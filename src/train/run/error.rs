@@ -92,6 +92,14 @@ impl Error {
             _ => None,
         }
     }
+
+    /// What ended the run, without how to go on with its folder.
+    pub fn cause(self) -> Self {
+        match self {
+            Self::Stopped { source, .. } => *source,
+            other => other,
+        }
+    }
 }
 
 fn how_to_go_on(source: &Error, kept: Option<u32>, folder: &Path) -> String {

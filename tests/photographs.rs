@@ -1,0 +1,176 @@
+//! Captures as users have them: photographs beside what the program made of them, several marks in one view, any unit.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use gscream_vk::gpu::testing;
+use gscream_vk::prepare::{self, Evidence, Request, Step, poses};
+use gscream_vk::scene::{self, Camera};
+use image::GrayImage;
+
+use crate::prepare::{Lines, VIEWS, capture, mask, name, transforms, truth};
+
+fn files(folder: &Path) -> Vec<PathBuf> {
+    fs::read_dir(folder).expect("a folder").map(|entry| entry.expect("a file").path()).collect()
+}
+
+fn prepared(request: &Request) -> Vec<String> {
+    let mut lines = Lines::default();
+    prepare::prepare(&testing::gpu(), request, &mut lines).expect("a scene");
+    lines.0
+}
+
+/// Photographs lie flat beside their masks, and the scene is made among them: neither is taken for photographs, however often.
+#[test]
+fn what_lies_among_the_photographs_is_none() {
+    let folder = capture();
+    let photos = folder.path().join("photos");
+    for picture in files(&photos.join("images")) {
+        fs::rename(&picture, photos.join(picture.file_name().expect("a name"))).expect("writable");
+    }
+    fs::remove_dir(photos.join("images")).expect("empty");
+    fs::create_dir(photos.join("masks")).expect("writable");
+    let one = photos.join("masks").join(name(3) + ".png");
+    fs::copy(truth(&folder, 3), &one).expect("writable");
+    let mut request = Request::new(&photos, photos.join("removed/scene"));
+    request.only = vec![Step::Poses];
+    for round in 0..2 {
+        let found = poses::find(&photos).expect("a capture");
+        assert_eq!(found.photographs.len(), VIEWS as usize, "{round}");
+        assert!(found.masks.keys().eq([&name(3)]), "{:?}", found.masks);
+        let said = prepared(&request);
+        assert_eq!(files(&request.out.join("images")).len(), VIEWS as usize);
+        assert_eq!(said.iter().any(|line| line.contains("nothing has changed")), round == 1, "{said:?}");
+    }
+}
+
+/// A scene that is made in the capture's own folder is made once: the model that came of it is not taken for one that was there.
+#[test]
+fn in_its_own_folder_a_scene_stays() {
+    let folder = capture();
+    let full = scene::load(&folder.path().join("full"), &scene::Config::default()).expect("a scene");
+    let views: Vec<(String, Camera)> = full.train.iter().map(|view| (view.name.clone(), view.camera)).collect();
+    let photos = folder.path().join("photos");
+    fs::remove_dir_all(photos.join("sparse")).expect("a folder");
+    fs::write(photos.join("transforms.json"), transforms(&views).to_string()).expect("writable");
+    let mut request = Request::new(&photos, &photos);
+    request.only = vec![Step::Poses];
+    for round in 0..3 {
+        let said = prepared(&request);
+        assert!(files(&photos.join("sparse/0")).len() > 2, "{round}: {said:?}");
+        assert_eq!(said.iter().any(|line| line.contains("nothing has changed")), round > 0, "{round}: {said:?}");
+    }
+}
+
+/// The masks that are made of this evidence in a view.
+fn marked(evidence: &dyn Fn(&Path) -> Vec<Evidence>) -> GrayImage {
+    let folder = capture();
+    let mut request = Request::new(folder.path().join("photos"), folder.path().join("scene"));
+    (request.fit_steps, request.fit_side) = (30, 64);
+    request.only = vec![Step::Poses, Step::Fit, Step::Masks];
+    request.object = evidence(&truth(&folder, 4)).into_iter().map(|evidence| (name(4), evidence)).collect();
+    prepared(&request);
+    mask(&request.out.join("masks").join(name(4) + ".png"))
+}
+
+/// Two masks of one view are one object: what any of them covers.
+#[test]
+fn several_masks_of_a_view_count_together() {
+    let halves = |whole: &Path| -> Vec<Evidence> {
+        let full = mask(whole);
+        let part = |first: bool| {
+            let mut half = full.clone();
+            half.enumerate_pixels_mut().filter(|(x, ..)| (x % 7 < 3) == first).for_each(|(.., v)| v.0[0] = 0);
+            let path = whole.with_file_name(format!("half-{first}.png"));
+            half.save(&path).expect("writable");
+            Evidence::Mask(path)
+        };
+        [true, false].map(part).to_vec()
+    };
+    let whole = |whole: &Path| vec![Evidence::Mask(whole.to_owned())];
+    assert_eq!(marked(&halves), marked(&whole));
+}
+
+/// Multiplies the lengths of a COLMAP model.
+fn scale(model: &Path, by: f64) {
+    let word = |bytes: &[u8], at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().expect("eight bytes"));
+    let lengths = |bytes: &mut [u8], at: usize| {
+        for at in (at..at + 24).step_by(8) {
+            let scaled = by * f64::from_bits(word(bytes, at));
+            bytes[at..at + 8].copy_from_slice(&scaled.to_le_bytes());
+        }
+    };
+    let change = |file: &str, one: &dyn Fn(&mut [u8], usize) -> usize| {
+        let path = model.join(file);
+        let mut bytes = fs::read(&path).expect("a model");
+        (0..word(&bytes, 0)).fold(8, |at, _| one(&mut bytes, at));
+        fs::write(path, bytes).expect("writable");
+    };
+    // Id, quaternion, translation, camera, name, points of 24 bytes.
+    change("images.bin", &|bytes, at| {
+        lengths(bytes, at + 36);
+        let end = (at + 64..).find(|i| bytes[*i] == 0).expect("the name's end");
+        end + 9 + 24 * word(bytes, end + 1) as usize
+    });
+    // Id, position, colour, error, tracks of 8 bytes.
+    change("points3D.bin", &|bytes, at| {
+        lengths(bytes, at + 8);
+        at + 51 + 8 * word(bytes, at + 43) as usize
+    });
+}
+
+/// Metres, millimetres or the width of the town: masks are the same to the byte, and depths are in the model's unit.
+#[test]
+fn the_models_unit_changes_nothing() {
+    let made = |by: f64| {
+        let folder = capture();
+        let photos = folder.path().join("photos");
+        scale(&photos.join("sparse/0"), by);
+        let mut request = Request::new(&photos, folder.path().join("scene"));
+        (request.fit_steps, request.fit_side) = (60, 84);
+        request.only = vec![Step::Poses, Step::Fit, Step::Masks, Step::Depth];
+        request.object = vec![(name(4), Evidence::Mask(truth(&folder, 4)))];
+        prepared(&request);
+        let masks: Vec<GrayImage> =
+            (0..VIEWS).map(|view| mask(&request.out.join("masks").join(name(view) + ".png"))).collect();
+        let config = scene::Config { seed_hole: false, ..scene::Config::default() };
+        let scene = scene::load(&request.out, &config).expect("a scene");
+        let depths = scene.train.iter().flat_map(|view| view.prior.as_ref().expect("a prior").values.clone());
+        (masks, depths.map(|z| z / by as f32).collect::<Vec<f32>>())
+    };
+    let (masks, depths) = made(1.0);
+    let known = depths.iter().filter(|z| z.is_finite()).count();
+    assert!(known > 1000, "{known}");
+    // Powers of two: but for the logarithms of sizes, which are kept to 1e-6, nothing is rounded, and the two come to one
+    // another but where a depth is just known or just not.
+    for by in [1024.0, 1.0 / 1024.0] {
+        let (scaled_masks, scaled_depths) = made(by);
+        assert!(scaled_masks == masks, "masks at {by}");
+        let apart = |(a, b): &(&f32, &f32)| !((**a / **b - 1.0).abs() < 1e-3 || a.is_nan() && b.is_nan());
+        let differ = depths.iter().zip(&scaled_depths).filter(apart).count();
+        assert!(differ * 100 < known, "{differ} of {known} depths at {by}");
+    }
+}
+
+/// What EXIF says about turning is not followed, and that is said of a photograph with a mark.
+#[test]
+fn turned_photographs_are_named() {
+    let folder = capture();
+    let images = folder.path().join("photos/images");
+    let png = images.join(name(2) + ".png");
+    let picture = image::open(&png).expect("a picture").into_rgb8();
+    let mut bytes = vec![];
+    let mut encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut bytes, 95);
+    // TIFF with one entry: orientation, a short, 6.
+    let exif = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0".to_vec();
+    image::ImageEncoder::set_exif_metadata(&mut encoder, exif).expect("JPEG has EXIF");
+    picture.write_with_encoder(encoder).expect("a picture");
+    fs::remove_file(png).and_then(|()| fs::write(images.join(name(2) + ".jpg"), bytes)).expect("writable");
+    let mut request = Request::new(folder.path().join("photos"), folder.path().join("scene"));
+    request.only = vec![Step::Poses];
+    for (view, turned) in [(2, true), (3, false)] {
+        request.object = vec![(name(view), Evidence::Box([4, 4, 30, 30]))];
+        let said = prepared(&request);
+        assert_eq!(said.iter().any(|line| line.contains("EXIF")), turned, "{said:?}");
+    }
+}
