@@ -346,7 +346,7 @@ fn a_disk_that_fills_up_leaves_nothing() {
     let output = Command::new("bash").args(["-c", &script]).current_dir(folder).output().expect("a shell");
     let text = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{text}");
-    assert!(text.contains("error: first/scene.ply: cannot be written: ") && text.contains("nothing"), "{text}");
+    assert!(text.contains("error: first/export.json: cannot be written: ") && text.contains("nothing"), "{text}");
     assert!(fs::read(folder.join("first/scene.ply")).expect("still there") == before, "the old file is untouched");
     let names: Vec<PathBuf> =
         fs::read_dir(folder.join("first")).expect("a folder").map(|e| e.expect("readable").path()).collect();
