@@ -152,7 +152,7 @@ fn the_models_unit_changes_nothing() {
     }
 }
 
-/// What EXIF says about turning is not followed, and that is said of a photograph with a mark.
+/// A photograph that EXIF turns is read as it is stored, and that is said where it has a mark.
 #[test]
 fn turned_photographs_are_named() {
     let folder = capture();

@@ -353,7 +353,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What export.json says of a file.
+/// A file as export.json lists it.
 #[derive(Serialize, Deserialize)]
 struct Listed {
     name: String,

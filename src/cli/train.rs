@@ -312,7 +312,7 @@ pub(super) struct Manner {
     pub clock: Option<minutes::Clock>,
     /// Ends as by Ctrl-C once this is set.
     pub stop: Stop,
-    /// What a new run is made of, as its record keeps it.
+    /// Hash of all that a new run is made of, as its record keeps it.
     pub inputs: Option<String>,
 }
 

@@ -6,6 +6,7 @@ pub mod fit;
 pub mod graph_cut;
 pub mod hole;
 pub mod lens;
+mod made;
 pub mod masks;
 mod min_cut;
 pub mod network;

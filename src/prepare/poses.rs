@@ -16,10 +16,11 @@ use rand_pcg::Pcg64;
 use serde::Deserialize;
 
 use super::lens::{self, Pinhole};
+use super::made::{Made, is_beside};
 use super::program;
 use super::record::{self, Batch, Inputs};
-use super::{Error, Step, Watch};
-use crate::scene::{self, Camera, HOLE, colmap, undistort};
+use super::{Error, Watch};
+use crate::scene::{self, Camera, colmap, undistort};
 use crate::statistics::median;
 
 /// Where a scene keeps its photographs and its model.
@@ -162,47 +163,6 @@ pub fn find(folder: &Path) -> Result<Capture, Error> {
         pinholes,
         renamed: vec![],
     })
-}
-
-/// Folders of pictures that are no photographs, where these lie in the capture's own folder.
-const BESIDE: [&str; 9] =
-    ["masks", "test_masks", "test_images", "depth", "disparity", "reference", HOLE, "relight", "prepare"];
-/// Files that say that a folder is the program's own.
-const MADE: [&str; 4] = [record::RECORD, "remove.json", "run.json", "export.json"];
-
-/// Whether a picture below a folder of photographs is none of them: of a folder of masks or the like, or of one that the program
-/// has made there.
-fn is_beside(folder: &Path, picture: &Path) -> bool {
-    let below = picture.strip_prefix(folder).unwrap_or(picture);
-    let is_named = |name: &std::ffi::OsStr| BESIDE.iter().any(|beside| name == *beside);
-    let first = below.components().next().filter(|_| below.components().count() > 1);
-    let within = picture.ancestors().skip(1).take_while(|path| *path != folder);
-    first.is_some_and(|first| is_named(first.as_os_str()))
-        || within.into_iter().any(|path| MADE.iter().any(|name| path.join(name).is_file()))
-}
-
-/// The files that the step poses has written into a folder and that are as it left them.
-struct Made(BTreeSet<PathBuf>);
-
-impl Made {
-    fn of(folder: &Path) -> Result<Self, Error> {
-        if !folder.join(record::RECORD).is_file() {
-            return Ok(Self(BTreeSet::new()));
-        }
-        let own = record::Folder::open(folder)?;
-        let files = own.record().steps.get(Step::Poses.name()).map(|step| step.files.keys());
-        let mut made = BTreeSet::new();
-        for path in files.into_iter().flatten() {
-            if !own.is_users(path)? {
-                made.insert(folder.join(path));
-            }
-        }
-        Ok(Self(made))
-    }
-
-    fn has(&self, file: &Path) -> bool {
-        self.0.contains(file)
-    }
 }
 
 /// The pinholes of the photographs whose lenses training does not project with.

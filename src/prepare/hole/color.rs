@@ -28,8 +28,8 @@ const HIDDEN: f64 = 1e3;
 const MANY: usize = 16;
 /// Mean difference of the channels from the median up to which photographs agree on the colour of a point.
 const ALIKE: f64 = 0.04;
-/// What all photographs have right beside the object is believed where so many sites within so many sites of it, that others show
-/// farther from the object, are of its colour, and of its depth up to this part.
+/// A site that all photographs have right beside the object is believed where so many sites within so many sites of it, which they
+/// show farther from the object, are of its colour, and of its depth up to this part.
 const LIKE_RIM: usize = 3;
 const RIM: i64 = 12;
 const NEAR_RIM: f64 = 0.25;
@@ -152,7 +152,7 @@ struct Told {
     doubtful: bool,
 }
 
-/// What is asked of a site's witnesses.
+/// The witnesses of a site, and the colours that they show.
 struct Asked {
     /// Photographs that show it, with the cost of each.
     shown: Vec<(usize, f64)>,

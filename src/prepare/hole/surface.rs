@@ -144,8 +144,8 @@ impl Sight {
         self.depth_from(place.map(|v| v.floor() as i64), place)
     }
 
-    /// The same where surfaces end in smooth lines: the surface is that of most of the nine sites around the place, the nearer
-    /// ones counting more. [`Sight::depth_at`] has the nearest site's, so that an end is a staircase of sites.
+    /// Depth z at a place in sites, of surfaces that end in smooth lines: the surface is that of most of the nine sites around the
+    /// place, the nearer ones counting more. [`Sight::depth_at`] has the nearest site's, so that an end is a staircase of sites.
     pub fn smooth_depth_at(&self, place: [f64; 2]) -> f64 {
         let own = place.map(|v| v.floor() as i64);
         let Some(surface) = self.surface_from(own) else { return f64::NAN };

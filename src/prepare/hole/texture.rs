@@ -44,7 +44,7 @@ const SAMPLES: usize = 128;
 const SHORTEST: f64 = 0.06;
 /// Sum of the differences of the channels from which on a copy shows something else than what is known there.
 const ANOTHER: f32 = 0.3;
-/// What surroundings of one thing in two lights may differ by: the mean of the channels, and what is left of them without it.
+/// Largest difference of the surroundings of one thing in two lights: of the mean of the channels, and of the channels without it.
 const SHADED: f32 = 0.25;
 const HUE: f32 = 0.12;
 /// Mean difference of the channels up to which surroundings are of one material in another light, which costs nothing: copies

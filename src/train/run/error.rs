@@ -93,7 +93,7 @@ impl Error {
         }
     }
 
-    /// What ended the run, without how to go on with its folder.
+    /// The error that ended the run, without how to go on with its folder.
     pub fn cause(self) -> Self {
         match self {
             Self::Stopped { source, .. } => *source,
