@@ -62,7 +62,7 @@ impl Watch for Lines {
     }
 }
 
-fn ious(folder: &TempDir, scene: &Path, given: &[u32]) -> Vec<f64> {
+pub(crate) fn ious(folder: &TempDir, scene: &Path, given: &[u32]) -> Vec<f64> {
     let others = (0..VIEWS).filter(|view| !given.contains(view));
     let of = |view| {
         let carried = mask(&scene.join("masks").join(name(view) + ".png"));

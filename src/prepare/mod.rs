@@ -308,10 +308,8 @@ fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(
         ));
     }
     let depth = request.depth;
-    // A splat and the cameras that it is seen from have one unit.
-    let unit = if request.ready.is_some() { 1.0 } else { 0.0 };
     let mut preparation =
-        Preparation { gpu, request, folder: &mut folder, watch, depth, networks, matched: None, unit };
+        Preparation { gpu, request, folder: &mut folder, watch, depth, networks, matched: None, unit: 1.0 };
     if request.wants(Step::Poses) {
         preparation.poses(&capture)?;
     }
@@ -377,7 +375,7 @@ struct Preparation<'a> {
     networks: Networks,
     /// The matched photographs, once they were asked for.
     matched: Option<Matched>,
-    /// Of how many of the model's units lengths are counted; 0 until the scene has been read.
+    /// Lengths are counted in so many of the model's units.
     unit: f64,
 }
 
@@ -447,14 +445,18 @@ impl Preparation<'_> {
 
     /// The scene at the size of the fit, without anything but photographs, cameras and points.
     fn small(&mut self) -> Result<Scene, Error> {
-        let scene = self.load(self.request.fit_side, false)?;
-        self.unit = scene.unit;
+        let mut scene = self.load(self.request.fit_side, false)?;
+        // A splat and the cameras that it is seen from have one unit.
+        let typical = scene::typical(&scene).filter(|_| self.request.ready.is_none());
+        if let Some(length) = typical.filter(|length| !USUAL.contains(length)) {
+            self.unit = length / SCALED;
+            scene::normalize(&mut scene, self.unit);
+        }
         Ok(scene)
     }
 
     /// The photographs with their cameras, the longer side of the largest at most about `side` pixels, without the object's
-    /// shadow where it has been found and that is wanted. Lengths are counted in a unit of the scene's own: the model's may be
-    /// any.
+    /// shadow where it has been found and that is wanted.
     fn load(&self, side: u32, relight: bool) -> Result<Scene, Error> {
         let images = self.folder.root().join(poses::IMAGES);
         let mut longest = 1;
@@ -790,6 +792,12 @@ impl Preparation<'_> {
         Ok(())
     }
 }
+
+/// The fit is made in the model's own units where a third of the median depth ([`scene::typical`]) is so many of them, and elsewhere
+/// in units of which it is [`SCALED`]. Fits of sparse points differ with it: those of can-half, at 5.0, found nothing at 1.
+const USUAL: std::ops::Range<f64> = 0.125..16.0;
+/// See [`USUAL`].
+const SCALED: f64 = 4.0;
 
 /// A view shows a side of the object that no masked view shows if more than this part of the object there is unseen.
 const THIN: f64 = 0.3;

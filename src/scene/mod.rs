@@ -49,7 +49,7 @@ use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 
 pub use camera::{Camera, distort, undistort};
-pub use condition::{condition, footprint, normalize};
+pub use condition::{condition, footprint, normalize, typical};
 pub(crate) use condition::{on_object, samples};
 use config::STEREO_PRIOR;
 pub use config::{Config, NONE};

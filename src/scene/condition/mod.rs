@@ -27,7 +27,7 @@ use super::{Config, STEREO_PRIOR, Scene, exposure};
 
 pub(crate) use points::on_object;
 pub(crate) use sparse::samples;
-pub use unit::{footprint, normalize};
+pub use unit::{footprint, normalize, typical};
 
 /// Makes a scene that was read ready for training, and adds what was done to its notes.
 pub fn condition(scene: &mut Scene, config: &Config) {

@@ -19,7 +19,7 @@ const GRID: f64 = 32.0;
 
 /// Divides all lengths of the scene by `unit`, or for 0 by the one found from it, and remembers it.
 pub fn normalize(scene: &mut Scene, unit: f64) {
-    let unit = if unit > 0.0 { unit } else { find(scene).unwrap_or(1.0) };
+    let unit = if unit > 0.0 { unit } else { typical(scene).unwrap_or(1.0) };
     if unit == 1.0 {
         return;
     }
@@ -30,12 +30,14 @@ pub fn normalize(scene: &mut Scene, unit: f64) {
 /// World length that a pixel of the train views covers at the median depth of the points, on the same grid as the unit;
 /// `None` where no view sees a point.
 pub fn footprint(scene: &Scene) -> Option<f64> {
-    let depth = MEDIAN_DEPTH * find(scene)?;
+    let depth = MEDIAN_DEPTH * typical(scene)?;
     let pixels = scene.train.iter().map(|v| 1.0 / f64::from(v.camera.focal[0].max(v.camera.focal[1])));
     Some(depth * median(pixels)?)
 }
 
-fn find(scene: &Scene) -> Option<f64> {
+/// The length that counts as one unless another is asked for: a third of the median depth of the points; `None` where no view
+/// sees a point.
+pub fn typical(scene: &Scene) -> Option<f64> {
     let cameras: Vec<&Camera> = scene.train.iter().map(|v| &v.camera).collect();
     let every = |n: usize, most: usize| n.div_ceil(most).max(1);
     let points = scene.points.iter().step_by(every(scene.points.len(), POINTS));
