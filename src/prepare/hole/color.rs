@@ -547,7 +547,7 @@ mod tests {
         assert!(!of(3, false, 5, &[0.0, 0.01, 0.3]) && of(3, true, 0, &[0.0, 0.1, 0.3]) && of(2, true, 0, &[0.0, 0.1]));
     }
 
-    /// What all views have right beside the object is believed where it looks like the wall that they show farther off, and not
+    /// A rim that all views have right beside the object is believed where it looks like the wall that they show farther off, and not
     /// where it has the object's own colour.
     #[test]
     fn a_rim_that_looks_like_the_wall_is_the_wall() {
