@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 
 use gscream_vk::gpu::testing;
 use gscream_vk::prepare::{self, Evidence, Request, Step, poses};
-use gscream_vk::scene::{self, Camera};
+use gscream_vk::scene;
 use image::GrayImage;
 
-use crate::prepare::{Lines, VIEWS, capture, ious, mask, name, transforms, truth};
+use crate::prepare::{Lines, VIEWS, capture, ious, mask, name, of_nerfstudio, transforms, truth};
 
 fn files(folder: &Path) -> Vec<PathBuf> {
     fs::read_dir(folder).expect("a folder").map(|entry| entry.expect("a file").path()).collect()
@@ -47,11 +47,8 @@ fn what_lies_among_the_photographs_is_none() {
 /// A scene that is made in the capture's own folder is made once: the model that came of it is not taken for one that was there.
 #[test]
 fn in_its_own_folder_a_scene_stays() {
-    let folder = capture();
-    let full = scene::load(&folder.path().join("full"), &scene::Config::default()).expect("a scene");
-    let views: Vec<(String, Camera)> = full.train.iter().map(|view| (view.name.clone(), view.camera)).collect();
+    let (folder, views) = of_nerfstudio();
     let photos = folder.path().join("photos");
-    fs::remove_dir_all(photos.join("sparse")).expect("a folder");
     fs::write(photos.join("transforms.json"), transforms(&views).to_string()).expect("writable");
     let mut request = Request::new(&photos, &photos);
     request.only = vec![Step::Poses];
@@ -89,6 +86,26 @@ fn several_masks_of_a_view_count_together() {
     };
     let whole = |whole: &Path| vec![Evidence::Mask(whole.to_owned())];
     assert_eq!(marked(&halves), marked(&whole));
+}
+
+/// Of the parts that COLMAP could not join the largest is used, whichever number it has, and the others are named.
+#[test]
+fn of_several_models_the_largest_is_used() {
+    let folder = capture();
+    let sparse = folder.path().join("photos/sparse");
+    fs::rename(sparse.join("0"), sparse.join("1")).expect("writable");
+    fs::create_dir(sparse.join("0")).expect("writable");
+    fs::write(sparse.join("0/cameras.txt"), "1 PINHOLE 100 100 90 90 50 50\n").expect("writable");
+    let stray = format!("1 1 0 0 0 0 0 0 1 {}.png\n\n", name(0));
+    fs::write(sparse.join("0/images.txt"), stray).expect("writable");
+    let mut request = Request::new(folder.path().join("photos"), folder.path().join("scene"));
+    request.only = vec![Step::Poses];
+    let said = prepared(&request);
+    // Two of its photographs are for tests.
+    let named = format!("sparse/1 is used, with {} photographs, and not sparse/0 (1)", VIEWS + 2);
+    assert!(said.iter().any(|line| line.contains(&named)), "{said:?}");
+    let scene = scene::load(&request.out, &scene::Config::default()).expect("a scene");
+    assert_eq!(scene.train.len(), VIEWS as usize);
 }
 
 /// Multiplies the lengths of a COLMAP model.

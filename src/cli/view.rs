@@ -84,6 +84,13 @@ pub(super) fn page_of(run: &Path) -> anyhow::Result<Page> {
 
 fn page(args: &Args) -> anyhow::Result<Page> {
     let run = &args.run;
+    if run.is_file() {
+        bail!(
+            "{}: this is a file, and the page needs the cameras beside it: give the folder of a run, of an export or of \
+             what `remove` has made",
+            run.display()
+        );
+    }
     if !run.is_dir() {
         bail!("{}: there is no such folder", run.display());
     }

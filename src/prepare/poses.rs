@@ -131,22 +131,23 @@ pub fn find(folder: &Path) -> Result<Capture, Error> {
     if model.is_none() && transforms.is_file() {
         return from_transforms(folder, &transforms);
     }
-    let images = ["images", "images_2", "images_4", "images_8"].map(|name| folder.join(name));
-    let has_photographs = |path: &PathBuf| {
-        Ok::<_, Error>(path.is_dir() && scene::pictures(path)?.values().any(|picture| !made.has(picture)))
-    };
     let mut found = None;
-    for path in images {
-        if has_photographs(&path)? {
-            found = Some(path);
+    for name in ["images", "images_2", "images_4", "images_8"] {
+        let images = folder.join(name);
+        let photographs = existing(&images)?;
+        if photographs.values().any(|path| !made.has(path)) {
+            found = Some((images, photographs));
             break;
         }
     }
-    let images = found.unwrap_or_else(|| folder.to_owned());
-    let mut photographs = scene::pictures(&images)?;
-    if images == folder {
-        photographs.retain(|_, path| !made.has(path) && !is_beside(folder, path));
-    }
+    let (images, photographs) = match found {
+        Some(found) => found,
+        None => {
+            let mut flat = scene::pictures(folder)?;
+            flat.retain(|_, path| !made.has(path) && !is_beside(folder, path));
+            (folder.to_owned(), flat)
+        }
+    };
     if photographs.is_empty() {
         return Err(scene::Error::NoImages { scene: folder.to_owned() }.into());
     }
@@ -193,13 +194,23 @@ fn existing(folder: &Path) -> Result<BTreeMap<String, PathBuf>, Error> {
 
 /// The files of the model under `folder`, if there is one.
 fn model_files(folder: &Path) -> Option<Vec<PathBuf>> {
+    let (model, _) = colmap::folder(folder).ok()?;
     let stems = ["cameras", "images", "points3D"];
-    ["sparse/0", "sparse"].map(|name| folder.join(name)).into_iter().find_map(|model| {
-        let files = |stem: &str| ["bin", "txt", "ply"].map(|e| model.join(stem).with_extension(e));
-        let found: Vec<PathBuf> = stems.iter().flat_map(|stem| files(stem)).filter(|path| path.is_file()).collect();
-        let has = |stem: &str| found.iter().any(|path| path.file_stem().is_some_and(|s| s == stem));
-        (has("cameras") && has("images")).then_some(found)
-    })
+    let files = stems.iter().flat_map(|stem| ["bin", "txt", "ply"].map(|e| model.join(stem).with_extension(e)));
+    Some(files.filter(|path| path.is_file()).collect())
+}
+
+/// A sentence on the parts of a capture, the largest first, of which the first alone is used.
+fn left_out(parts: &[(PathBuf, usize)]) -> Option<String> {
+    let ((largest, most), others) = parts.split_first().filter(|(_, others)| !others.is_empty())?;
+    let name = |folder: &Path| format!("sparse/{}", folder.file_name().unwrap_or_default().to_string_lossy());
+    let counts: Vec<String> = others.iter().map(|(folder, n)| format!("{} ({n})", name(folder))).collect();
+    Some(format!(
+        "COLMAP has made {} models that it could not join: {} is used, with {most} photographs, and not {}",
+        parts.len(),
+        name(largest),
+        counts.join(", ")
+    ))
 }
 
 impl Capture {
@@ -257,6 +268,9 @@ impl Capture {
     pub fn collect(&self, out: &Path, watch: &mut dyn Watch) -> Result<Batch, Error> {
         let mut batch = Batch::default();
         let in_place = self.in_place(out);
+        if matches!(self.source, Source::Colmap(_)) {
+            batch.notes.extend(left_out(&colmap::parts(&self.folder)));
+        }
         if !self.pinholes.is_empty() {
             if in_place {
                 let what = "the photographs are of lenses that are resampled, and the originals stay: make the scene in \

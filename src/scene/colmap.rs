@@ -190,7 +190,7 @@ fn rotation(q: [f64; 4]) -> Option<[[f64; 3]; 3]> {
     ])
 }
 
-/// Finds and reads the model under `scene`: `sparse/0`, else `sparse`. Cameras and images are binary where `cameras.bin`
+/// Finds and reads the model under `scene`: of `sparse/0`, `sparse/1` and so on the largest, else `sparse`. Cameras and images are binary where `cameras.bin`
 /// is, else text; points come from `points3D.bin`, `.txt` or `.ply`, the first that holds any.
 ///
 /// # Errors
@@ -223,19 +223,37 @@ pub fn lenses(scene: &Path) -> Result<(Lenses, Vec<Image>), Error> {
     cameras_and_images(scene, READ).map(|(_, cameras, images)| (cameras, images))
 }
 
-/// The model's folder under `scene`, which may be `scene` itself, and the extension of its cameras and images.
+/// The extension of a model's cameras and images, if `folder` has one.
+fn extension(folder: &Path) -> Option<&'static str> {
+    let has = |extension: &str| {
+        ["cameras", "images"].iter().all(|stem| folder.join(stem).with_extension(extension).is_file())
+    };
+    ["bin", "txt"].into_iter().find(|e| has(e))
+}
+
+/// The models that a mapper has made of the parts of a capture that it could not join, `sparse/0`, `sparse/1` and so on, and
+/// how many photographs each has: the largest first, of equals the first. Of one alone the photographs are not counted.
+pub(crate) fn parts(scene: &Path) -> Vec<(PathBuf, usize)> {
+    let folders = (0..).map(|number| scene.join("sparse").join(number.to_string()));
+    let folders = folders.take_while(|folder| folder.is_dir()).filter(|folder| extension(folder).is_some());
+    let mut parts: Vec<(PathBuf, usize)> = folders.map(|folder| (folder, 0)).collect();
+    if parts.len() > 1 {
+        for (folder, count) in &mut parts {
+            *count = cameras_and_images(folder, READ).map_or(0, |(_, _, images)| images.len());
+        }
+        parts.sort_by_key(|(_, count)| std::cmp::Reverse(*count));
+    }
+    parts
+}
+
+/// The model's folder under `scene`, which may be `scene` itself, and the extension of its cameras and images. Of several parts
+/// it is the largest.
 ///
 /// # Errors
 /// No model.
 pub(crate) fn folder(scene: &Path) -> Result<(PathBuf, &'static str), Error> {
-    let folders = [scene.join("sparse/0"), scene.join("sparse"), scene.to_owned()];
-    let has = |folder: &Path, extension: &str| {
-        ["cameras", "images"].iter().all(|stem| folder.join(stem).with_extension(extension).is_file())
-    };
-    let found = folders.into_iter().find_map(|folder| {
-        let extension = ["bin", "txt"].into_iter().find(|e| has(&folder, e))?;
-        Some((folder, extension))
-    });
+    let folders = parts(scene).into_iter().map(|(folder, _)| folder).chain([scene.join("sparse"), scene.to_owned()]);
+    let found = folders.into_iter().find_map(|folder| extension(&folder).map(|extension| (folder, extension)));
     found.ok_or_else(|| Error::NoModel { scene: scene.to_path_buf() })
 }
 
