@@ -122,6 +122,28 @@ mod tests {
         (camera, box_heights, grid)
     }
 
+    /// The plane through the box's back, of which nothing is seen but where it crosses the floor, is none that the box leans on.
+    #[test]
+    fn what_crosses_the_floor_holds_nothing_up() {
+        let (camera, heights, grid) = view(0);
+        let is_box = |x: u32, y: u32| heights[(y * SIZE[0] + x) as usize].is_some();
+        let mask = GrayImage::from_fn(SIZE[0], SIZE[1], |x, y| Luma([if is_box(x, y) { 255 } else { 0 }]));
+        let sight = Sight::new(grid, &camera, &mask);
+        // Of the world's points x with normal . x = offset.
+        let plane = |normal: DVec3, offset: f64| {
+            let turned = camera.rotation.map(|row| DVec3::from(row.map(f64::from)).dot(normal));
+            let distance = offset - normal.dot(DVec3::from(camera.center()));
+            turned.map(|v| v / distance)
+        };
+        let (floor, back) = (plane(DVec3::Y, 0.0), plane(DVec3::Z, 0.5));
+        let alone = |plane| sight.supports(&[plane]).len();
+        assert_eq!((alone(floor), sight.supports(&[floor, back]).len()), (1, 1));
+        let under = camera.to_camera([0.0, 0.0, 0.0]);
+        let supports = sight.supports(&[floor, back]);
+        let found = supports[0].under([under[0] / under[2], under[1] / under[2]]);
+        assert!(found.is_some_and(|z| (z / under[2] - 1.0).abs() < 1e-6), "{found:?}");
+    }
+
     /// From one mask: in all views the floor is none of the object, on its far side too, and all of the object stays but the
     /// last of its foot.
     #[test]

@@ -29,6 +29,8 @@ const HULL: f64 = 0.8;
 pub(super) const HULL_VIEWS: usize = 3;
 /// Part that speaks against a surface behind what the object stands on: it is likely hidden, which is no proof.
 const BELOW: f64 = 0.5;
+/// Least part of what is known around a hole that lies on a plane, and on none before it, for the object to stand on that.
+const SHOWN: f64 = 0.05;
 /// Relative difference to a plane up to which a measured inverse depth is taken to lie on it.
 const FLAT: f32 = 0.015;
 /// Least width of a hole's surroundings, sites.
@@ -262,9 +264,28 @@ impl Sight {
                 DVec3::new(x, y, 1.0) * self.grid.depth[site]
             })
             .collect();
-        let supports: Vec<Support> = planes.iter().filter_map(|plane| Support::new(*plane, &object)).collect();
+        let supports: Vec<Support> =
+            self.shown(planes).iter().filter_map(|plane| Support::new(*plane, &object)).collect();
         log::debug!("surface: {} planes, the object stands on {}", planes.len(), supports.len());
         supports
+    }
+
+    /// The planes, of these of the view, that it shows around its hole: not only where they cross one before them.
+    fn shown(&self, planes: &[planes::Plane]) -> Vec<planes::Plane> {
+        let near = self.surroundings();
+        let known = (0..near.len()).filter(|site| near[*site] && !self.hole[*site] && self.depth[*site].is_finite());
+        let on = |site: usize, plane: &planes::Plane| {
+            (planes::on(plane, self.ray(site)) * self.depth[site] - 1.0).abs() <= planes::THICKNESS
+        };
+        let (mut counts, mut all) = (vec![0usize; planes.len()], 0usize);
+        for site in known {
+            all += 1;
+            if let Some(first) = planes.iter().position(|plane| on(site, plane)) {
+                counts[first] += 1;
+            }
+        }
+        let enough = |count: usize| count as f64 >= SHOWN * all as f64;
+        planes.iter().zip(counts).filter(|(_, count)| enough(*count)).map(|(plane, _)| *plane).collect()
     }
 
     /// Normalised coordinates of a site's centre.
