@@ -23,9 +23,11 @@ use super::min_cut::{Grid, SHIFTS};
 use crate::scene::resample;
 use crate::statistics::median;
 
+mod boxed;
 mod mark;
 mod tree;
 
+pub use boxed::from_box;
 pub use mark::{MOST_POINTS, Mark};
 use tree::Tree;
 
@@ -71,6 +73,10 @@ const MOST: [f64; 2] = [8.0, 8.0];
 const NEAR: f64 = 4.0;
 /// The weight of being within the segment that a click means, in nats.
 const SHAPE: f64 = 12.0;
+/// The weight of being parted from what is outside a box, in nats.
+const ENCLOSED: f64 = 2.0;
+/// What a way costs per pixel along which nothing changes: to clicks, which mean what is near, and out of boxes.
+const ALONG: [f64; 2] = [0.5, 0.05];
 /// Nearer than this to a click, from -1 to 1, is the object to begin with.
 const NEARER: f64 = 0.33;
 /// A place so far from where the background is, squared and in its deviations, is as likely to be the object as not.
@@ -414,8 +420,18 @@ impl Pixels {
         })
     }
 
-    /// Distances from some pixels, along which every change of the picture counts.
-    fn distances(&self, from: impl Iterator<Item = usize>) -> Vec<f32> {
+    /// By how much more the picture changes on the way out of the boxes than it does for most of what is in them, from -1 to 1;
+    /// nothing where it does not change.
+    fn enclosed(&self) -> Option<Vec<f64>> {
+        self.pairs().any(|(i, _, j, _)| !self.outside[i] && self.apart(i, j).0 > 0.0).then_some(())?;
+        let ways = self.distances((0..self.outside.len()).filter(|i| self.outside[*i]), ALONG[1]);
+        let middle =
+            median(ways.iter().zip(&self.outside).filter(|(_, outside)| !**outside).map(|(way, _)| f64::from(*way)))?;
+        Some(ways.iter().map(|way| (f64::from(*way) - middle) / (f64::from(*way) + middle)).collect())
+    }
+
+    /// Distances from some pixels, along which every change of the picture counts, and `along` each pixel.
+    fn distances(&self, from: impl Iterator<Item = usize>, along: f64) -> Vec<f32> {
         let [w, h] = self.size;
         let mut distance = vec![f32::INFINITY; w * h];
         // Distances are not negative: their bits are ordered as they are.
@@ -435,7 +451,7 @@ impl Pixels {
                 }
                 let j = y as usize * w + x as usize;
                 let (color, jump) = self.apart(i, j);
-                let step = (0.5 + color.sqrt() / 8.0 + 8.0 * jump) * f64::hypot(dx as f64, dy as f64);
+                let step = (along + color.sqrt() / 8.0 + 8.0 * jump) * f64::hypot(dx as f64, dy as f64);
                 let far = distance[i] + step as f32;
                 if far < distance[j] {
                     distance[j] = far;
@@ -574,26 +590,29 @@ fn cut(
     // Places in space know more of what is in a box than segments do.
     let flat = pixels.places.iter().all(Option::is_none);
     let within = (boxed && flat && pass == 0).then(|| Tree::of(&pixels).within(|i| !pixels.outside[i])).flatten();
+    let enclosed = if boxed && flat { pixels.enclosed() } else { None };
     // Nearer to the object's clicks, or to what is not the object: from -1 to 1.
     let near: Option<Vec<f64>> = marked.then(|| {
         let objects = (0..count).filter(|i| pixels.touched[*i] == Some(true));
-        let objects = pixels.distances(objects);
+        let objects = pixels.distances(objects, ALONG[0]);
         let others = (0..count)
             .filter(|i| pixels.touched[*i] == Some(false) || pixels.outside[*i] || pixels.is_border(*i) && !was(*i));
-        let others = pixels.distances(others);
+        let others = pixels.distances(others, ALONG[0]);
         let side = |(a, b): (&f32, &f32)| if b.is_infinite() { 1.0 } else { f64::from((b - a) / (a + b).max(1e-6)) };
         objects.iter().zip(&others).map(side).collect()
     });
     let object: Vec<bool> = (0..count)
-        .map(|i| match (&before, &within, pixels.touched[i]) {
-            (.., Some(side)) => side,
+        .map(|i| match (&before, &within, &enclosed) {
+            _ if pixels.touched[i].is_some() => pixels.touched[i] == Some(true),
             (Some(before), ..) => before[i],
-            (None, Some(within), None) => within[i],
+            (None, Some(within), _) => within[i],
+            (None, None, Some(enclosed)) => enclosed[i] > 0.0,
             _ if boxed => !pixels.outside[i],
             _ => near.as_ref().is_some_and(|near| near[i] > NEARER),
         })
         .collect();
-    let beside = |i: usize| near.as_ref().map_or(0.0, |near| NEAR * near[i]);
+    let says = |of: &Option<Vec<f64>>, i: usize| of.as_ref().map_or(0.0, |of| of[i]);
+    let beside = |i: usize| NEAR * says(&near, i) + ENCLOSED * says(&enclosed, i);
     let object = solve(&pixels, object, ROUNDS[pass], beside, |_| true)?;
     whole(picture, window, small, joined(object, &pixels, boxed))
 }
@@ -642,10 +661,13 @@ fn edited(picture: &RgbImage, marks: &[Mark], before: &GrayImage, depth: Option<
     let rim = (0..w * h).filter(|i| was[*i] == adds).map(far).fold(f64::INFINITY, f64::min);
     let reach = if rim.is_finite() { REACH * rim + 3.0 } else { f64::INFINITY };
     let nearest = (0..w * h).min_by(|a, b| far(*a).total_cmp(&far(*b)))?;
-    let mine = pixels.distances(std::iter::once(nearest));
-    let others = pixels.distances((0..w * h).filter(|i| {
-        pixels.touched[*i] == Some(!adds) || adds && (pixels.outside[*i] || pixels.is_border(*i) && !was[*i])
-    }));
+    let mine = pixels.distances(std::iter::once(nearest), ALONG[0]);
+    let others = pixels.distances(
+        (0..w * h).filter(|i| {
+            pixels.touched[*i] == Some(!adds) || adds && (pixels.outside[*i] || pixels.is_border(*i) && !was[*i])
+        }),
+        ALONG[0],
+    );
     // Nearer to this click than to what says otherwise, for the object: from -1 to 1.
     let near = |i: usize| {
         let (a, b) = (mine[i], others[i]);

@@ -6,7 +6,7 @@
 
 use std::path::Path;
 
-use image::{GrayImage, Luma, RgbImage};
+use image::{GrayImage, RgbImage};
 use rand::RngExt;
 use rand_pcg::Pcg64;
 
@@ -23,11 +23,6 @@ const ROUNDS: u32 = 6;
 /// Cost of a border between pixels of the same colour (Rother et al.: 50, for larger pictures, whose narrow parts are more
 /// pixels wide). In a box the next is tried where the object does not fill it: a thin one is mostly border.
 pub(super) const SMOOTHNESS: [f64; 4] = [20.0, 8.0, 3.0, 1.0];
-/// An object fills its box if it reaches over this part of its width and height (Lempitsky et al. 2009: a box is drawn
-/// tightly).
-const FILLED: f64 = 0.8;
-/// A thin object covers at most this part of its box; a cut with little smoothness that covers more has found the ground.
-const THIN: f64 = 0.7;
 /// Costs are whole numbers of this fraction.
 pub(super) const UNIT: f64 = 256.0;
 /// Pieces smaller than this share of the largest are no part of the object.
@@ -214,65 +209,11 @@ pub(super) fn within(size: [u32; 2], side: u32) -> [u32; 2] {
     }
 }
 
-fn to_mask(object: Vec<bool>, from: [u32; 2], to: [u32; 2]) -> GrayImage {
+pub(super) fn to_mask(object: Vec<bool>, from: [u32; 2], to: [u32; 2]) -> GrayImage {
     let raw = object.into_iter().map(|v| if v { 255 } else { 0 }).collect();
     let mask = GrayImage::from_raw(from[0], from[1], raw).expect("a label per pixel");
     let mask = masks::without_specks(&mask, SPECK);
     masks::threshold(&masks::parts(&mask, from), from, to, 0.5)
-}
-
-/// The object in a box (x0, y0 and one past x1, y1). Its surroundings, as wide again as the box, are what it is told from.
-/// Nothing if nothing in the box differs from them.
-pub fn from_box(picture: &RgbImage, bounds: [u32; 4]) -> Option<GrayImage> {
-    let full = [picture.width(), picture.height()];
-    let [x0, y0, x1, y1] = bounds;
-    let (wide, high) = (x1 - x0, y1 - y0);
-    let low = [x0.saturating_sub(wide.div_ceil(2)), y0.saturating_sub(high.div_ceil(2))];
-    let far = [(x1 + wide.div_ceil(2)).min(full[0]), (y1 + high.div_ceil(2)).min(full[1])];
-    let around = image::imageops::crop_imm(picture, low[0], low[1], far[0] - low[0], far[1] - low[1]).to_image();
-    let whole = [around.width(), around.height()];
-    let size = reduced(whole);
-    let small = resample::photograph(&around, size);
-    let inside = |i: u32, axis: usize| {
-        let at = (f64::from(i) + 0.5) * f64::from(whole[axis]) / f64::from(size[axis]) + f64::from(low[axis]);
-        at > f64::from(bounds[axis]) && at < f64::from(bounds[axis + 2])
-    };
-    let known: Vec<Known> = (0..size[0] * size[1])
-        .map(|i| {
-            let boxed = inside(i % size[0], 0) && inside(i / size[0], 1);
-            if boxed { Known::Maybe } else { Known::Background }
-        })
-        .collect();
-    let cuts = SMOOTHNESS.into_iter().filter_map(|smoothness| {
-        let cut = to_mask(segment(&small, &known, smoothness)?, size, whole);
-        let mut mask = GrayImage::new(full[0], full[1]);
-        image::imageops::replace(&mut mask, &cut, i64::from(low[0]), i64::from(low[1]));
-        // Where the reduced pixels of the box's border reach over it.
-        for (x, y, v) in mask.enumerate_pixels_mut() {
-            if x < x0 || y < y0 || x >= x1 || y >= y1 {
-                *v = Luma([0]);
-            }
-        }
-        Some((filled(&mask, bounds)?, mask))
-    });
-    let mut first = None;
-    for (part, mask) in cuts {
-        let share = mask.as_raw().iter().filter(|v| **v != 0).count() as f64 / (f64::from(wide) * f64::from(high));
-        if part >= FILLED && (first.is_none() || share <= THIN) {
-            return Some(mask);
-        }
-        first.get_or_insert(mask);
-    }
-    first
-}
-
-/// Over which part of a box's width and height, the smaller of the two, a mask reaches; nothing if it is empty.
-fn filled(mask: &GrayImage, [x0, y0, x1, y1]: [u32; 4]) -> Option<f64> {
-    let on = || mask.enumerate_pixels().filter(|(_, _, v)| v.0[0] != 0);
-    let (left, right) = (on().map(|(x, _, _)| x).min()?, on().map(|(x, _, _)| x).max()?);
-    let (top, bottom) = (on().map(|(_, y, _)| y).min()?, on().map(|(_, y, _)| y).max()?);
-    let part = |low: u32, high: u32, of: u32| f64::from(high + 1 - low) / f64::from(of);
-    Some(part(left, right, x1 - x0).min(part(top, bottom, y1 - y0)))
 }
 
 /// Strokes on a picture.
@@ -358,7 +299,7 @@ pub fn from_strokes(picture: &RgbImage, strokes: &Strokes) -> GrayImage {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
 
     /// Two squares of one colour, a stroke on one of them, and a box around it: the other is not of the object.
@@ -381,8 +322,8 @@ mod tests {
         assert!(count(&one, 15) > 380 && count(&one, 65) == 0, "{} {}", count(&one, 15), count(&one, 65));
     }
 
-    /// A textured disc on a textured ground, boxed loosely.
-    fn disc() -> (RgbImage, impl Fn(u32, u32) -> bool) {
+    /// A textured disc on a textured ground.
+    pub(in crate::prepare) fn disc() -> (RgbImage, impl Fn(u32, u32) -> bool) {
         let inside = |x: u32, y: u32| (f64::from(x) - 60.0).powi(2) + (f64::from(y) - 45.0).powi(2) < 22.0f64.powi(2);
         let picture = RgbImage::from_fn(128, 96, |x, y| {
             let noise = ((x * 7 + y * 13) % 17) as u8;
@@ -391,43 +332,8 @@ mod tests {
         (picture, inside)
     }
 
-    fn wrong(mask: &GrayImage, inside: &impl Fn(u32, u32) -> bool) -> usize {
+    pub(in crate::prepare) fn wrong(mask: &GrayImage, inside: &impl Fn(u32, u32) -> bool) -> usize {
         mask.enumerate_pixels().filter(|(x, y, v)| (v.0[0] != 0) != inside(*x, *y)).count()
-    }
-
-    #[test]
-    fn a_box_becomes_its_object() {
-        let (picture, inside) = disc();
-        let mask = from_box(&picture, [30, 15, 92, 76]).expect("there is something in it");
-        // The disc has about 140 border pixels, which may fall to either side.
-        assert!(wrong(&mask, &inside) < 40, "{}", wrong(&mask, &inside));
-        // Nothing but ground.
-        let flat = RgbImage::from_pixel(64, 64, image::Rgb([90, 90, 90]));
-        assert!(from_box(&flat, [20, 20, 40, 40]).is_none());
-    }
-
-    /// Leaflets two pixels wide on a stem, and more of the same green above the box: with the first smoothness nothing of it
-    /// would be worth its border.
-    #[test]
-    fn a_thin_object_fills_its_box() {
-        let leaf =
-            |x: u32, y: u32| (40..80).contains(&x) && (30..90).contains(&y) && (y % 4 < 2 || (58..62).contains(&x));
-        let picture = RgbImage::from_fn(120, 120, |x, y| {
-            let noise = ((x * 7 + y * 13) % 29) as u8;
-            let green = leaf(x, y) || y < 28 && x > 30 && x < 90;
-            image::Rgb(if green { [70 + noise, 110 + noise, 80] } else { [130 + noise, 130 + noise, 125] })
-        });
-        let bounds = [38, 30, 82, 92];
-        let around =
-            |i: u32| bounds[0] <= i % 120 && i % 120 < bounds[2] && bounds[1] <= i / 120 && i / 120 < bounds[3];
-        let known: Vec<Known> =
-            (0..120 * 120).map(|i| if around(i) { Known::Maybe } else { Known::Background }).collect();
-        let smooth = segment(&picture, &known, SMOOTHNESS[0]).unwrap_or_default();
-        assert!(smooth.iter().filter(|on| **on).count() < 400, "the case is too easy");
-        let mask = from_box(&picture, bounds).expect("there is something in it");
-        let wrong = mask.enumerate_pixels().filter(|(x, y, v)| (v.0[0] != 0) != leaf(*x, *y)).count();
-        // 1,320 pixels are the leaf's.
-        assert!(wrong < 130, "{wrong}");
     }
 
     #[test]

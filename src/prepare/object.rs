@@ -140,7 +140,7 @@ pub(super) fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<Str
                     continue;
                 }
                 let picture = scene::photograph(photograph, 1)?;
-                let mask = graph_cut::from_box(&picture, *bounds).ok_or_else(|| {
+                let mask = click::from_box(&picture, *bounds).ok_or_else(|| {
                     Error::Request(format!(
                         "--box {name}={x0},{y0},{x1},{y1}: nothing in the box differs from what is around it; draw it closer, \
                          or give a mask"

@@ -77,7 +77,7 @@ fn masks_of(
 }
 
 /// Marks that a user may begin with.
-const TOOLS: [&str; 4] = ["clicks", "box", "lasso", "the box of graph cuts"];
+const TOOLS: [&str; 4] = ["clicks", "box", "lasso", "a box of the command line"];
 
 /// IoU after 1, 2, 3 and 5 marks that begin with a click, a box or a lasso.
 type Row = [[f64; 4]; 4];
@@ -94,7 +94,7 @@ fn row(picture: &RgbImage, truth: &GrayImage, cues: &Cues<'_>) -> (Row, f64) {
     let Mark::Box { bounds } = boxed(truth) else { unreachable!("a box") };
     let size = [truth.width(), truth.height()];
     let corners = std::array::from_fn(|k| (bounds[k] * f64::from(size[k % 2])).round() as u32);
-    let cut = crate::prepare::graph_cut::from_box(picture, corners);
+    let cut = super::from_box(picture, corners);
     let alone = cut.map_or(0.0, |mask| iou(&mask, truth));
     ([clicks, boxes, lassos, [alone; 4]], slowest)
 }

@@ -1,0 +1,137 @@
+//! A box on the command line: as on the page, and for what is thin by cuts whose borders are cheap.
+
+use image::{GrayImage, Luma, RgbImage};
+
+use super::{Cues, Mark, found};
+use crate::prepare::graph_cut::{self, Known, SMOOTHNESS};
+use crate::scene::resample;
+
+/// A mask that covers less of its box than this, and does not reach over it, is a part of something thin.
+const SOLID: f64 = 0.25;
+/// An object reaches over this part of its box's width and height (Lempitsky et al. 2009: a box is drawn tightly).
+const FILLED: f64 = 0.8;
+/// A thin object covers at most this part of its box; a cut with little smoothness that covers more has found the ground.
+const THIN: f64 = 0.7;
+
+/// The object in a box (x0, y0 and one past x1, y1), told from its surroundings, as wide again as the box. Nothing if nothing in
+/// the box differs from them.
+pub fn from_box(picture: &RgbImage, bounds: [u32; 4]) -> Option<GrayImage> {
+    let [x0, y0, x1, y1] = bounds;
+    let sides = [picture.width(), picture.height()].map(f64::from);
+    let mark = Mark::Box { bounds: std::array::from_fn(|k| f64::from(bounds[k]) / sides[k % 2]) };
+    let of_page = || Some(found(picture, &[mark], &Cues::default()));
+    let area = f64::from(x1 - x0) * f64::from(y1 - y0);
+    let mut first = None;
+    let cuts = std::iter::once_with(of_page).chain(SMOOTHNESS[1..].iter().map(|s| thin(picture, bounds, *s)));
+    for mut mask in cuts.flatten() {
+        // Where the reduced pixels of the box's border reach over it.
+        for (x, y, v) in mask.enumerate_pixels_mut() {
+            if x < x0 || y < y0 || x >= x1 || y >= y1 {
+                *v = Luma([0]);
+            }
+        }
+        let Some(part) = filled(&mask, bounds) else { continue };
+        let share = mask.as_raw().iter().filter(|v| **v != 0).count() as f64 / area;
+        let taken = match &first {
+            None => part >= FILLED || share >= SOLID,
+            Some(_) => part >= FILLED && share <= THIN,
+        };
+        if taken {
+            return Some(mask);
+        }
+        first.get_or_insert(mask);
+    }
+    first
+}
+
+/// The cheapest cut where borders cost little.
+fn thin(picture: &RgbImage, bounds: [u32; 4], smoothness: f64) -> Option<GrayImage> {
+    let full = [picture.width(), picture.height()];
+    let sides: [u32; 2] = std::array::from_fn(|k| bounds[k + 2] - bounds[k]);
+    let low: [u32; 2] = std::array::from_fn(|k| bounds[k].saturating_sub(sides[k].div_ceil(2)));
+    let far: [u32; 2] = std::array::from_fn(|k| (bounds[k + 2] + sides[k].div_ceil(2)).min(full[k]));
+    let around = image::imageops::crop_imm(picture, low[0], low[1], far[0] - low[0], far[1] - low[1]).to_image();
+    let whole = [around.width(), around.height()];
+    let size = graph_cut::reduced(whole);
+    let small = resample::photograph(&around, size);
+    let inside = |i: u32, axis: usize| {
+        let at = (f64::from(i) + 0.5) * f64::from(whole[axis]) / f64::from(size[axis]) + f64::from(low[axis]);
+        at > f64::from(bounds[axis]) && at < f64::from(bounds[axis + 2])
+    };
+    let boxed = |i: u32| inside(i % size[0], 0) && inside(i / size[0], 1);
+    let known: Vec<Known> =
+        (0..size[0] * size[1]).map(|i| if boxed(i) { Known::Maybe } else { Known::Background }).collect();
+    let cut = graph_cut::to_mask(graph_cut::segment(&small, &known, smoothness)?, size, whole);
+    let mut mask = GrayImage::new(full[0], full[1]);
+    image::imageops::replace(&mut mask, &cut, i64::from(low[0]), i64::from(low[1]));
+    Some(mask)
+}
+
+/// Over which part of a box's width and height, the smaller of the two, a mask reaches; nothing if it is empty.
+fn filled(mask: &GrayImage, [x0, y0, x1, y1]: [u32; 4]) -> Option<f64> {
+    let on = || mask.enumerate_pixels().filter(|(_, _, v)| v.0[0] != 0);
+    let (left, right) = (on().map(|(x, _, _)| x).min()?, on().map(|(x, _, _)| x).max()?);
+    let (top, bottom) = (on().map(|(_, y, _)| y).min()?, on().map(|(_, y, _)| y).max()?);
+    let part = |low: u32, high: u32, of: u32| f64::from(high + 1 - low) / f64::from(of);
+    Some(part(left, right, x1 - x0).min(part(top, bottom, y1 - y0)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::prepare::graph_cut::segment;
+    use crate::prepare::graph_cut::tests::{disc, wrong};
+
+    #[test]
+    fn a_box_becomes_its_object() {
+        let (picture, inside) = disc();
+        let mask = from_box(&picture, [30, 15, 92, 76]).expect("there is something in it");
+        // The disc has about 140 border pixels, which may fall to either side.
+        assert!(wrong(&mask, &inside) < 40, "{}", wrong(&mask, &inside));
+        // Nothing but ground.
+        let flat = RgbImage::from_pixel(64, 64, image::Rgb([90, 90, 90]));
+        assert!(from_box(&flat, [20, 20, 40, 40]).is_none());
+    }
+
+    /// Leaflets two pixels wide on a stem, and more of the same green above the box: with the first smoothness nothing of it
+    /// would be worth its border.
+    #[test]
+    fn a_thin_object_fills_its_box() {
+        let leaf =
+            |x: u32, y: u32| (40..80).contains(&x) && (30..90).contains(&y) && (y % 4 < 2 || (58..62).contains(&x));
+        let picture = RgbImage::from_fn(120, 120, |x, y| {
+            let noise = ((x * 7 + y * 13) % 29) as u8;
+            let green = leaf(x, y) || y < 28 && x > 30 && x < 90;
+            image::Rgb(if green { [70 + noise, 110 + noise, 80] } else { [130 + noise, 130 + noise, 125] })
+        });
+        let bounds = [38, 30, 82, 92];
+        let around =
+            |i: u32| bounds[0] <= i % 120 && i % 120 < bounds[2] && bounds[1] <= i / 120 && i / 120 < bounds[3];
+        let known: Vec<Known> =
+            (0..120 * 120).map(|i| if around(i) { Known::Maybe } else { Known::Background }).collect();
+        let smooth = segment(&picture, &known, SMOOTHNESS[0]).unwrap_or_default();
+        assert!(smooth.iter().filter(|on| **on).count() < 400, "the case is too easy");
+        let mask = from_box(&picture, bounds).expect("there is something in it");
+        let wrong = mask.enumerate_pixels().filter(|(x, y, v)| (v.0[0] != 0) != leaf(*x, *y)).count();
+        // 1,320 pixels are the leaf's.
+        assert!(wrong < 130, "{wrong}");
+    }
+
+    /// Speckled stone on stone of nearly the same colour, from which an edge alone parts it, in a box wider by a quarter: what hangs
+    /// together with what is outside the box is not the object.
+    #[test]
+    fn stone_on_stone_ends_at_its_edge() {
+        let inside = |x: u32, y: u32| (60..120).contains(&x) && (50..100).contains(&y);
+        let edge = |x: u32, y: u32| (57..123).contains(&x) && (47..103).contains(&y) && !inside(x, y);
+        let speck = |x: u32, y: u32| ((x * 7919 + y * 104_729 + x * y * 31) % 23) as u8;
+        let picture = RgbImage::from_fn(180, 150, |x, y| {
+            let stone = if inside(x, y) { 124 } else { 118 };
+            image::Rgb(if edge(x, y) { [60; 3] } else { [stone + speck(x, y), stone - 2 + speck(x, y), stone - 12] })
+        });
+        let mask = from_box(&picture, [45, 38, 135, 112]).expect("there is something in it");
+        // The edge, 3 pixels wide, is of either.
+        let off = mask.enumerate_pixels().filter(|(x, y, v)| !edge(*x, *y) && (v.0[0] != 0) != inside(*x, *y));
+        let off = off.count();
+        assert!(off < 150, "{off} of 3000");
+    }
+}
