@@ -17,7 +17,7 @@ use std::collections::BinaryHeap;
 use image::{GrayImage, RgbImage};
 
 use super::depth::DepthMap;
-use super::graph_cut::{self, COMPONENTS, Mixture, SMOOTHNESS, UNIT};
+use super::graph_cut::{self, COMPONENTS, Mixture, SMOOTHNESS, UNIT, some};
 use super::masks;
 use super::min_cut::{Grid, SHIFTS};
 use crate::scene::resample;
@@ -65,8 +65,6 @@ impl Cues<'_> {
 const ROUNDS: [u32; 2] = [4, 2];
 /// The longer sides of their pictures, pixels.
 const SIDES: [u32; 2] = [192, 288];
-/// Pixels that a mixture is made of at most.
-const SAMPLES: usize = 3000;
 /// The most that colours and that places may say of a pixel, in nats.
 const MOST: [f64; 2] = [8.0, 8.0];
 /// The weight of being nearer to a click than to anything else, in nats.
@@ -474,11 +472,6 @@ impl Pixels {
         let (x, y) = (i % w, i / w);
         x == 0 || y == 0 || x + 1 == w || y + 1 == h
     }
-}
-
-/// Some of these at most, evenly spread.
-fn some<T: Copy>(all: &[T]) -> Vec<T> {
-    all.iter().step_by(all.len().div_ceil(SAMPLES).max(1)).copied().collect()
 }
 
 /// Where the background is, by places of it; nothing where there are next to none.

@@ -135,6 +135,14 @@ impl Mixture {
     }
 }
 
+/// Values that a mixture is made of at most.
+const SAMPLES: usize = 3000;
+
+/// Some of these, evenly spread: as many as a mixture is made of.
+pub(super) fn some<T: Copy>(all: &[T]) -> Vec<T> {
+    all.iter().step_by(all.len().div_ceil(SAMPLES).max(1)).copied().collect()
+}
+
 // ---------------------------------------------------------------- pictures
 
 /// What a border between neighbours costs: a pixel, the direction of its neighbour, the cost.
@@ -169,7 +177,8 @@ pub fn segment(picture: &RgbImage, known: &[Known], smoothness: f64) -> Option<V
         if inside.is_empty() || outside.is_empty() {
             return None;
         }
-        let (inside, outside) = (Mixture::of(&inside, COMPONENTS[0], 1), Mixture::of(&outside, COMPONENTS[1], 2));
+        let mixture = |colors: &[[f64; 3]], side: usize| Mixture::of(&some(colors), COMPONENTS[side], side as u64 + 1);
+        let (inside, outside) = (mixture(&inside, 0), mixture(&outside, 1));
         let mut grid = Grid::new([w, h], &SHIFTS);
         for &(i, d, cost) in &edges {
             grid.set_edge(i, d, cost);
