@@ -8,7 +8,8 @@ use gscream_vk::prepare::{self, Evidence, Request, Step, poses};
 use gscream_vk::scene;
 use image::GrayImage;
 
-use crate::prepare::{Lines, VIEWS, capture, ious, mask, name, of_nerfstudio, transforms, truth};
+use crate::nerfstudio::{of_nerfstudio, transforms};
+use crate::prepare::{Lines, VIEWS, capture, ious, mask, name, truth};
 
 fn files(folder: &Path) -> Vec<PathBuf> {
     fs::read_dir(folder).expect("a folder").map(|entry| entry.expect("a file").path()).collect()
@@ -88,7 +89,7 @@ fn several_masks_of_a_view_count_together() {
     assert_eq!(marked(&halves), marked(&whole));
 }
 
-/// Of the parts that COLMAP could not join the largest is used, whichever number it has, and the others are named.
+/// The largest of the parts that COLMAP could not join is used, whichever number it has, and the others are named.
 #[test]
 fn of_several_models_the_largest_is_used() {
     let folder = capture();

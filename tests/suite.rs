@@ -18,6 +18,7 @@ mod kernels;
 mod live;
 mod loaders;
 mod model_files;
+mod nerfstudio;
 mod photographs;
 mod plan;
 mod prepare;

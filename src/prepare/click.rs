@@ -73,7 +73,7 @@ const NEAR: f64 = 4.0;
 const SHAPE: f64 = 12.0;
 /// The weight of being parted from what is outside a box, in nats.
 const ENCLOSED: f64 = 2.0;
-/// What a way costs per pixel along which nothing changes: to clicks, which mean what is near, and out of boxes.
+/// Cost of a way per pixel along which nothing changes: to clicks, which mean what is near, and out of boxes.
 const ALONG: [f64; 2] = [0.5, 0.05];
 /// Nearer than this to a click, from -1 to 1, is the object to begin with.
 const NEARER: f64 = 0.33;
@@ -418,8 +418,8 @@ impl Pixels {
         })
     }
 
-    /// By how much more the picture changes on the way out of the boxes than it does for most of what is in them, from -1 to 1;
-    /// nothing where it does not change.
+    /// How much more the picture changes on the way out of the boxes than on the way from most of what is in them, -1 to 1; nothing
+    /// where it does not change.
     fn enclosed(&self) -> Option<Vec<f64>> {
         self.pairs().any(|(i, _, j, _)| !self.outside[i] && self.apart(i, j).0 > 0.0).then_some(())?;
         let ways = self.distances((0..self.outside.len()).filter(|i| self.outside[*i]), ALONG[1]);

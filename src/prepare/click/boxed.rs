@@ -67,7 +67,7 @@ fn thin(picture: &RgbImage, bounds: [u32; 4], smoothness: f64) -> Option<GrayIma
     Some(mask)
 }
 
-/// Over which part of a box's width and height, the smaller of the two, a mask reaches; nothing if it is empty.
+/// The part of a box's width and height, the smaller of the two, that a mask reaches over; nothing if it is empty.
 fn filled(mask: &GrayImage, [x0, y0, x1, y1]: [u32; 4]) -> Option<f64> {
     let on = || mask.enumerate_pixels().filter(|(_, _, v)| v.0[0] != 0);
     let (left, right) = (on().map(|(x, _, _)| x).min()?, on().map(|(x, _, _)| x).max()?);
