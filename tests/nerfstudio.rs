@@ -7,7 +7,7 @@ use gscream_vk::prepare::{self, Request, Step};
 use gscream_vk::scene::{self, Camera, View};
 use tempfile::TempDir;
 
-use crate::prepare::{Lines, capture};
+use crate::prepare::{Lines, capture, prepared};
 
 /// nerfstudio's file of these cameras.
 pub(crate) fn transforms(views: &[View]) -> serde_json::Value {
@@ -46,9 +46,8 @@ fn cameras_of_nerfstudio_are_the_same() {
     fs::write(photos.join("transforms.json"), transforms(&views).to_string()).expect("a writable folder");
     let mut request = Request::new(&photos, folder.path().join("scene"));
     request.only = vec![Step::Poses];
-    let mut lines = Lines::default();
-    prepare::prepare(&testing::gpu(), &request, &mut lines).expect("poses");
-    assert!(lines.0.iter().any(|line| line.contains("random points")), "{:?}", lines.0);
+    let said = prepared(&request);
+    assert!(said.iter().any(|line| line.contains("random points")), "{said:?}");
     let scene = scene::load(&request.out, &scene::Config::default()).expect("a scene");
     assert_eq!(scene.train.len(), views.len());
     for (view, View { name, camera, .. }) in scene.train.iter().zip(&views) {
@@ -74,10 +73,9 @@ fn fisheyes_of_nerfstudio_become_pinholes() {
     fs::write(photos.join("transforms.json"), json.to_string()).expect("a writable folder");
     let mut request = Request::new(&photos, folder.path().join("scene"));
     request.only = vec![Step::Poses];
-    let mut lines = Lines::default();
-    prepare::prepare(&testing::gpu(), &request, &mut lines).expect("poses");
-    let said = "poses: 10 photographs were resampled from OPENCV_FISHEYE to pinholes";
-    assert!(lines.0.iter().any(|line| line == said), "{:?}", lines.0);
+    let said = prepared(&request);
+    let resampled = "poses: 10 photographs were resampled from OPENCV_FISHEYE to pinholes";
+    assert!(said.iter().any(|line| line == resampled), "{said:?}");
     let scene = scene::load(&request.out, &scene::Config { unit: 1.0, ..Default::default() }).expect("a scene");
     let camera = views[0].camera;
     let lens = prepare::lens::Pinhole::of(scene::colmap::Lens {

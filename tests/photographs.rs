@@ -3,22 +3,15 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use gscream_vk::gpu::testing;
-use gscream_vk::prepare::{self, Evidence, Request, Step, poses};
+use gscream_vk::prepare::{Evidence, Request, Step, poses};
 use gscream_vk::scene;
 use image::GrayImage;
 
 use crate::nerfstudio::{of_nerfstudio, transforms};
-use crate::prepare::{Lines, VIEWS, capture, ious, mask, name, truth};
+use crate::prepare::{VIEWS, capture, ious, mask, name, prepared, truth};
 
 fn files(folder: &Path) -> Vec<PathBuf> {
     fs::read_dir(folder).expect("a folder").map(|entry| entry.expect("a file").path()).collect()
-}
-
-fn prepared(request: &Request) -> Vec<String> {
-    let mut lines = Lines::default();
-    prepare::prepare(&testing::gpu(), request, &mut lines).expect("a scene");
-    lines.0
 }
 
 /// Photographs lie flat beside their masks, and the scene is made among them: neither is taken for photographs, however often.
@@ -94,16 +87,16 @@ fn several_masks_of_a_view_count_together() {
 fn of_several_models_the_largest_is_used() {
     let folder = capture();
     let sparse = folder.path().join("photos/sparse");
-    fs::rename(sparse.join("0"), sparse.join("1")).expect("writable");
-    fs::create_dir(sparse.join("0")).expect("writable");
-    fs::write(sparse.join("0/cameras.txt"), "1 PINHOLE 100 100 90 90 50 50\n").expect("writable");
+    fs::rename(sparse.join("0"), sparse.join("10")).expect("writable");
+    fs::create_dir(sparse.join("2")).expect("writable");
+    fs::write(sparse.join("2/cameras.txt"), "1 PINHOLE 100 100 90 90 50 50\n").expect("writable");
     let stray = format!("1 1 0 0 0 0 0 0 1 {}.png\n\n", name(0));
-    fs::write(sparse.join("0/images.txt"), stray).expect("writable");
+    fs::write(sparse.join("2/images.txt"), stray).expect("writable");
     let mut request = Request::new(folder.path().join("photos"), folder.path().join("scene"));
     request.only = vec![Step::Poses];
     let said = prepared(&request);
     // Two of its photographs are for tests.
-    let named = format!("sparse/1 is used, with {} photographs, and not sparse/0 (1)", VIEWS + 2);
+    let named = format!("sparse/10 is used, with {} photographs, and not sparse/2 (1)", VIEWS + 2);
     assert!(said.iter().any(|line| line.contains(&named)), "{said:?}");
     let scene = scene::load(&request.out, &scene::Config::default()).expect("a scene");
     assert_eq!(scene.train.len(), VIEWS as usize);

@@ -197,6 +197,13 @@ fn one_box_becomes_a_scene() {
 
 // ---------------------------------------------------------------- thin evidence, other lenses
 
+/// What a preparation says.
+pub(crate) fn prepared(request: &Request) -> Vec<String> {
+    let mut lines = Lines::default();
+    prepare::prepare(&testing::gpu(), request, &mut lines).expect("a scene");
+    lines.0
+}
+
 /// Masks for all photographs, by the number of the view; a short fit.
 fn prepared_with_masks(of: impl Fn(u32, &GrayImage) -> GrayImage) -> (TempDir, Vec<String>) {
     let folder = capture();
@@ -272,10 +279,9 @@ fn fisheyes_become_pinholes() {
 
     let mut request = Request::new(&photos, folder.path().join("scene"));
     request.only = vec![Step::Poses];
-    let mut lines = Lines::default();
-    prepare::prepare(&testing::gpu(), &request, &mut lines).expect("poses");
-    let said = "poses: 1 photographs were resampled from OPENCV_FISHEYE to pinholes";
-    assert!(lines.0.iter().any(|line| line == said), "{:?}", lines.0);
+    let said = prepared(&request);
+    let resampled = "poses: 1 photographs were resampled from OPENCV_FISHEYE to pinholes";
+    assert!(said.iter().any(|line| line == resampled), "{said:?}");
     let scene = scene::load(&request.out, &scene::Config { unit: 1.0, ..Default::default() }).expect("a scene");
     let original =
         scene::load(&folder.path().join("full"), &scene::Config { unit: 1.0, ..Default::default() }).expect("a scene");

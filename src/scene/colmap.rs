@@ -3,7 +3,7 @@
 //! The format is the one documented in COLMAP's manual ("Output Format"). The 2D observations are skipped.
 
 use std::collections::BTreeMap;
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
 
@@ -190,8 +190,8 @@ fn rotation(q: [f64; 4]) -> Option<[[f64; 3]; 3]> {
     ])
 }
 
-/// Finds and reads the model under `scene`: of `sparse/0`, `sparse/1` and so on the largest, else `sparse`. Cameras and images are binary where `cameras.bin`
-/// is, else text; points come from `points3D.bin`, `.txt` or `.ply`, the first that holds any.
+/// Finds and reads the model under `scene`: of `sparse/0`, `sparse/1` and so on the largest, else `sparse`. Cameras and images
+/// are binary where `cameras.bin` is, else text; points come from `points3D.bin`, `.txt` or `.ply`, the first that holds any.
 ///
 /// # Errors
 /// No model, an unreadable or truncated file, an unsupported camera model, unusable numbers, no points.
@@ -234,16 +234,32 @@ fn extension(folder: &Path) -> Option<&'static str> {
 /// The models that a mapper has made of the parts of a capture that it could not join, `sparse/0`, `sparse/1` and so on, and
 /// how many photographs each has: the largest first, of equals the first. Of one alone the photographs are not counted.
 pub(crate) fn parts(scene: &Path) -> Vec<(PathBuf, usize)> {
-    let folders = (0..).map(|number| scene.join("sparse").join(number.to_string()));
-    let folders = folders.take_while(|folder| folder.is_dir()).filter(|folder| extension(folder).is_some());
-    let mut parts: Vec<(PathBuf, usize)> = folders.map(|folder| (folder, 0)).collect();
+    let numbered =
+        |entry: fs::DirEntry| entry.file_name().to_str()?.parse::<u32>().ok().map(|number| (number, entry.path()));
+    let mut folders: Vec<_> =
+        fs::read_dir(scene.join("sparse")).into_iter().flatten().flatten().filter_map(numbered).collect();
+    folders.sort();
+    let mut parts: Vec<(PathBuf, usize)> =
+        folders.into_iter().filter(|(_, folder)| extension(folder).is_some()).map(|(_, folder)| (folder, 0)).collect();
     if parts.len() > 1 {
         for (folder, count) in &mut parts {
-            *count = cameras_and_images(folder, READ).map_or(0, |(_, _, images)| images.len());
+            *count = photographs(folder).unwrap_or(0);
         }
         parts.sort_by_key(|(_, count)| std::cmp::Reverse(*count));
     }
     parts
+}
+
+/// How many photographs the model in `folder` has. A binary file begins with it: its tracks are not read for that.
+///
+/// # Errors
+/// A file that cannot be read.
+fn photographs(folder: &Path) -> Result<usize, Error> {
+    let binary = folder.join("images.bin");
+    if binary.is_file() {
+        return Ok(Binary::open(&binary)?.u64(&|| "the count".into())? as usize);
+    }
+    Ok(text_images(&folder.join("images.txt"))?.len())
 }
 
 /// The model's folder under `scene`, which may be `scene` itself, and the extension of its cameras and images. Of several parts

@@ -2,7 +2,7 @@
 
 use image::{GrayImage, Luma, RgbImage};
 
-use super::{Cues, Mark, found};
+use super::{Cues, Mark, bounds_of, found};
 use crate::prepare::graph_cut::{self, Known, SMOOTHNESS};
 use crate::scene::resample;
 
@@ -68,12 +68,10 @@ fn thin(picture: &RgbImage, bounds: [u32; 4], smoothness: f64) -> Option<GrayIma
 }
 
 /// The part of a box's width and height, the smaller of the two, that a mask reaches over; nothing if it is empty.
-fn filled(mask: &GrayImage, [x0, y0, x1, y1]: [u32; 4]) -> Option<f64> {
-    let on = || mask.enumerate_pixels().filter(|(_, _, v)| v.0[0] != 0);
-    let (left, right) = (on().map(|(x, _, _)| x).min()?, on().map(|(x, _, _)| x).max()?);
-    let (top, bottom) = (on().map(|(_, y, _)| y).min()?, on().map(|(_, y, _)| y).max()?);
-    let part = |low: u32, high: u32, of: u32| f64::from(high + 1 - low) / f64::from(of);
-    Some(part(left, right, x1 - x0).min(part(top, bottom, y1 - y0)))
+fn filled(mask: &GrayImage, bounds: [u32; 4]) -> Option<f64> {
+    let on = bounds_of(mask)?;
+    let part = |axis: usize| (on[axis + 2] - on[axis]) / f64::from(bounds[axis + 2] - bounds[axis]);
+    Some(part(0).min(part(1)))
 }
 
 #[cfg(test)]
