@@ -173,34 +173,42 @@ fn labels<F: Fn(usize, f64) -> f64 + Sync>(hole: &Hole<'_, F>, planes: &[Plane])
     let of_nodes: Vec<Vec<f64>> = (0..nodes).into_par_iter().map(of).collect();
     let costs: Vec<Vec<f64>> =
         (0..=rest).map(|label| of_nodes.iter().map(|costs| scale * costs[label]).collect()).collect();
-    let border = |[p, q]: [usize; 2], _: [usize; 2]| BORDER * if outline[p] || outline[q] { COINCIDENCE } else { 1.0 };
-    let current = cheapest(&costs, border, size);
+    let between = |[p, q]: [usize; 2]| BORDER * if outline[p] || outline[q] { COINCIDENCE } else { 1.0 };
+    let current = cheapest(&costs, &Border { between, at: |_, _| 0.0 }, size);
     (0..w * h).map(|i| current[(i / w / stride) * gw + (i % w) / stride] as u8).collect()
 }
 
-/// The labels of least cost on a grid, by alpha expansion: `costs` `[label][node]`, and for each pair of nodes and their
-/// labels what `border` says, for each unit of a border's length between them: the same for `[a, b]` and `[b, a]`; 0 for the same
-/// label.
-pub fn cheapest(
-    costs: &[Vec<f64>],
-    border: impl Fn([usize; 2], [usize; 2]) -> f64 + Copy,
-    size: [usize; 2],
-) -> Vec<usize> {
+/// What a border between two labels costs for each unit of its length.
+pub struct Border<B, A> {
+    /// Between two nodes, whichever their labels.
+    pub between: B,
+    /// More at each of the two nodes, by the two labels in either order.
+    pub at: A,
+}
+
+/// The labels of least cost on a grid, by alpha expansion: `costs` `[label][node]`.
+pub fn cheapest<B, A>(costs: &[Vec<f64>], border: &Border<B, A>, size: [usize; 2]) -> Vec<usize>
+where
+    B: Fn([usize; 2]) -> f64,
+    A: Fn(usize, [usize; 2]) -> f64,
+{
     let labels = costs.len();
     let units: Vec<Vec<i64>> = costs.iter().map(|of| of.iter().map(|cost| (UNIT * cost) as i64).collect()).collect();
     let least = |node: usize| (0..labels).min_by_key(|label| units[*label][node]).unwrap_or(0);
     let mut current: Vec<usize> = (0..size[0] * size[1]).map(least).collect();
-    for _ in 0..3 {
-        let before = current.clone();
-        for alpha in 0..labels {
-            expand(&mut current, alpha, &units, border, size);
-        }
-        if before == current {
+    // Until no label has been taken anywhere since it was tried last.
+    let mut unchanged = 0;
+    for alpha in (0..labels).cycle().take(ROUNDS * labels) {
+        unchanged = if expand(&mut current, alpha, &units, border, size) { 0 } else { unchanged + 1 };
+        if unchanged == labels {
             break;
         }
     }
     current
 }
+
+/// How often each label is tried at most.
+const ROUNDS: usize = 3;
 
 /// Sixteen neighbours: with eight, the staircases between two points within half a right angle are as short as the line.
 const SHIFTS: [[isize; 2]; 16] = [
@@ -235,18 +243,24 @@ fn length(dx: isize, dy: isize) -> f64 {
     0.5 * angle / f64::hypot(dx as f64, dy as f64)
 }
 
-/// Every pixel keeps its label or takes `alpha`, as is cheapest: one minimum cut (Kolmogorov and Zabih 2004).
-fn expand(
+/// Every pixel keeps its label or takes `alpha`, as is cheapest: one minimum cut (Kolmogorov and Zabih 2004). Returns whether any
+/// takes it.
+fn expand<B, A>(
     current: &mut [usize],
     alpha: usize,
     units: &[Vec<i64>],
-    border: impl Fn([usize; 2], [usize; 2]) -> f64,
+    Border { between, at }: &Border<B, A>,
     size @ [w, h]: [usize; 2],
-) {
+) -> bool
+where
+    B: Fn([usize; 2]) -> f64,
+    A: Fn(usize, [usize; 2]) -> f64,
+{
     let mut grid = Grid::new(size, &SHIFTS);
     let scales = SHIFTS.map(|[dx, dy]| UNIT * length(dx, dy));
     // Of keeping, minus of taking alpha.
     let mut gain: Vec<i64> = (0..current.len()).map(|i| units[current[i]][i] - units[alpha][i]).collect();
+    let own: Vec<f64> = current.iter().enumerate().map(|(i, label)| at(i, [*label, alpha])).collect();
     for p in 0..current.len() {
         for (d, [dx, dy]) in SHIFTS.into_iter().enumerate().skip(8) {
             let (x, y) = ((p % w) as isize + dx, (p / w) as isize + dy);
@@ -254,10 +268,17 @@ fn expand(
                 continue;
             }
             let q = y as usize * w + x as usize;
-            let differ =
-                |a: usize, b: usize| if a == b { 0 } else { (scales[d] * border([p, q], [a, b])).min(MOST) as i64 };
-            let (keep, take_q) = (differ(current[p], current[q]), differ(current[p], alpha));
-            let take_p = if current[p] == current[q] { take_q } else { differ(alpha, current[q]) };
+            let price = |cost: f64| (scales[d] * cost).min(MOST) as i64;
+            let (keep, take_p, take_q) = if current[p] == current[q] {
+                // On either side the border is between the same two labels.
+                let take = if current[p] == alpha { 0 } else { price(between([p, q]) + (own[p] + own[q])) };
+                (0, take, take)
+            } else {
+                let differ = |labels @ [a, b]: [usize; 2]| {
+                    if a == b { 0 } else { price(between([p, q]) + (at(p, labels) + at(q, labels))) }
+                };
+                (differ([current[p], current[q]]), differ([alpha, current[q]]), differ([current[p], alpha]))
+            };
             gain[p] += keep - take_p;
             gain[q] += take_p;
             // A border that is no metric is made one: what would be negative is 0.
@@ -267,11 +288,14 @@ fn expand(
     for (i, gain) in gain.into_iter().enumerate() {
         grid.set_terminals(i, gain, 0);
     }
+    let mut taken = false;
     for (label, takes) in current.iter_mut().zip(grid.cut()) {
-        if takes {
+        if takes && *label != alpha {
             *label = alpha;
+            taken = true;
         }
     }
+    taken
 }
 
 /// Each surface's inverse depth in the hole: its plane, and on it a membrane over what known pixels are off from it.

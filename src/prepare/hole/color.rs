@@ -192,7 +192,7 @@ fn asked(sights: &Sights, of: usize, site: usize) -> Option<Asked> {
     if !own.near_hole(site) || !own.depth[site].is_finite() {
         return None;
     }
-    let eye = DVec3::from(own.grid.camera.center());
+    let eye = own.eye();
     let point = own.point(site, own.depth[site]);
     let (to, distance) = ((point - eye).normalize(), point.distance(eye));
     let mut found: Vec<(usize, f64, [f64; 3])> = vec![];
@@ -204,7 +204,7 @@ fn asked(sights: &Sights, of: usize, site: usize) -> Option<Asked> {
             witnesses.through += usize::from(!sight.hole[there] && sight.grid.depth[there] > z * (1.0 + APART));
         }
         let Some(there) = sight.shows(point, 1.5 * SAME) else { continue };
-        let from = DVec3::from(sight.grid.camera.center());
+        let from = sight.eye();
         let angle = to.dot((point - from).normalize()).clamp(-1.0, 1.0).acos();
         let finer = (mean_focal(sight) * distance / (mean_focal(own) * point.distance(from))).ln();
         let color = sight.grid.colors[there].map(f64::from);
@@ -289,7 +289,7 @@ fn sources(sights: &Sights, of: usize, told: &[Told]) -> Vec<Option<usize>> {
         }
     };
     let costs: Vec<Vec<f64>> = (0..=none).map(|label| sites.iter().map(|site| cost(label, *site)).collect()).collect();
-    let labels = planes::cheapest(&costs, |_, _| SEAM, window.size);
+    let labels = planes::cheapest(&costs, &planes::Border { between: |_| SEAM, at: |_, _| 0.0 }, window.size);
     let mut sources = vec![None; own.hole.len()];
     for (cell, site) in sites.iter().enumerate() {
         let label = labels[cell];
@@ -367,7 +367,7 @@ pub fn repaint(
         filling.rgb[i] = told[i].unwrap_or(filling.rgb[i]);
         filling.guessed[i] = false;
     }
-    gradient::solve(&mut filling.rgb, &equations);
+    gradient::solve(&mut filling.rgb, w, &equations);
 }
 
 /// Whether two colours of one place differ in brightness alone.
@@ -431,7 +431,7 @@ pub fn gather(sights: &Sights, photographs: &[Photograph<'_>], of: usize) -> Fil
         filling.rgb[i] = mixed[i];
         (filling.guessed[i], filling.seen[i]) = (false, true);
     }
-    gradient::solve(&mut filling.rgb, &equations);
+    gradient::solve(&mut filling.rgb, w, &equations);
     let doubts = filling.doubtful.iter().filter(|doubtful| **doubtful).count() as f64;
     if doubts > DISTRUST * own.hole.as_raw().iter().filter(|hole| **hole != 0).count() as f64 {
         // What is around such a hole is not known, either, and a guess goes on from there; but under the object lies what it

@@ -123,7 +123,7 @@ impl Sights {
                 let known = |site: &usize| near[*site] && sight.grid.confirmed[*site] && sight.depth[*site].is_finite();
                 let sites: Vec<usize> = (0..near.len()).filter(|site| sight.grid.trusted && known(site)).collect();
                 let every = sites.len().div_ceil(POINTS).max(1);
-                let eye = DVec3::from(sight.grid.camera.center());
+                let eye = sight.eye();
                 let point = |site: usize| Measured { point: sight.point(site, sight.depth[site]), eye };
                 sites.into_iter().step_by(every).map(point).collect::<Vec<_>>()
             })
@@ -236,7 +236,7 @@ impl Sights {
         };
         let costs: Vec<Vec<f64>> =
             (0..=planes.len()).map(|label| (0..sites.len()).map(|cell| cost(label, cell)).collect()).collect();
-        let labels = planes::cheapest(&costs, |_, _| BORDER, window.size);
+        let labels = planes::cheapest(&costs, &planes::Border { between: |_| BORDER, at: |_, _| 0.0 }, window.size);
         let on_plane = |cell: usize| {
             let site = sites[cell];
             let z = depth_on(planes.get(labels[cell])?, site);

@@ -250,7 +250,7 @@ fn common(colors: &[[f32; 3]]) -> Option<[f32; 3]> {
     colors.iter().copied().find(|color| (0..3).all(|c| (color[c] - middle[c]).abs() <= GLARE))
 }
 
-/// Fills what is left and `wanted` in the picture itself, from the same surface, else from any.
+/// Fills the parts that are left and `wanted` in the picture itself, each from the same surface, else from any.
 fn in_picture(filling: &mut Filling, size: [usize; 2], wanted: &[bool], surface: impl Fn(usize) -> u8 + Sync) {
     for same in [true, false] {
         let left: Vec<usize> = (0..wanted.len()).filter(|i| wanted[*i] && filling.guessed[*i]).collect();
@@ -259,20 +259,22 @@ fn in_picture(filling: &mut Filling, size: [usize; 2], wanted: &[bool], surface:
         labels.dedup();
         for label in labels {
             let of: Vec<usize> = left.iter().copied().filter(|i| !same || surface(*i) == label).collect();
-            let (cells, [cw, ch]) = surroundings(&of, size);
-            let mut wanted = vec![false; filling.guessed.len()];
-            of.iter().for_each(|i| wanted[*i] = true);
-            let source = |i: &usize| !filling.guessed[*i] && (!same || surface(*i) == label);
-            let mut texture = Texture {
-                size: [cw, ch],
-                rgb: cells.iter().map(|i| filling.rgb[*i]).collect(),
-                hole: cells.iter().map(|i| wanted[*i]).collect(),
-                source: cells.par_iter().map(source).collect(),
-            };
-            if texture::fill(&mut texture) {
-                for (cell, i) in cells.iter().enumerate().filter(|(cell, i)| wanted[**i] && !texture.hole[*cell]) {
-                    filling.rgb[*i] = texture.rgb[cell];
-                    filling.guessed[*i] = false;
+            for part in parts(&of, size) {
+                let (cells, [cw, ch]) = surroundings(&part, size);
+                let mut wanted = vec![false; filling.guessed.len()];
+                part.iter().for_each(|i| wanted[*i] = true);
+                let source = |i: &usize| !filling.guessed[*i] && (!same || surface(*i) == label);
+                let mut texture = Texture {
+                    size: [cw, ch],
+                    rgb: cells.iter().map(|i| filling.rgb[*i]).collect(),
+                    hole: cells.iter().map(|i| wanted[*i]).collect(),
+                    source: cells.par_iter().map(source).collect(),
+                };
+                if texture::fill(&mut texture) {
+                    for (cell, i) in cells.iter().enumerate().filter(|(cell, i)| wanted[**i] && !texture.hole[*cell]) {
+                        filling.rgb[*i] = texture.rgb[cell];
+                        filling.guessed[*i] = false;
+                    }
                 }
             }
         }

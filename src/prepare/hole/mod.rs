@@ -142,35 +142,36 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
     let mut sights = Sights::new(grids, &cameras, &masks, &wide);
     sights.flatten(task.seed);
     log::debug!("hole: planes are found");
-    let of = reference(task, &sights, &with_holes)?;
+    let mut shown = shown_by_others(&sights, &with_holes);
+    let of = reference(task, &sights, &shown)?;
     let photographed = |masks: &[GrayImage]| -> Vec<Photograph<'_>> {
         let views = task.fine.train.iter().zip(masks);
         views.map(|(view, hole)| Photograph { camera: view.camera, picture: &view.image, hole: hole.clone() }).collect()
     };
     let mut photographs = photographed(&masks);
     if task.shade {
-        sights.solve(of, task.seed);
-        let found = shade::add(&sights, &photographs, of, &mut masks);
-        if found {
+        let mut solved = sights.clone();
+        solved.solve(of, task.seed);
+        if shade::add(&solved, &photographs, of, &mut masks) {
             batch.notes.push(
                 "the soft shadow around the object's foot is taken away with it (--shadow keep: it stays)".into(),
             );
             photographs = photographed(&masks);
+            let grids = sights.0.into_iter().map(|sight| sight.grid).collect();
+            sights = Sights::new(grids, &cameras, &masks, &wide);
+            sights.flatten(task.seed);
+            shown = shown_by_others(&sights, &with_holes);
         }
-        let grids = sights.0.into_iter().map(|sight| sight.grid).collect();
-        sights = Sights::new(grids, &cameras, &masks, &wide);
-        sights.flatten(task.seed);
     }
     let mut filled: Vec<(usize, Filled)> = vec![];
-    let unsolved = |sights: &Sights, i: usize| {
-        let known = sights.carried(i).iter().filter(|(z, _)| z.is_finite()).count();
-        sights.0[i].hole.iter().filter(|hole| **hole).count() - known
-    };
-    let expected = 1.0 - unsolved(&sights, of) as f64 / sights.0[of].hole.iter().filter(|h| **h).count().max(1) as f64;
+    let expected = part(&shown[&of]);
     sights.solve(of, task.seed);
     // After the reference those that show most of what is still unknown.
-    let mut rest: Vec<(usize, usize)> =
-        with_holes.iter().filter(|i| **i != of).map(|i| (unsolved(&sights, *i), *i)).collect();
+    let unknown = |i: usize| {
+        let told = sights.told(of, i);
+        shown[&i].iter().zip(told).filter(|(shown, told)| !**shown && !told).count()
+    };
+    let mut rest: Vec<(usize, usize)> = with_holes.iter().filter(|i| **i != of).map(|i| (unknown(*i), *i)).collect();
     rest.sort_by(|a, b| b.0.cmp(&a.0).then(a.1.cmp(&b.1)));
     watch.turn(n + 1)?;
     // What the user has painted is known to all others.
@@ -258,26 +259,41 @@ fn as_exposed(task: &Task<'_>, i: usize, rgb: &[[f32; 3]]) -> Vec<[f32; 3]> {
     rgb.iter().map(|color| std::array::from_fn(|c| color[c] * gain[c] as f32)).collect()
 }
 
+/// `[view][site of the hole]` whether other photographs show what is there, of these views.
+type Shown = BTreeMap<usize, Vec<bool>>;
+
+fn shown_by_others(sights: &Sights, views: &[usize]) -> Shown {
+    let of = |i: usize| {
+        let carried = sights.carried(i).into_iter().zip(&sights.0[i].hole);
+        carried.filter(|(_, hole)| **hole).map(|((z, _), _)| z.is_finite()).collect()
+    };
+    views.iter().map(|i| (*i, of(*i))).collect()
+}
+
+/// The part of a hole that is shown.
+fn part(shown: &[bool]) -> f64 {
+    shown.iter().filter(|shown| **shown).count() as f64 / shown.len().max(1) as f64
+}
+
 /// The view whose hole is seen best by others, or the named one.
-fn reference(task: &Task<'_>, sights: &Sights, with_holes: &[usize]) -> Result<usize, Error> {
+fn reference(task: &Task<'_>, sights: &Sights, shown: &Shown) -> Result<usize, Error> {
     if let Some(name) = task.named {
         let of = task.scene.train.iter().position(|view| view.name == name).expect("the name was looked up before");
-        if !with_holes.contains(&of) {
+        if !shown.contains_key(&of) {
             return Err(Error::Request(format!(
                 "--reference {name}: the object is not in this view; name one that shows it"
             )));
         }
         return Ok(of);
     }
-    if let Some(of) = task.given.keys().find(|i| with_holes.contains(i)) {
+    if let Some(of) = task.given.keys().find(|i| shown.contains_key(i)) {
         return Ok(*of);
     }
-    let area = |i: usize| sights.0[i].hole.iter().filter(|hole| **hole).count() as f64;
-    let largest = with_holes.iter().map(|i| area(*i)).fold(0.0, f64::max);
-    let seen = |i: usize| sights.carried(i).iter().filter(|(z, _)| z.is_finite()).count() as f64 / area(i).max(1.0);
-    let large = with_holes.iter().copied().filter(|i| sights.0[*i].grid.trusted && area(*i) >= LEAST_HOLE * largest);
-    let best = large.map(|i| (seen(i), i)).reduce(|best, next| if next.0 > best.0 { next } else { best });
-    Ok(best.map_or(with_holes[0], |(_, i)| i))
+    let largest = shown.values().map(Vec::len).max().unwrap_or(0) as f64;
+    let large = shown.iter().filter(|(i, s)| sights.0[**i].grid.trusted && s.len() as f64 >= LEAST_HOLE * largest);
+    let best = large.map(|(i, shown)| (part(shown), *i)).reduce(|best, next| if next.0 > best.0 { next } else { best });
+    let first = || *shown.keys().next().expect("a view has a hole");
+    Ok(best.map_or_else(first, |(_, i)| i))
 }
 
 /// The filled hole and a little around it: whole colours, alpha in the hole alone, [`DOUBTFUL`] where it is.

@@ -14,7 +14,11 @@ const WIDE: usize = 7;
 /// Pixels to each side of a patch's middle.
 pub const RADIUS: usize = WIDE / 2;
 /// Pixels of a patch whose copies must be known: two thirds.
-const ENOUGH: f32 = (WIDE * WIDE) as f32 * 2.0 / 3.0;
+const ENOUGH: i32 = (2 * WIDE * WIDE).div_ceil(3) as i32;
+/// Colours are compared in these parts of one, so that sums may run without rounding.
+const PARTS: f32 = 65536.0;
+/// [`DIFFERENT`] in those.
+const CAPPED: i32 = (DIFFERENT * PARTS + 0.5) as i32;
 
 /// The best shift of each patch.
 pub struct Best {
@@ -62,8 +66,9 @@ pub fn most_alike(
     rows: Range<usize>,
 ) -> Best {
     let patches = columns.len() * rows.len();
-    let channels = [0, 1, 2].map(|c| rgb.iter().map(|rgb| rgb[c]).collect::<Vec<f32>>());
-    let known = known.iter().map(|known| f32::from(u8::from(*known))).collect();
+    let whole = |value: f32| (PARTS * value).round() as i32;
+    let channels = [0, 1, 2].map(|c| rgb.iter().map(|rgb| whole(rgb[c])).collect::<Vec<i32>>());
+    let known = known.iter().map(|known| -i32::from(*known)).collect();
     let search = Search { channels, known, size, columns, rows };
     let chunk = shifts.len().div_ceil(4 * rayon::current_num_threads()).max(1);
     let parts = shifts.par_chunks(chunk).enumerate().map(|(part, shifts)| search.of(shifts, part * chunk));
@@ -72,24 +77,28 @@ pub fn most_alike(
 
 /// A texture as it is searched: each channel for itself, so that pixels of a row are compared at once.
 struct Search {
-    channels: [Vec<f32>; 3],
-    /// `[pixel]` 1 where it may be copied, 0 elsewhere.
-    known: Vec<f32>,
+    channels: [Vec<i32>; 3],
+    /// `[pixel]` all bits where it may be copied, none elsewhere.
+    known: Vec<i32>,
     size: [usize; 2],
     columns: Range<usize>,
     rows: Range<usize>,
 }
 
-/// Sums of differences, and of how many pixels they are.
-type Sums = [Vec<f32>; 2];
+/// Sums of differences, in parts of one, and of how many pixels they are: far from what overflows, which is not looked for, so that
+/// pixels of a row are compared at once in tests, too.
+type Sums = [Vec<i32>; 2];
+
+/// Rows of differences that are kept: those of a patch and the one that left it.
+const KEPT: usize = WIDE + 1;
 
 impl Search {
     /// The best of some shifts, the first of which has this number.
     fn of(&self, shifts: &[Shift], first: usize) -> Best {
         let width = self.columns.len();
-        let zeros = |n: usize| -> Sums { [vec![0.0; n], vec![0.0; n]] };
+        let zeros = |n: usize| -> Sums { [vec![0; n], vec![0; n]] };
         let mut best = Best::none(width * self.rows.len());
-        let mut compared: Vec<Sums> = self.rows.clone().map(|_| zeros(width)).collect();
+        let mut compared: [Sums; KEPT] = std::array::from_fn(|_| zeros(width));
         // With a margin of nothing on both sides.
         let (mut down, mut across) = (zeros(width + WIDE), zeros(width));
         for (number, [dx, dy]) in (first as u32..).zip(shifts) {
@@ -101,22 +110,32 @@ impl Search {
             if n <= RADIUS || m <= RADIUS {
                 continue;
             }
-            down.iter_mut().for_each(|sums| sums[RADIUS + n..].fill(0.0));
-            for (row, to) in rows.clone().zip(&mut compared) {
-                let here = row * self.size[0] + columns.start;
-                self.compare(here, here.wrapping_add_signed(dy * self.size[0] as isize + dx), n, to);
-            }
-            for row in 0..m {
-                let patch = row.saturating_sub(RADIUS)..(row + RADIUS + 1).min(m);
-                for k in 0..2 {
-                    let sums = &mut down[k][RADIUS..RADIUS + n];
-                    sums.fill(0.0);
-                    compared[patch.clone()].iter().for_each(|row| add(sums, &row[k]));
-                    let sums = &mut across[k][..n];
-                    sums.fill(0.0);
-                    (0..WIDE).for_each(|by| add(sums, &down[k][by..]));
+            down.iter_mut().for_each(|sums| sums.fill(0));
+            // The sums over a patch's rows run: one row comes and one goes.
+            for row in 0..m + RADIUS {
+                if row >= WIDE {
+                    for (sums, gone) in down.iter_mut().zip(&compared[(row - WIDE) % KEPT]) {
+                        sums[RADIUS..RADIUS + n]
+                            .iter_mut()
+                            .zip(gone)
+                            .for_each(|(sum, gone)| *sum = sum.wrapping_sub(*gone));
+                    }
                 }
-                let at = (rows.start + row - self.rows.start) * width + columns.start - self.columns.start;
+                if row < m {
+                    let here = (rows.start + row) * self.size[0] + columns.start;
+                    let there = here.wrapping_add_signed(dy * self.size[0] as isize + dx);
+                    let come = &mut compared[row % KEPT];
+                    self.compare(here, there, n, come);
+                    for (sums, come) in down.iter_mut().zip(come) {
+                        sums[RADIUS..RADIUS + n]
+                            .iter_mut()
+                            .zip(come)
+                            .for_each(|(sum, come)| *sum = sum.wrapping_add(*come));
+                    }
+                }
+                let Some(middle) = row.checked_sub(RADIUS) else { continue };
+                across.iter_mut().zip(&down).for_each(|(sums, down)| wide(down, &mut sums[..n]));
+                let at = (rows.start + middle - self.rows.start) * width + columns.start - self.columns.start;
                 keep(&across, number, &mut best.error[at..at + n], &mut best.shift[at..at + n]);
             }
         }
@@ -130,10 +149,21 @@ impl Search {
         let (own, copy) = (&self.known[here..here + n], &self.known[there..there + n]);
         let (sums, counts) = (&mut sums[..n], &mut counts[..n]);
         for i in 0..n {
-            let apart = (r[i] - red[i]).abs() + (g[i] - green[i]).abs() + (b[i] - blue[i]).abs();
-            counts[i] = own[i] * copy[i];
-            sums[i] = apart.min(DIFFERENT) * counts[i];
+            let off = |one: i32, other: i32| one.wrapping_sub(other).wrapping_abs();
+            let apart = off(r[i], red[i]).wrapping_add(off(g[i], green[i])).wrapping_add(off(b[i], blue[i]));
+            let known = own[i] & copy[i];
+            counts[i] = known & 1;
+            sums[i] = apart.min(CAPPED) & known;
         }
+    }
+}
+
+/// The sums over a patch's width, of columns that begin so many before the first patch's middle as it is wide there.
+fn wide(columns: &[i32], sums: &mut [i32]) {
+    let n = sums.len();
+    let by: [&[i32]; WIDE] = std::array::from_fn(|by| &columns[by..by + n]);
+    for i in 0..n {
+        sums[i] = by.iter().fold(0, |sum: i32, columns| sum.wrapping_add(columns[i]));
     }
 }
 
@@ -143,17 +173,13 @@ fn overlap(range: &Range<usize>, length: usize, by: isize) -> Range<usize> {
     start..range.end.min((length as isize - by).max(0) as usize).max(start)
 }
 
-/// Adds what comes first of a row to each of these.
-fn add(sums: &mut [f32], row: &[f32]) {
-    sums.iter_mut().zip(row).for_each(|(sum, value)| *sum += value);
-}
-
 /// Keeps for a row of patches the shift of this number where it is better than what was found before.
 fn keep([sums, counts]: &Sums, number: u32, error: &mut [f32], shift: &mut [u32]) {
     let n = error.len();
     let (sums, counts, shift) = (&sums[..n], &counts[..n], &mut shift[..n]);
     for i in 0..n {
-        let found = if counts[i] >= ENOUGH { sums[i] / counts[i] } else { f32::INFINITY };
+        let mean = sums[i] as f32 / (PARTS * counts[i] as f32);
+        let found = if counts[i] >= ENOUGH { mean } else { f32::INFINITY };
         let better = found < error[i];
         error[i] = if better { found } else { error[i] };
         shift[i] = if better { number } else { shift[i] };
@@ -173,7 +199,7 @@ mod tests {
         let mut rng = Pcg64::seed_from_u64(4);
         let size @ [w, h] = [31, 26];
         let mut pixel = |_| {
-            let rgb: [f32; 3] = std::array::from_fn(|_| rng.random_range(0.0..0.4));
+            let rgb: [f32; 3] = std::array::from_fn(|_| rng.random_range(0..26_000) as f32 / PARTS);
             (rgb, rng.random_bool(0.9))
         };
         let (rgb, source): (Vec<[f32; 3]>, Vec<bool>) = (0..w * h).map(&mut pixel).unzip();
@@ -192,8 +218,9 @@ mod tests {
             let both = patch.filter_map(|[x, y]| Some((known([x, y])?, known([x + dx, y + dy])?)));
             let apart =
                 |(a, b): (usize, usize)| (0..3).map(|c| (texture.rgb[a][c] - texture.rgb[b][c]).abs()).sum::<f32>();
-            let apart: Vec<f32> = both.map(|pair| apart(pair).min(DIFFERENT)).collect();
-            if apart.len() as f32 >= ENOUGH { apart.iter().sum::<f32>() / apart.len() as f32 } else { f32::INFINITY }
+            let capped = CAPPED as f32 / PARTS;
+            let apart: Vec<f32> = both.map(|pair| apart(pair).min(capped)).collect();
+            if apart.len() >= ENOUGH as usize { apart.iter().sum::<f32>() / apart.len() as f32 } else { f32::INFINITY }
         };
         let mut some = 0;
         for (at, (x, y)) in rows.clone().flat_map(|y| columns.clone().map(move |x| (x, y))).enumerate() {
@@ -203,8 +230,8 @@ mod tests {
                 assert!(found.error[at].is_infinite(), "({x}, {y})");
                 continue;
             }
-            // Two sums of up to 49 numbers below 1, so many roundings of half a unit in the last place of 32, over 33 or more.
-            let tolerance = 2.0 * 49.0 * 16.0 * f32::EPSILON / 33.0;
+            // The sums are exact, in whole parts below 2^16; the two quotients are rounded, to half a unit in the last place of 1.
+            let tolerance = f32::EPSILON;
             assert!((found.error[at] - least).abs() <= tolerance, "({x}, {y}): {} for {least}", found.error[at]);
             assert!(errors[found.shift[at] as usize] - least <= tolerance, "({x}, {y})");
             some += 1;

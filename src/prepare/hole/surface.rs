@@ -21,8 +21,8 @@ pub(super) const SAME: f64 = 0.03;
 pub(super) const APART: f64 = 0.06;
 /// Sum of the weights of the views that must claim a depth behind the object.
 const ENOUGH: f64 = 2.0;
-/// Weight of a depth that no other view has confirmed. A confirmed one weighs 1.
-const UNCONFIRMED: f64 = 0.5;
+/// What a claim weighs whose view is solved, which is enough; whose depth another view confirms; whose depth none does.
+const WEIGHTS: [f64; 3] = [ENOUGH, 1.0, 0.5];
 /// Share of the views with a point in the picture whose masks must cover it for it to be the object's.
 const HULL: f64 = 0.8;
 /// Fewest views with a point in the picture that can tell whether it is the object's.
@@ -47,6 +47,7 @@ const NEARER: f64 = 0.5;
 const FEW: usize = 12;
 
 /// One view of the scene without the object.
+#[derive(Clone)]
 pub struct Sight {
     /// Depth of the photograph, the object included.
     pub grid: DepthGrid,
@@ -67,6 +68,15 @@ pub struct Sight {
     pub solved: bool,
     /// How many views were solved before it.
     rank: usize,
+    /// From world coordinates to a place in sites times z, and z.
+    forward: (DMat3, DVec3),
+    /// From a place in sites, and 1, to the way to what is seen there at z = 1; and the camera's centre.
+    backward: (DMat3, DVec3),
+}
+
+/// A camera's rotation.
+fn rotation(camera: &Camera) -> DMat3 {
+    DMat3::from_cols_array_2d(&camera.rotation.map(|row| row.map(f64::from))).transpose()
 }
 
 /// Depth z that another view claims at a site.
@@ -74,11 +84,46 @@ pub struct Sight {
 struct Claim {
     depth: f64,
     view: usize,
-    weight: f64,
+    /// Which of [`WEIGHTS`] is its.
+    class: usize,
     /// Whether the view's photograph shows it.
     photographed: bool,
     /// Number of the view's plane that it lies on, if on one.
     surface: u8,
+}
+
+/// What the views claim that have a claim in a cluster: of each its weightiest counts.
+struct Votes {
+    /// `[view][class]` how many of its claims there are.
+    counts: Vec<[u32; 3]>,
+    /// The sum.
+    weight: f64,
+}
+
+impl Votes {
+    fn of(views: usize) -> Self {
+        Self { counts: vec![[0; 3]; views], weight: 0.0 }
+    }
+
+    /// The weight of a view's weightiest claim.
+    fn own(&self, view: usize) -> f64 {
+        self.counts[view].iter().position(|count| *count > 0).map_or(0.0, |class| WEIGHTS[class])
+    }
+
+    fn count(&mut self, claim: &Claim, change: impl Fn(&mut u32)) {
+        let before = self.own(claim.view);
+        change(&mut self.counts[claim.view][claim.class]);
+        // Halves and wholes: the sum is exact.
+        self.weight += self.own(claim.view) - before;
+    }
+
+    fn come(&mut self, claim: &Claim) {
+        self.count(claim, |count| *count += 1);
+    }
+
+    fn go(&mut self, claim: &Claim) {
+        self.count(claim, |count| *count -= 1);
+    }
 }
 
 /// A surface as it goes on around one of its sites.
@@ -118,7 +163,14 @@ impl Sight {
         let hole: Vec<bool> = (0..grid.depth.len()).map(|site| covers(mask, camera, &grid, site)).collect();
         let depth = grid.depth.iter().zip(&hole).map(|(z, hole)| if *hole { f64::NAN } else { *z }).collect();
         let sites = hole.len();
+        let [focal, principal] = [grid.camera.focal, grid.camera.principal]
+            .map(|lengths| lengths.map(|length| f64::from(length) / f64::from(grid.stride)));
+        let lens = DMat3::from_cols_array(&[focal[0], 0.0, 0.0, 0.0, focal[1], 0.0, principal[0], principal[1], 1.0]);
+        let turn = rotation(&grid.camera);
+        let shift = DVec3::from(grid.camera.translation);
         Self {
+            forward: (lens * turn, lens * shift),
+            backward: (turn.transpose() * lens.inverse(), DVec3::from(grid.camera.center())),
             grid,
             hole,
             depth,
@@ -131,6 +183,11 @@ impl Sight {
         }
     }
 
+    /// Where the camera stands.
+    pub fn eye(&self) -> DVec3 {
+        self.backward.1
+    }
+
     /// Site and depth z of a world point that is in the picture.
     pub fn see(&self, point: DVec3) -> Option<(usize, f64)> {
         self.seen(point).map(|(site, _, z)| (site, z))
@@ -138,7 +195,13 @@ impl Sight {
 
     /// The same, with the place in sites.
     pub(super) fn seen(&self, point: DVec3) -> Option<(usize, [f64; 2], f64)> {
-        self.grid.see(point)
+        let at = self.forward.0 * point + self.forward.1;
+        if at.z <= 0.0 {
+            return None;
+        }
+        let place @ [x, y] = [at.x / at.z, at.y / at.z];
+        let inside = x >= 0.0 && y >= 0.0;
+        self.grid.site(x as i64, y as i64).filter(|_| inside).map(|site| (site, place, at.z))
     }
 
     /// Depth z at a place in sites, linear in its inverse between sites of one surface; NaN where nothing is known.
@@ -240,11 +303,8 @@ impl Sight {
     /// The view's planes as another sees them: inverse depth by x/z, y/z and 1 of its camera.
     fn planes_for(&self, other: &Self) -> Vec<planes::Plane> {
         // A plane p is p . x = 1 in camera coordinates.
-        let rows = |sight: &Self| {
-            DMat3::from_cols_array_2d(&sight.grid.camera.rotation.map(|row| row.map(f64::from))).transpose()
-        };
         let offset = |sight: &Self| DVec3::from(sight.grid.camera.translation);
-        let turn = rows(self) * rows(other).transpose();
+        let turn = rotation(&self.grid.camera) * rotation(&other.grid.camera).transpose();
         let shift = offset(self) - turn * offset(other);
         let plane = |plane: &planes::Plane| {
             let plane = DVec3::from(*plane);
@@ -309,7 +369,8 @@ impl Sight {
 
     /// The world point on a site's ray at a depth z.
     pub fn point(&self, site: usize, depth: f64) -> DVec3 {
-        DVec3::from(self.grid.camera.along(self.ray(site), depth))
+        let [column, row] = [site as u32 % self.grid.columns, site as u32 / self.grid.columns].map(f64::from);
+        self.backward.0 * DVec3::new(column + 0.5, row + 0.5, 1.0) * depth + self.backward.1
     }
 
     /// Whether a site is of the hole, or next to it.
@@ -377,6 +438,7 @@ impl Window {
 }
 
 /// All views of the scene without the object.
+#[derive(Clone)]
 pub struct Sights(pub Vec<Sight>);
 
 impl Sights {
@@ -424,14 +486,13 @@ impl Sights {
                     }
                     let point = sight.point(site, depth);
                     let Some((there, z)) = own.see(point).filter(|(there, _)| own.hole[*there]) else { continue };
-                    let weight = match (sight.hole[site], sight.grid.confirmed[site]) {
-                        // One solved view is enough.
-                        (true, _) => ENOUGH,
-                        (false, true) => 1.0,
-                        (false, false) => UNCONFIRMED,
+                    let class = match (sight.hole[site], sight.grid.confirmed[site]) {
+                        (true, _) => 0,
+                        (false, true) => 1,
+                        (false, false) => 2,
                     };
                     let (photographed, surface) = (!sight.hole[site], sight.surface[site]);
-                    found.push((there, Claim { depth: z, view, weight, photographed, surface }));
+                    found.push((there, Claim { depth: z, view, class, photographed, surface }));
                 }
                 found
             })
@@ -463,35 +524,56 @@ impl Sights {
             near.retain(|claim| claim.photographed || Some(self.0[claim.view].rank) == first);
             near.sort_unstable_by(|a, b| a.depth.total_cmp(&b.depth));
             let object = if own.grid.confirmed[site] { own.grid.depth[site] } else { 0.0 };
-            let mut first = 0;
-            while first < near.len() {
-                let last =
-                    first + near[first..].partition_point(|claim| claim.depth <= (1.0 + SAME) * near[first].depth);
-                let mut views: Vec<(usize, f64)> = near[first..last].iter().map(|c| (c.view, c.weight)).collect();
-                views.sort_unstable_by(|a, b| a.0.cmp(&b.0).then(b.1.total_cmp(&a.1)));
-                views.dedup_by_key(|view| view.0);
-                let weight: f64 = views.iter().map(|view| view.1).sum();
-                // What a view was solved by is smoother than what was measured.
-                let solved = near[first..last].iter().filter(|claim| !claim.photographed);
-                let mut solved: Vec<f64> = solved.map(|claim| in_middle(site, claim)).collect();
-                solved.sort_unstable_by(f64::total_cmp);
-                let depth = match solved.len() {
-                    0 => near[(first + last) / 2].depth,
-                    n => solved[n / 2],
-                };
-                let enough = weight >= ENOUGH && depth > (1.0 - SAME) * object;
-                if enough && self.against(of, own.point(site, depth)) < 1.0 {
-                    if self.barred(of, site, depth) {
-                        break;
-                    }
-                    return (depth, near[first..last].iter().any(|claim| claim.photographed));
+            let solved = first.is_some();
+            let (mut last, mut votes, mut refuted) = (0, Votes::of(self.0.len()), f64::NAN);
+            // Each cluster begins with the next claim.
+            for first in 0..near.len() {
+                while near.get(last).is_some_and(|claim| claim.depth <= (1.0 + SAME) * near[first].depth) {
+                    votes.come(&near[last]);
+                    last += 1;
                 }
-                // The cluster that begins with the next claim.
-                first += 1;
+                let (cluster, weight) = (&near[first..last], votes.weight);
+                votes.go(&near[first]);
+                if weight < ENOUGH {
+                    continue;
+                }
+                // What a view was solved by is smoother than what was measured.
+                let smooth = cluster.iter().filter(|claim| solved && !claim.photographed);
+                let mut smooth: Vec<f64> = smooth.map(|claim| in_middle(site, claim)).collect();
+                smooth.sort_unstable_by(f64::total_cmp);
+                let depth = match smooth.len() {
+                    0 => cluster[cluster.len() / 2].depth,
+                    n => smooth[n / 2],
+                };
+                // The next cluster often has the same middle.
+                if depth == refuted || depth <= (1.0 - SAME) * object {
+                    continue;
+                }
+                if self.is_refuted(of, own.point(site, depth)) {
+                    refuted = depth;
+                    continue;
+                }
+                if self.barred(of, site, depth) {
+                    break;
+                }
+                return (depth, cluster.iter().any(|claim| claim.photographed));
             }
             (f64::NAN, false)
         };
         (0..own.hole.len()).into_par_iter().map(one).collect()
+    }
+
+    /// `[site of the hole]` of a view whether another's surface behind the object falls there, or beside it.
+    pub fn told(&self, by: usize, of: usize) -> Vec<bool> {
+        let (own, other) = (&self.0[of], &self.0[by]);
+        let mut falls = vec![false; own.hole.len()];
+        for site in (0..other.hole.len()).filter(|site| other.hole[*site] && other.depth[*site].is_finite()) {
+            if let Some((there, _)) = own.see(other.point(site, other.depth[site])) {
+                falls[there] = true;
+            }
+        }
+        let holes = (0..own.hole.len()).filter(|site| own.hole[*site]);
+        holes.map(|site| own.around(site).any(|near| falls[near])).collect()
     }
 
     /// `[cell]` what each plane costs there by what photographs show on it, and at last where the site was carried to; nothing
@@ -523,7 +605,7 @@ impl Sights {
             let impossible = |plane: &planes::Plane| {
                 let z = 1.0 / planes::on(plane, own.ray(site));
                 let before = z < NEARER / f64::from(disparity[site]);
-                before || self.against(of, own.point(site, z)) == 1.0
+                before || self.is_refuted(of, own.point(site, z))
             };
             let cost = |label: usize| {
                 if planes.get(label).is_some_and(impossible) {

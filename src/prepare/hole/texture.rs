@@ -257,16 +257,13 @@ impl Texture {
         };
         let colors: Vec<Vec<[f32; 3]>> =
             (0..=none).map(|label| (0..n).map(|node| color(label, pixel(node))).collect()).collect();
-        let border = |[p, q]: [usize; 2], [a, b]: [usize; 2]| {
-            let at = |node: usize| {
-                let apart = apart(colors[a][node], colors[b][node]);
-                // Known pixels have one colour; that a copy would have there is compared on the other side.
-                f64::from(if apart.is_nan() { DIFFERENT / 2.0 } else { apart })
-            };
-            LEAST_SEAM + SEAM * (at(p) + at(q))
+        let at = |node: usize, [a, b]: [usize; 2]| {
+            let apart = apart(colors[a][node], colors[b][node]);
+            // Known pixels have one colour; that a copy would have there is compared on the other side.
+            SEAM * f64::from(if apart.is_nan() { DIFFERENT / 2.0 } else { apart })
         };
         let mut labels = vec![none; w * h];
-        planes::cheapest(&costs, border, size)
+        planes::cheapest(&costs, &planes::Border { between: |_| LEAST_SEAM, at }, size)
             .into_iter()
             .enumerate()
             .for_each(|(node, label)| labels[pixel(node)] = label);
@@ -359,10 +356,10 @@ impl Texture {
         let inwards = resample::distances(&known, w.max(h) as u32);
         let deepest = (0..w * h).filter(|i| self.hole[*i]).map(|i| inwards[i]).max().unwrap_or(1);
         let fades = FADES * f64::from(deepest);
+        let weights: Vec<f64> = inwards.iter().map(|depth| UNLIKE * (-f64::from(*depth) / fades).exp()).collect();
         move |pixel, from| {
             let apart = of_another(around[from], expected[pixel]);
-            let weight = UNLIKE * (-f64::from(inwards[pixel]) / fades).exp();
-            if apart.is_finite() { weight * f64::from(apart) } else { 0.0 }
+            if apart.is_finite() { weights[pixel] * f64::from(apart) } else { 0.0 }
         }
     }
 }
@@ -381,14 +378,8 @@ pub fn fill(texture: &mut Texture) -> bool {
     }
     let labels = small.labels(&coarse, &materials);
     let shifts = refined(texture, &small, &labels, &coarse, by);
-    // Of each pixel the pixel that it copies.
+    let copied = copies(texture, &shifts, &labels, small.size[0], by);
     let [w, h] = texture.size;
-    let copied: Vec<Option<usize>> = (0..w * h)
-        .map(|i| {
-            let label = labels[(i / w / by) * small.size[0] + i % w / by];
-            texture.hole[i].then(|| shifts.get(label).and_then(|shift| texture.source(i, *shift))).flatten()
-        })
-        .collect();
     for (i, from) in copied.iter().enumerate() {
         if let Some(from) = from {
             texture.rgb[i] = texture.rgb[*from];
@@ -411,6 +402,34 @@ pub fn fill(texture: &mut Texture) -> bool {
         *hole &= copied[i].is_none() && !(between[i] && texture.rgb[i][0].is_finite());
     }
     true
+}
+
+/// Of each pixel the pixel that it copies, by the labels of the reduced picture. A shift at full size may end some pixels before
+/// the one it is from: there the pieces beside it go on.
+fn copies(texture: &Texture, shifts: &[Shift], labels: &[usize], columns: usize, by: usize) -> Vec<Option<usize>> {
+    let w = texture.size[0];
+    let label = |i: usize| Some(labels[(i / w / by) * columns + i % w / by]).filter(|label| *label < shifts.len());
+    let holes = (0..texture.hole.len()).filter(|i| texture.hole[*i]);
+    let mut copied = vec![None; texture.hole.len()];
+    let mut own = vec![None; texture.hole.len()];
+    let mut left = vec![];
+    for i in holes {
+        own[i] = label(i).filter(|label| texture.source(i, shifts[*label]).is_some());
+        copied[i] = own[i].and_then(|label| texture.source(i, shifts[label]));
+        left.extend(own[i].is_none().then_some(i));
+    }
+    for _ in 0..2 * by {
+        let goes_on = |i: usize| {
+            let mut beside = planes::neighbours(i, texture.size).filter_map(|j| own[j]);
+            beside.find_map(|label| Some((i, label, texture.source(i, shifts[label])?)))
+        };
+        let more: Vec<(usize, usize, usize)> = left.iter().filter_map(|i| goes_on(*i)).collect();
+        for (i, label, from) in more {
+            (own[i], copied[i]) = (Some(label), Some(from));
+        }
+        left.retain(|i| own[*i].is_none());
+    }
+    copied
 }
 
 /// The shifts of the reduced picture at full size: of each the nearest at which what is around its pixels is most like what it
@@ -523,7 +542,7 @@ fn join(texture: &mut Texture, copied: &[Option<usize>]) {
             let gradient = match (own, other) {
                 (Some(own), Some(other)) => std::array::from_fn(|c| 0.5 * (own[c] + other[c])),
                 (Some(one), None) | (None, Some(one)) => one,
-                (None, None) => less(copied[i].unwrap_or(i), copied[j].unwrap_or(j)),
+                (None, None) => less(here, there),
             };
             equation.add(j, gradient);
         }
@@ -531,7 +550,7 @@ fn join(texture: &mut Texture, copied: &[Option<usize>]) {
     };
     let inside: Vec<usize> = (0..copied.len()).filter(|i| copied[*i].is_some()).collect();
     let equations: Vec<Equation> = inside.into_par_iter().map(equation).collect();
-    gradient::solve(&mut texture.rgb, &equations);
+    gradient::solve(&mut texture.rgb, texture.size[0], &equations);
 }
 
 #[cfg(test)]
@@ -664,6 +683,22 @@ mod tests {
             let steps = (62..130).map(|x| (mean(x + 4, y) - mean(x, y)).abs());
             let largest = steps.fold(0.0, f32::max);
             assert!(largest < 0.08, "{largest} in row {y}");
+        }
+    }
+
+    /// Two pieces, of which the left one's copies end two pixels before it does: there the right one goes on.
+    #[test]
+    fn pieces_touch() {
+        let (texture, _) = texture([60, 20], |x, _| (20..40).contains(&x), |_, _| [0.5; 3]);
+        let labels: Vec<usize> = (0..30 * 10).map(|cell| if cell % 30 < 15 { 0 } else { 1 }).collect();
+        let copied = copies(&texture, &[[-8, 0], [12, 0]], &labels, 30, 2);
+        for (i, from) in copied.iter().enumerate() {
+            let by = match i % 60 {
+                20..28 => Some(-8),
+                28..40 => Some(12),
+                _ => None,
+            };
+            assert_eq!(*from, by.map(|by| i.wrapping_add_signed(by)), "{i}");
         }
     }
 

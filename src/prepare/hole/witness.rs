@@ -76,6 +76,21 @@ impl Sights {
         }
     }
 
+    /// Whether the other views prove that nothing is at this point. They are asked until what is left of them cannot change it.
+    pub(super) fn is_refuted(&self, of: usize, point: DVec3) -> bool {
+        let (mut through, mut agree) = (0, 0);
+        for view in (0..self.0.len()).filter(|view| *view != of) {
+            let said = self.witness(view, point);
+            through += u32::from(said == Witness::Through);
+            agree += u32::from(said == Witness::Agrees);
+            let left = (self.0.len() - 1 - view) as u32;
+            if refuted(through, agree + left) || through + left <= 2 * agree {
+                break;
+            }
+        }
+        refuted(through, agree)
+    }
+
     /// From 0, nothing speaks against a surface at this point, to 1, it cannot be there.
     pub(super) fn against(&self, of: usize, point: DVec3) -> f64 {
         let (mut through, mut agree, mut hidden, mut asked) = (0u32, 0u32, 0u32, 0u32);
@@ -99,7 +114,12 @@ impl Sights {
             let said = self.witness(view, point);
             asked += usize::from(said != Witness::Silent);
             if said == Witness::Hidden {
-                hidden.push(DVec3::from(self.0[view].grid.camera.center()) - point);
+                hidden.push(self.0[view].eye() - point);
+            }
+            // Though all that are left had something before it.
+            let left = self.0.len() - 1 - view;
+            if ((hidden.len() + left) as f64) < WITHIN_THING * (asked + left) as f64 {
+                return false;
             }
         }
         let around = || hidden.iter().any(|side| side.dot(hidden[0]) < 0.0);
