@@ -769,6 +769,21 @@ pub(super) mod tests {
         (cameras.iter().map(grid).collect(), cameras.clone(), cameras.iter().map(mask).collect())
     }
 
+    /// Of each view the weightiest claim counts, as claims come and go.
+    #[test]
+    fn a_view_has_one_vote() {
+        let claim = |view, class| Claim { depth: 1.0, view, class, photographed: true, surface: 0 };
+        let mut votes = Votes::of(2);
+        for (claim, weight) in [(claim(0, 2), 0.5), (claim(0, 1), 1.0), (claim(1, 2), 1.5), (claim(0, 1), 1.5)] {
+            votes.come(&claim);
+            assert_eq!(votes.weight, weight);
+        }
+        for (claim, weight) in [(claim(0, 1), 1.5), (claim(0, 1), 1.0), (claim(1, 2), 0.5), (claim(0, 2), 0.0)] {
+            votes.go(&claim);
+            assert_eq!(votes.weight, weight);
+        }
+    }
+
     /// What the views on the left and on the right show behind the square is the wall, and the middle view's hole gets it; what
     /// is solved is known to the next view.
     #[test]

@@ -165,6 +165,29 @@ mod tests {
         }
     }
 
+    /// Who stops asking early comes to what all views say, before, on and behind the wall, beside and behind the square.
+    #[test]
+    fn an_early_answer_is_the_whole_one() {
+        let (mut grids, cameras, masks) = views(0.4);
+        // Two views have the wall nearer than it is.
+        for grid in &mut grids[..2] {
+            grid.depth.iter_mut().filter(|z| **z > 3.0).for_each(|z| *z = 3.2);
+        }
+        let mut sights = Sights::new(grids, &cameras, &masks, &masks);
+        let mut counts = [0; 2];
+        for solved in [false, true] {
+            for at in 0..9 * 9 * 30 {
+                let [x, y, z] = [at % 9, at / 9 % 9, at / 81].map(f64::from);
+                let point = DVec3::new(0.3 * (x - 4.0), 0.2 * (y - 4.0), 1.0 + 0.2 * z);
+                let refuted = sights.is_refuted(2, point);
+                assert_eq!(refuted, sights.against(2, point) == 1.0, "{point} {solved}");
+                counts[usize::from(refuted)] += 1;
+            }
+            (0..5).for_each(|of| sights.solve(of, 1));
+        }
+        assert!(counts.iter().all(|count| *count > 200), "{counts:?}");
+    }
+
     /// A ball that is seen from all around bars the way to what is behind it, not the way past it nor to its front.
     #[test]
     fn the_way_through_a_thing_is_barred() {
