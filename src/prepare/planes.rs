@@ -178,7 +178,7 @@ fn labels<F: Fn(usize, f64) -> f64 + Sync>(hole: &Hole<'_, F>, planes: &[Plane])
     (0..w * h).map(|i| current[(i / w / stride) * gw + (i % w) / stride] as u8).collect()
 }
 
-/// What a border between two labels costs for each unit of its length.
+/// Cost of a border between two labels for each unit of its length.
 pub struct Border<B, A> {
     /// Between two nodes, whichever their labels.
     pub between: B,

@@ -21,7 +21,7 @@ pub(super) const SAME: f64 = 0.03;
 pub(super) const APART: f64 = 0.06;
 /// Sum of the weights of the views that must claim a depth behind the object.
 const ENOUGH: f64 = 2.0;
-/// What a claim weighs whose view is solved, which is enough; whose depth another view confirms; whose depth none does.
+/// Weights of claims: of a view that is solved, which is enough; of a depth that another view confirms; of one that none does.
 const WEIGHTS: [f64; 3] = [ENOUGH, 1.0, 0.5];
 /// Share of the views with a point in the picture whose masks must cover it for it to be the object's.
 const HULL: f64 = 0.8;
@@ -92,7 +92,7 @@ struct Claim {
     surface: u8,
 }
 
-/// What the views claim that have a claim in a cluster: of each its weightiest counts.
+/// Votes of the views that have claims in a cluster: the weightiest of each view counts.
 struct Votes {
     /// `[view][class]` how many of its claims there are.
     counts: Vec<[u32; 3]>,
@@ -769,7 +769,7 @@ pub(super) mod tests {
         (cameras.iter().map(grid).collect(), cameras.clone(), cameras.iter().map(mask).collect())
     }
 
-    /// Of each view the weightiest claim counts, as claims come and go.
+    /// The weightiest claim of a view counts alone, as claims come and go.
     #[test]
     fn a_view_has_one_vote() {
         let claim = |view, class| Claim { depth: 1.0, view, class, photographed: true, surface: 0 };

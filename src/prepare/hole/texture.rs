@@ -404,32 +404,27 @@ pub fn fill(texture: &mut Texture) -> bool {
     true
 }
 
-/// Of each pixel the pixel that it copies, by the labels of the reduced picture. A shift at full size may end some pixels before
-/// the one it is from: there the pieces beside it go on.
+/// The pixel that each pixel copies, by the labels of the reduced picture. A shift at full size may end some pixels before the one
+/// it is from: there the pieces beside it go on.
 fn copies(texture: &Texture, shifts: &[Shift], labels: &[usize], columns: usize, by: usize) -> Vec<Option<usize>> {
     let w = texture.size[0];
-    let label = |i: usize| Some(labels[(i / w / by) * columns + i % w / by]).filter(|label| *label < shifts.len());
-    let holes = (0..texture.hole.len()).filter(|i| texture.hole[*i]);
-    let mut copied = vec![None; texture.hole.len()];
-    let mut own = vec![None; texture.hole.len()];
-    let mut left = vec![];
-    for i in holes {
-        own[i] = label(i).filter(|label| texture.source(i, shifts[*label]).is_some());
-        copied[i] = own[i].and_then(|label| texture.source(i, shifts[label]));
-        left.extend(own[i].is_none().then_some(i));
+    let source = |i: usize, label: usize| texture.source(i, *shifts.get(label)?);
+    let holes: Vec<usize> = (0..texture.hole.len()).filter(|i| texture.hole[*i]).collect();
+    let mut own: Vec<Option<usize>> = vec![None; texture.hole.len()];
+    for &i in &holes {
+        own[i] = Some(labels[(i / w / by) * columns + i % w / by]).filter(|label| source(i, *label).is_some());
     }
+    let mut left: Vec<usize> = holes.into_iter().filter(|i| own[*i].is_none()).collect();
     for _ in 0..2 * by {
         let goes_on = |i: usize| {
             let mut beside = planes::neighbours(i, texture.size).filter_map(|j| own[j]);
-            beside.find_map(|label| Some((i, label, texture.source(i, shifts[label])?)))
+            beside.find(|label| source(i, *label).is_some())
         };
-        let more: Vec<(usize, usize, usize)> = left.iter().filter_map(|i| goes_on(*i)).collect();
-        for (i, label, from) in more {
-            (own[i], copied[i]) = (Some(label), Some(from));
-        }
+        let more: Vec<(usize, Option<usize>)> = left.iter().map(|i| (*i, goes_on(*i))).collect();
+        more.into_iter().for_each(|(i, label)| own[i] = label);
         left.retain(|i| own[*i].is_none());
     }
-    copied
+    own.into_iter().enumerate().map(|(i, label)| source(i, label?)).collect()
 }
 
 /// The shifts of the reduced picture at full size: of each the nearest at which what is around its pixels is most like what it
