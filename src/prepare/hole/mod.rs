@@ -6,7 +6,8 @@
 //! - `complete`: masks that end before the object does grow.
 //! - `surface`: the depth of what is behind the object, in all views, by what they know of a point (`witness`).
 //! - `color`: what photographs show of it, and what views that were filled before show of it.
-//! - `guess`: what nobody shows is filled with pieces of the same surface, seen straight on (`texture`), or by a network.
+//! - `guess`: what nobody shows is filled with pieces of the same surface, seen straight on (`texture`), lines that
+//!   cross the hole first (`lines`), or by a network.
 //!
 //! One view is the reference: its picture goes to `reference/`, where a better one may take its place. All other views'
 //! holes are filled from the same surface, into `hole/`.
@@ -18,6 +19,7 @@ mod front;
 mod gradient;
 pub mod ground;
 mod guess;
+mod lines;
 mod residue;
 mod shade;
 mod similar;
@@ -54,7 +56,7 @@ const LEAST_HOLE: f64 = 0.4;
 const AT_ONCE: usize = 16;
 /// Name of the way in which holes are filled: a scene that was filled in another way is filled anew.
 pub const METHOD: &str = "one surface with smooth ends, nothing where others look through it, no colour from a rim that looks like nothing near it, \
-     lights joined, doubts left to training, nothing stands on what only crosses the floor";
+     lights joined, doubts left to training, nothing stands on what only crosses the floor, lines go on through holes";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 
