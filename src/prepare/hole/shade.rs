@@ -5,12 +5,13 @@
 //! under it is.
 
 use glam::DVec3;
-use image::GrayImage;
+use image::{GrayImage, Luma};
 use rayon::prelude::*;
 
 use super::color::Photograph;
 use super::guess::Chart;
 use super::surface::{SAME, Sights};
+use crate::prepare::planes;
 use crate::scene::{Camera, resample};
 
 /// Logarithm of the luminance by which the shade's middle is darker than the surface, at least, and its border.
@@ -26,12 +27,16 @@ const UNSEEN: f64 = 0.3;
 const ROUGH: f64 = 0.05;
 /// Half the width of the squares that the differences are averaged over, as a part of the foot's width.
 const SMOOTH: f64 = 0.05;
+/// Half the width of a line, with the squares, as a part of the foot's.
+const THIN: f64 = 0.1;
 /// Fewest sites of the foot.
 const FEWEST_SITES: usize = 8;
 /// The dark part of a shade covers at least this part of the foot's area, and all of it at most so much: what is larger is a
 /// pattern of the surface, or something else's shadow.
 const LEAST: f64 = 0.05;
 const MOST: f64 = 3.5;
+/// What is known of the plane where the farthest shade would end, at least, as a part of the foot's area.
+const LEAST_RING: f64 = 0.2;
 /// Views that are asked for the colours of the plane.
 const VIEWS: usize = 12;
 
@@ -104,10 +109,29 @@ fn find(sights: &Sights, photographs: &[Photograph<'_>], of: usize) -> Option<(C
             }
         }
     }
+    // What no view shows of the plane around those, where the view itself has the hole, is under the object as well.
+    let in_hole = |i: usize| {
+        let point = chart.point(i);
+        let site = (point.z > 0.0).then(|| sight.grid.place([point.x / point.z, point.y / point.z]));
+        let site = site.and_then(|[x, y]| sight.grid.site(x.floor() as i64, y.floor() as i64));
+        site.is_some_and(|site| sight.hole[site])
+    };
+    let unseen: Vec<bool> = (0..light.len()).map(|i| light[i][0].is_nan() && in_hole(i)).collect();
+    spread(&mut footing, &unseen, chart.size);
     let mut shade = shaded(&light, &footing, chart.size)?;
     // A site of the foot reaches beyond the mask, into the darkest of the shade.
     shade.iter_mut().zip(&footing).for_each(|(shade, foot)| *shade |= foot);
     Some((chart, shade))
+}
+
+/// Adds what is unseen and hangs together with the foot to it.
+fn spread(foot: &mut [bool], unseen: &[bool], size: [usize; 2]) {
+    let mut left: Vec<bool> = foot.iter().zip(unseen).map(|(foot, unseen)| *foot || *unseen).collect();
+    for first in 0..foot.len() {
+        if foot[first] {
+            planes::connected(first, &mut left, size).into_iter().for_each(|i| foot[i] = true);
+        }
+    }
 }
 
 /// `[texel]` logarithms of what the views show of the plane: the median of each channel; NaN where none shows it.
@@ -198,8 +222,18 @@ fn shaded(light: &[[f64; 3]], foot: &[bool], size @ [w, h]: [usize; 2]) -> Optio
             }
         }
     }
+    let dark = |shade: &[bool]| (0..foot.len()).filter(|i| shade[*i] && darker(*i, DARK)).count() as f64;
+    let whole = dark(&shade);
+    // What is thin is a joint or another line, which the foot happens to stand beside.
+    let of = |is: &dyn Fn(usize) -> bool| {
+        GrayImage::from_fn(w as u32, h as u32, |x, y| Luma([if is((y * w as u32 + x) as usize) { 255 } else { 0 }]))
+    };
+    let thin = (THIN * width).ceil() as u32;
+    let outside = resample::dilate(&of(&|i| !shade[i] && !foot[i]), thin);
+    let thick = resample::dilate(&of(&|i| outside.as_raw()[i] == 0), thin);
+    shade.iter_mut().zip(thick.as_raw()).for_each(|(shade, thick)| *shade &= *thick != 0);
     let area = shade.iter().filter(|shade| **shade).count() as f64;
-    let core = (0..foot.len()).filter(|i| shade[*i] && darker(*i, DARK)).count() as f64;
+    let core = dark(&shade);
     // A shade ends: what is dark as far as one looks is another surface.
     let far = |i: &usize| f64::from(away[*i]) > 0.9 * REACH * width;
     let ring = (0..foot.len()).filter(|i| differences[*i].is_some()).filter(far);
@@ -207,9 +241,11 @@ fn shaded(light: &[[f64; 3]], foot: &[bool], size @ [w, h]: [usize; 2]) -> Optio
     let darkest = differences.iter().flatten().min_by(|a, b| a.iter().sum::<f64>().total_cmp(&b.iter().sum()));
     log::debug!("shade: the darkest is {darkest:.2?}");
     log::debug!("shade: {area} texels, {core} of them dark, {at_end} of {all} at the end of what is looked at");
-    let ends = 5 * at_end < all || at_end == 0;
     let foot = feet().count() as f64;
-    (core >= LEAST * foot && core >= 0.2 * area && area <= MOST * foot && ends).then_some(shade)
+    // Where it would end is to be seen.
+    let ends = all as f64 >= LEAST_RING * foot && (5 * at_end < all || at_end == 0);
+    // Where most of it is lines, what is left of them beside the foot is none.
+    (core >= LEAST * foot && core >= 0.2 * area && core >= 0.5 * whole && area <= MOST * foot && ends).then_some(shade)
 }
 
 /// Coefficients of least squares in which what is far off loses its weight (Cauchy), and the median of the absolute residuals.
@@ -288,12 +324,31 @@ mod tests {
         }
     }
 
+    /// Of the foot a few sites alone are on the plane: what no view shows around them is the foot, too, so that the shade, which is many
+    /// times as large as they are, is one. What is unseen elsewhere is not.
+    #[test]
+    fn the_foot_is_all_that_is_unseen_around_it() {
+        let disc = |i: usize, x: f64, y: f64| ((i % SIZE[0]) as f64 - x).hypot((i / SIZE[0]) as f64 - y) < 12.0;
+        let sites = || (0..SIZE[0] * SIZE[1]).map(|i| i / SIZE[0] == 52 && (55..63).contains(&(i % SIZE[0])));
+        let unseen: Vec<bool> = (0..SIZE[0] * SIZE[1]).map(|i| disc(i, 60.0, 50.0) || disc(i, 100.0, 80.0)).collect();
+        let shade = |x: f64, y: f64| 0.35 * (-((x - 48.0) / 9.0).powi(2) - ((y - 50.0) / 9.0).powi(2)).exp();
+        let mut floor = light(|x, y| [0.8, 0.75, 0.7].map(|v| v * (1.0 - shade(x, y))));
+        floor.iter_mut().zip(&unseen).filter(|(_, unseen)| **unseen).for_each(|(v, _)| *v = [f64::NAN; 3]);
+        let mut spread_out: Vec<bool> = sites().collect();
+        assert!(shaded(&floor, &spread_out, SIZE).is_none());
+        spread(&mut spread_out, &unseen, SIZE);
+        assert_eq!(spread_out, foot());
+        assert!(shaded(&floor, &spread_out, SIZE).is_some());
+    }
+
     /// Dark joints between tiles run away from the foot, and a shadow of something else touches it: neither is the foot's shade.
     #[test]
     fn patterns_and_other_shadows_stay() {
         let joint = |v: f64| v.rem_euclid(30.0) < 2.0;
         let tiles = light(|x, y| if joint(x) || joint(y) { [0.4, 0.37, 0.35] } else { [0.8, 0.75, 0.7] });
         assert!(shaded(&tiles, &foot(), SIZE).is_none());
+        let one = light(|x, _| if (59.0..61.0).contains(&x) { [0.4, 0.37, 0.35] } else { [0.8, 0.75, 0.7] });
+        assert!(shaded(&one, &foot(), SIZE).is_none());
         let wide = |x: f64, y: f64| x < 52.0 && (y - 50.0).abs() < 25.0;
         let shadow = light(|x, y| if wide(x, y) { [0.5, 0.47, 0.44] } else { [0.8, 0.75, 0.7] });
         assert!(shaded(&shadow, &foot(), SIZE).is_none());
