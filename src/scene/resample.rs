@@ -170,6 +170,16 @@ pub fn dilate(mask: &GrayImage, radius: u32) -> GrayImage {
     GrayImage::from_raw(mask.width(), mask.height(), values).expect("a value per pixel")
 }
 
+/// The pixels of a picture of this size that `is` says, without what is thinner than discs of this radius: a mask of 0 and 255
+/// (morphological opening).
+pub fn opened([w, h]: [u32; 2], is: impl Fn(usize) -> bool, radius: u32) -> GrayImage {
+    let mask = |of: &dyn Fn(usize) -> bool| {
+        GrayImage::from_fn(w, h, |x, y| image::Luma([if of((y * w + x) as usize) { 255 } else { 0 }]))
+    };
+    let outside = dilate(&mask(&|i| !is(i)), radius);
+    dilate(&mask(&|i| outside.as_raw()[i] == 0), radius)
+}
+
 /// Distance of each pixel from the nearest object pixel, rounded up to whole pixels; `reach + 1` where none is as near as
 /// `reach`.
 pub fn distances(mask: &GrayImage, reach: u32) -> Vec<u32> {

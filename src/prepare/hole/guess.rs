@@ -6,7 +6,6 @@
 use std::collections::BTreeSet;
 
 use glam::{DVec2, DVec3};
-use image::{GrayImage, Luma};
 use rayon::prelude::*;
 
 use super::color::{Filling, Photograph, between};
@@ -150,11 +149,7 @@ const THIN: f64 = 0.008;
 /// `[pixel]` what of this is at least [`THIN`] wide. The rest is filled smoothly.
 pub fn thick(wanted: &[bool], [w, h]: [u32; 2]) -> Vec<bool> {
     let reach = (0.5 * THIN * f64::from(w.max(h))).ceil() as u32;
-    let picture = |of: &dyn Fn(usize) -> bool| {
-        GrayImage::from_fn(w, h, |x, y| Luma([if of((y * w + x) as usize) { 255 } else { 0 }]))
-    };
-    let beside = resample::dilate(&picture(&|i| !wanted[i]), reach);
-    let inside = resample::dilate(&picture(&|i| beside.as_raw()[i] == 0), reach);
+    let inside = resample::opened([w, h], |i| wanted[i], reach);
     inside.as_raw().iter().map(|v| *v != 0).collect()
 }
 

@@ -10,7 +10,6 @@
 use std::ops::Range;
 
 use glam::DVec2;
-use image::{GrayImage, Luma};
 use rayon::prelude::*;
 
 use super::similar::Picture;
@@ -77,7 +76,7 @@ impl Line {
         [off.dot(along), along.perp_dot(off)]
     }
 
-    /// The same line where a picture is so many times as large.
+    /// Scales the line with its picture, which becomes so many times as large.
     pub fn scaled(&self, by: f64) -> Self {
         Self { ends: self.ends.map(|end| end * by), beside: self.beside * by, known: self.known * by, ..*self }
     }
@@ -97,14 +96,14 @@ impl Line {
 }
 
 /// Sums of the channels of a picture.
-struct Grey {
+pub struct Grey {
     size: [usize; 2],
     /// `[pixel]`; NaN where it is not known.
     values: Vec<f64>,
 }
 
 impl Grey {
-    fn new(Picture { rgb, known, size }: Picture<'_>) -> Self {
+    pub fn new(Picture { rgb, known, size }: Picture<'_>) -> Self {
         let grey =
             |(rgb, known): (&[f32; 3], &bool)| if *known { f64::from(rgb.iter().sum::<f32>()) } else { f64::NAN };
         Self { size, values: rgb.iter().zip(known).map(grey).collect() }
@@ -113,13 +112,9 @@ impl Grey {
     /// Between the middles of four pixels; NaN where one of them is not known.
     fn at(&self, place: DVec2) -> f64 {
         let [w, h] = self.size;
-        let (low, part) = ((place - 0.5).floor(), (place - 0.5).fract_gl());
-        if low.x < 0.0 || low.y < 0.0 || low.x + 1.0 >= w as f64 || low.y + 1.0 >= h as f64 {
-            return f64::NAN;
-        }
-        let i = low.y as usize * w + low.x as usize;
-        let row = |i: usize| self.values[i] + (self.values[i + 1] - self.values[i]) * part.x;
-        row(i) + (row(i + w) - row(i)) * part.y
+        let inside = place.cmpge(DVec2::splat(0.5)).all() && place.cmplt(DVec2::new(w as f64, h as f64) - 0.5).all();
+        let grey = || resample::bilinear(self.size.map(|n| n as u32), place.to_array(), |i| [self.values[i]])[0];
+        if inside { grey() } else { f64::NAN }
     }
 
     /// How much brighter it is at a place than on both sides.
@@ -137,7 +132,7 @@ fn ridge(here: f64, sides: [f64; 2]) -> f64 {
     }
 }
 
-/// What is around a hole, turned so that lines of one direction are rows.
+/// The surroundings of a hole, turned so that lines of one direction are rows.
 struct Turned {
     middle: DVec2,
     /// The direction of the rows.
@@ -253,13 +248,9 @@ fn line(nearly: &Row<'_>, here: &Row<'_>, [first, last]: [usize; 2], least: f64)
 /// The lines that cross a picture's hole, surest first.
 pub fn lines(picture: Picture<'_>, hole: &[bool]) -> Vec<Line> {
     let (grey, size @ [w, h]) = (Grey::new(picture), picture.size);
-    let of = |is: &dyn Fn(usize) -> bool| {
-        GrayImage::from_fn(w as u32, h as u32, |x, y| Luma([if is((y * w as u32 + x) as usize) { 255 } else { 0 }]))
-    };
     // What is too thin for a gap is left out, and parts that are near each other are one.
-    let thin = LEAST_GAP as u32 / 2;
-    let outside = resample::dilate(&of(&|i| !hole[i]), thin);
-    let near = resample::dilate(&of(&|i| outside.as_raw()[i] == 0), thin + LEAST_END as u32 / 2);
+    let thick = resample::opened([w as u32, h as u32], |i| hole[i], LEAST_GAP as u32 / 2);
+    let near = resample::dilate(&thick, LEAST_END as u32 / 2);
     let mut near: Vec<bool> = near.as_raw().iter().map(|v| *v != 0).collect();
     let mut found: Vec<Line> = vec![];
     for first in 0..w * h {
@@ -281,7 +272,7 @@ pub fn lines(picture: Picture<'_>, hole: &[bool]) -> Vec<Line> {
 }
 
 /// The middle of a pixel of a picture so wide.
-fn middle_of(pixel: usize, w: usize) -> DVec2 {
+pub fn middle_of(pixel: usize, w: usize) -> DVec2 {
     DVec2::new((pixel % w) as f64 + 0.5, (pixel / w) as f64 + 0.5)
 }
 
@@ -310,8 +301,7 @@ fn across(grey: &Grey, hole: &[bool], [low, high]: [DVec2; 2]) -> Vec<Line> {
 
 /// Moves a line, found in a reduced picture, to where it is in this one: each end to where it differs most from what is beside it,
 /// so many pixels to the side at most.
-pub fn refined(picture: Picture<'_>, line: &Line, most: f64) -> Line {
-    let grey = Grey::new(picture);
+pub fn refined(grey: &Grey, line: &Line, most: f64) -> Line {
     let middle = |end: DVec2, away: DVec2| {
         let strength = |aside: f64| {
             let places = (0..line.known.ceil() as usize).map(|i| end + away.perp() * aside + away * (i as f64 + 0.5));
@@ -333,9 +323,9 @@ pub fn refined(picture: Picture<'_>, line: &Line, most: f64) -> Line {
 pub struct Piece {
     /// From the hole along the line.
     away: DVec2,
-    /// Distance of its beginning from the hole, pixels.
+    /// Distance from the hole to where the piece begins, pixels.
     from: f64,
-    /// Its length, pixels.
+    /// Length of the piece, pixels.
     pub length: f64,
 }
 
@@ -349,8 +339,7 @@ impl Piece {
 }
 
 /// The longest pieces of both ends of a line that nothing crosses, as wide as `half` to each side.
-pub fn pieces(picture: Picture<'_>, line: &Line, half: f64) -> [Piece; 2] {
-    let grey = Grey::new(picture);
+pub fn pieces(grey: &Grey, line: &Line, half: f64) -> [Piece; 2] {
     let n = (2.0 * line.known).max(line.length()).ceil() as usize;
     let side = half.ceil() as i64;
     [0, 1].map(|end| {

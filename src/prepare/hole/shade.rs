@@ -5,7 +5,7 @@
 //! under it is.
 
 use glam::DVec3;
-use image::{GrayImage, Luma};
+use image::GrayImage;
 use rayon::prelude::*;
 
 use super::color::Photograph;
@@ -35,7 +35,7 @@ const FEWEST_SITES: usize = 8;
 /// pattern of the surface, or something else's shadow.
 const LEAST: f64 = 0.05;
 const MOST: f64 = 3.5;
-/// What is known of the plane where the farthest shade would end, at least, as a part of the foot's area.
+/// The least area that is known of the plane where the farthest shade would end, as a part of the foot's.
 const LEAST_RING: f64 = 0.2;
 /// Views that are asked for the colours of the plane.
 const VIEWS: usize = 12;
@@ -225,12 +225,7 @@ fn shaded(light: &[[f64; 3]], foot: &[bool], size @ [w, h]: [usize; 2]) -> Optio
     let dark = |shade: &[bool]| (0..foot.len()).filter(|i| shade[*i] && darker(*i, DARK)).count() as f64;
     let whole = dark(&shade);
     // What is thin is a joint or another line, which the foot happens to stand beside.
-    let of = |is: &dyn Fn(usize) -> bool| {
-        GrayImage::from_fn(w as u32, h as u32, |x, y| Luma([if is((y * w as u32 + x) as usize) { 255 } else { 0 }]))
-    };
-    let thin = (THIN * width).ceil() as u32;
-    let outside = resample::dilate(&of(&|i| !shade[i] && !foot[i]), thin);
-    let thick = resample::dilate(&of(&|i| outside.as_raw()[i] == 0), thin);
+    let thick = resample::opened([w as u32, h as u32], |i| shade[i] || foot[i], (THIN * width).ceil() as u32);
     shade.iter_mut().zip(thick.as_raw()).for_each(|(shade, thick)| *shade &= *thick != 0);
     let area = shade.iter().filter(|shade| **shade).count() as f64;
     let core = dark(&shade);
@@ -324,8 +319,8 @@ mod tests {
         }
     }
 
-    /// Of the foot a few sites alone are on the plane: what no view shows around them is the foot, too, so that the shade, which is many
-    /// times as large as they are, is one. What is unseen elsewhere is not.
+    /// A foot of which few sites are on the plane is all that no view shows around them, so that its shade, many times as large as they
+    /// are, is one. What is unseen elsewhere is no foot.
     #[test]
     fn the_foot_is_all_that_is_unseen_around_it() {
         let disc = |i: usize, x: f64, y: f64| ((i % SIZE[0]) as f64 - x).hypot((i / SIZE[0]) as f64 - y) < 12.0;

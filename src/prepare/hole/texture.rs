@@ -9,12 +9,11 @@
 //!
 //! Everything is a function of the picture.
 
-use glam::DVec2;
 use image::GrayImage;
 use rayon::prelude::*;
 
 use super::gradient::{self, Equation};
-use super::lines::{self, Line, Piece};
+use super::lines::{self, Grey, Line, Piece};
 use super::similar::{DIFFERENT, Picture, RADIUS, Shift, most_alike};
 use crate::prepare::planes;
 use crate::scene::resample;
@@ -84,11 +83,6 @@ const LEAST_SEAM: f64 = 0.05;
 impl Texture {
     fn picture(&self) -> Picture<'_> {
         Picture { rgb: &self.rgb, known: &self.source, size: self.size }
-    }
-
-    /// The middle of a pixel.
-    fn middle(&self, pixel: usize) -> DVec2 {
-        DVec2::new((pixel % self.size[0]) as f64 + 0.5, (pixel / self.size[0]) as f64 + 0.5)
     }
 
     /// The pixel at a shift from another, if it is in the picture.
@@ -334,7 +328,8 @@ impl Texture {
     /// The contrast up to which something may be copied into a part of the hole with this rim: what stands out more than all that is
     /// beside it, but for the lines that have been filled, does not begin just where the object hides it.
     fn plain(&self, rim: &[usize], lines: &[Line]) -> f32 {
-        let on_line = |i: usize| lines.iter().any(|line| line.place(self.middle(i))[1].abs() <= LINE);
+        let on_line =
+            |i: usize| lines.iter().any(|line| line.place(lines::middle_of(i, self.size[0]))[1].abs() <= LINE);
         let busiest = rim.iter().filter(|i| !on_line(**i)).map(|i| self.contrast(*i)).reduce(f32::max);
         busiest.map_or(f32::INFINITY, |busiest| (BUSIER * busiest).max(STILL))
     }
@@ -439,16 +434,20 @@ pub fn fill(texture: &mut Texture) -> bool {
 fn go_on(texture: &mut Texture, cell: usize) -> Vec<Line> {
     let by = texture.size[0].max(texture.size[1]).div_ceil(LINES).max(1);
     let small = texture.reduced(by);
+    let found = lines::lines(small.picture(), &small.hole);
+    if found.is_empty() {
+        return found;
+    }
+    let grey = Grey::new(texture.picture());
     let at_full_size = |line: Line| {
-        let line = lines::refined(texture.picture(), &line.scaled(by as f64), ASIDE * by as f64);
+        let line = lines::refined(&grey, &line.scaled(by as f64), ASIDE * by as f64);
         let half = WIDE * line.beside.max(cell as f64);
-        (line, half, lines::pieces(texture.picture(), &line, half))
+        (line, half, lines::pieces(&grey, &line, half))
     };
-    let found: Vec<(Line, f64, [Piece; 2])> =
-        lines::lines(small.picture(), &small.hole).into_iter().map(at_full_size).collect();
+    let found: Vec<(Line, f64, [Piece; 2])> = found.into_iter().map(at_full_size).collect();
     let copy = |i: usize| {
         let on = found.iter().filter_map(|(line, half, pieces)| {
-            let [from_first, aside] = line.place(texture.middle(i));
+            let [from_first, aside] = line.place(lines::middle_of(i, texture.size[0]));
             let inside = [from_first, line.length() - from_first];
             let is_on = aside.abs() <= *half && inside.iter().all(|inside| *inside >= -1.0);
             is_on.then_some((aside.abs(), inside, pieces))
