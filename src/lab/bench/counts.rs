@@ -104,8 +104,8 @@ struct Lists<'a> {
 const MOST_SAMPLES: u64 = 1 << 29;
 
 impl Lists<'_> {
-    /// Pairs up to where the tiles end; their samples, of wide tiles those in the rows of 32 threads that the Gaussian reaches,
-    /// two on the way there and four on the way back; samples that changed a pixel, and pairs with such a sample.
+    /// Pairs up to where the tiles end; their samples, of wide tiles those in rows that the Gaussian reaches, and on the way back
+    /// in the four rows of 32 threads; samples that changed a pixel, and pairs with such a sample.
     fn walk(&self, tiling: Tiling, size: [u32; 2], method: Method) -> [f64; 5] {
         let [columns, rows] = tiling.grid(size);
         let tiles = columns * rows;
@@ -132,12 +132,12 @@ impl Lists<'_> {
                 pixels.push(([x as f32 + 0.5, y as f32 + 0.5], 1f32));
             }
         }
-        // Wide tiles pass over what no row of a subgroup's can see.
-        let bands = if side == 16 { 8 } else { 1 };
-        let rows = side / bands;
-        let of_band: Vec<u64> = (0..bands)
-            .map(|band| pixels.iter().filter(|(at, _)| (at[1] as u32 - row * side) / rows == band).count() as u64)
-            .collect();
+        // Pixels of each row; wide tiles pass over what reaches none of them.
+        let of_row: Vec<u64> =
+            (0..side).map(|r| pixels.iter().filter(|(at, _)| at[1] as u32 == row * side + r).count() as u64).collect();
+        let reaching = |rows: u32, bands: u32| -> u64 {
+            of_row.iter().zip(0..).filter(|(_, r)| bands >> (r / rows) & 1 == 1).map(|(n, _)| n).sum()
+        };
         let (mut evaluated, mut samples, mut samples_back, mut blended, mut seen) = (0, 0, 0, 0, 0);
         for &pair in &self.sorted[first as usize..end as usize] {
             if pixels.is_empty() {
@@ -147,18 +147,18 @@ impl Lists<'_> {
             let before = blended;
             let slot = self.pair_slot[pair as usize] as usize;
             let (mean, conic, opacity) = (self.mean[slot], self.conic[slot], self.opacity[slot]);
-            let reached = if bands == 1 {
-                1
-            } else {
+            if side == 16 {
                 let bound = support_bound(opacity, method.alpha_min);
-                support_bands(mean[1], conic[2], bound, (row * side) as f32 + 0.5, rows, bands)
-            };
-            let reaching =
-                |bands: u32| of_band.iter().zip(0..).filter(move |(_, b)| bands >> b & 1 == 1).map(|(n, _)| n);
-            samples += reaching(reached).sum::<u64>();
-            // Of a pair of bands both, where one is reached.
-            let either = (reached | reached >> 1) & 0x5555_5555;
-            samples_back += reaching(if bands == 1 { 1 } else { either | either << 1 }).sum::<u64>();
+                let reached =
+                    |rows| support_bands(mean[1], conic[2], bound, (row * side) as f32 + 0.5, rows, side / rows);
+                samples += reaching(1, reached(1));
+                // Of a pair of bands of two rows both, where one is reached.
+                let either = (reached(2) | reached(2) >> 1) & 0x5555_5555;
+                samples_back += reaching(2, either | either << 1);
+            } else {
+                samples += of_row.iter().sum::<u64>();
+                samples_back += of_row.iter().sum::<u64>();
+            }
             pixels.retain_mut(|(at, transmittance)| {
                 let (dx, dy) = (at[0] - mean[0], at[1] - mean[1]);
                 let across = dx - conic[1] * dy;
@@ -220,9 +220,9 @@ mod tests {
             opacity: &[0.5; 3],
         };
         let method = Method::from(Tiling::Wide);
-        // 16 columns and 12 rows, of which rows 0 to 5, 10 and 11, and 5 to 10 are reached: by twos, and by fours.
+        // 16 columns and 12 rows, of which rows 0 to 5, 10 and 11, and 5 to 10 are reached; on the way back by fours.
         let [evaluated, samples, back, ..] = lists.walk(Tiling::Wide, [16, 12], method);
-        assert_eq!((evaluated, samples), (3.0, 16.0 * (6.0 + 2.0 + 8.0)));
+        assert_eq!((evaluated, samples), (3.0, 16.0 * (6.0 + 2.0 + 6.0)));
         assert_eq!(back, 16.0 * (8.0 + 4.0 + 8.0));
     }
 
