@@ -28,8 +28,9 @@ const SIDE: usize = 320;
 pub const OFF: f64 = 4.0;
 /// What a pixel without a surface of its own costs: a plane that fits is preferred.
 pub const REST: f64 = 1.5;
-/// The same in the hole, where nothing fits better or worse.
-const UNKNOWN_REST: f64 = 0.4;
+/// The same in the hole, where nothing fits better or worse; and where no photograph tells anything of it: what is off all
+/// planes around a hole, as most of what is rough is, would go on all over it.
+const UNKNOWN_REST: [f64; 2] = [0.4, 2.0];
 /// What a pixel costs where its surface is impossible.
 pub const IMPOSSIBLE: f64 = 40.0;
 /// What a border costs per pixel of its length.
@@ -158,7 +159,7 @@ fn labels<F: Fn(usize, f64) -> f64 + Sync>(hole: &Hole<'_, F>, planes: &[Plane])
             // What speaks against all planes alike speaks against what is between them, too.
             let likely = against.iter().copied().filter(|against| *against < 0.5).reduce(f64::min);
             let of = |(surface, against): (f64, f64)| IMPOSSIBLE * if surface <= 0.0 { 1.0 } else { against };
-            let of_rest = UNKNOWN_REST + IMPOSSIBLE * likely.unwrap_or(0.0);
+            let of_rest = UNKNOWN_REST[usize::from(hole.costs.is_empty())] + IMPOSSIBLE * likely.unwrap_or(0.0);
             return surfaces.zip(against).map(of).chain([of_rest]).collect();
         }
         let d = f64::from(hole.disparity[i]);
@@ -442,6 +443,34 @@ mod tests {
         let wrong: Vec<usize> = wrong.filter(|i| !border(*i)).collect();
         assert!(wrong.is_empty(), "{} pixels off the border are wrong", wrong.len());
         assert!(found.disparity.iter().all(|d| d.is_finite()));
+    }
+
+    /// A hole that is mostly in what is rough, as most of a garden is: the plane beside it goes on in it.
+    #[test]
+    fn what_is_rough_does_not_go_on() {
+        let rays = rays();
+        let rough = |i: usize| (i.wrapping_mul(2_654_435_761) >> 9) as f32 % 1000.0 / 1000.0;
+        let seen: Vec<f32> = (0..rays.len())
+            .map(|i| match (i % SIZE[0], i / SIZE[0]) {
+                (40..80, 30..60) => f32::NAN,
+                (0..40, _) => 0.4 + 0.3 * rays[i].unwrap()[1] as f32,
+                _ => 0.15 + 0.4 * rough(i),
+            })
+            .collect();
+        let unknown: Vec<bool> = seen.iter().map(|d| d.is_nan()).collect();
+        let outline = outline(&unknown);
+        let hole = Hole {
+            size: SIZE,
+            disparity: &seen,
+            rays: &rays,
+            unknown: &unknown,
+            costs: &[],
+            outline: &outline,
+            against: |_, _| 0.0,
+        };
+        let found = surfaces(&hole, around(hole.disparity, hole.rays, hole.unknown, 5));
+        let on_it = (0..seen.len()).filter(|i| unknown[*i] && found.label[*i] == 0).count();
+        assert!(on_it > 1000, "{on_it} of 1200 pixels");
     }
 
     /// Where other views look through the table top, the floor goes on: the hole is all floor but for its left edge.

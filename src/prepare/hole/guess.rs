@@ -9,7 +9,7 @@ use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
 use super::color::{Filling, Photograph, between};
-use super::surface::{SAME, Sights};
+use super::surface::{APART, SAME, Sight, Sights};
 use super::texture::{self, Texture};
 use crate::prepare::planes::{self, Plane, membrane};
 use crate::scene::resample;
@@ -27,6 +27,10 @@ const FARTHEST: f64 = 4.0;
 const OTHERS: usize = 6;
 /// Difference of a channel from the median of the views from which on one of them shows a light's reflection.
 const GLARE: f32 = 0.06;
+
+/// Least share of what lies on another plane in a hole, and nearly on this one, for them to be filled as one: a bench and a hedge as
+/// high as it. What of one goes on into the other, its border too, is copied with both.
+const NEARLY_ONE: f64 = 0.8;
 
 /// A plane seen straight on. Lengths are in the view's camera coordinates.
 pub struct Chart {
@@ -103,14 +107,27 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
     let thick = thick(&filling.guessed, own.camera.size);
     let ray = |i: usize| own.camera.unproject([(i % w) as f64 + 0.5, (i / w) as f64 + 0.5]);
     let surface = |i: usize| ray(i).map(|ray| sight.surface_at(sight.grid.place(ray)));
+    let surfaces: Vec<(usize, u8)> = guessed.par_iter().filter_map(|i| Some((*i, surface(*i)?))).collect();
     let focal = f64::from(own.camera.focal[0].max(own.camera.focal[1]));
     for (number, plane) in sight.planes.iter().enumerate() {
-        let mut left: Vec<usize> = guessed.par_iter().copied().filter(|i| surface(*i) == Some(number as u8)).collect();
+        let rays =
+            |label: usize| surfaces.iter().filter(move |(_, l)| usize::from(*l) == label).filter_map(|(i, _)| ray(*i));
+        let one: Vec<bool> =
+            (0..sight.planes.len()).map(|l| l == number || nearly_one(sight, plane, rays(l))).collect();
+        let its = |label: u8| {
+            let other = if usize::from(label) == number { SAME } else { APART };
+            one.get(usize::from(label)).is_some_and(|one| *one).then_some(other)
+        };
+        let mut left: Vec<usize> = surfaces
+            .iter()
+            .filter(|(i, label)| filling.guessed[*i] && its(*label).is_some())
+            .map(|(i, _)| *i)
+            .collect();
         // Around the largest part first: another may be far away on the same plane, and a chart of all would be coarse.
         while let Some(part) = parts(&left, [w, h]).into_iter().max_by_key(Vec::len) {
             let rays: Vec<[f64; 2]> = part.iter().filter(|i| thick[**i]).filter_map(|i| ray(*i)).collect();
             if let Some(chart) = Chart::new(*plane, &rays, focal, AROUND) {
-                let mut texture = charted(sights, photographs, of, filling, &chart, number as u8);
+                let mut texture = charted(sights, photographs, of, filling, &chart, &its);
                 let wanted = texture.hole.clone();
                 let filled = texture::fill(&mut texture);
                 for i in left.iter().filter(|_| filled) {
@@ -130,6 +147,13 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
     if filling.guessed.contains(&true) {
         smooth(filling, [w, h]);
     }
+}
+
+/// Whether what lies along these rays, on another plane of the view, is nearly on this one.
+fn nearly_one(sight: &Sight, plane: &Plane, rays: impl Iterator<Item = [f64; 2]>) -> bool {
+    let near = |ray: [f64; 2]| (sight.depth_at(sight.grid.place(ray)) * planes::on(plane, ray) - 1.0).abs() <= APART;
+    let (ones, all) = rays.fold((0u32, 0u32), |(ones, all), ray| (ones + u32::from(near(ray)), all + 1));
+    all > 0 && f64::from(ones) >= NEARLY_ONE * f64::from(all)
 }
 
 /// Smallest part of a hole that has a texture, as a part of the picture.
@@ -175,14 +199,15 @@ fn texel(texture: &Texture, wanted: &[bool], place: [f64; 2]) -> Option<[f32; 3]
     between(at, place)
 }
 
-/// What is known of a plane, on its chart; the hole is what is to be filled there.
+/// What is known of a plane, on its chart; the hole is what is to be filled there. `its` says of the view's
+/// surfaces that it has how far what lies on them may be off the plane.
 fn charted(
     sights: &Sights,
     photographs: &[Photograph<'_>],
     of: usize,
     filling: &Filling,
     chart: &Chart,
-    number: u8,
+    its: &(dyn Fn(u8) -> Option<f64> + Sync),
 ) -> Texture {
     let (own, sight) = (&photographs[of], &sights.0[of]);
     let size @ [w, _] = own.camera.size.map(|n| n as usize);
@@ -207,12 +232,13 @@ fn charted(
             let inside = x >= 0.0 && y >= 0.0 && (x as usize) < size[0] && (y as usize) < size[1];
             let pixel = if inside { y as usize * w + x as usize } else { 0 };
             if inside && filling.guessed[pixel] {
-                let is_its = sight.surface_at(sight.grid.place(ray)) == number;
-                return if is_its { Texel::Hole } else { Texel::Nothing };
+                let is_its = its(sight.surface_at(sight.grid.place(ray)));
+                return if is_its.is_some() { Texel::Hole } else { Texel::Nothing };
             }
             if inside {
                 let z = sight.depth_at(sight.grid.place(ray));
-                if (z / point.z - 1.0).abs() <= SAME {
+                let same = its(sight.surface_at(sight.grid.place(ray))).unwrap_or(SAME);
+                if (z / point.z - 1.0).abs() <= same {
                     // What is to be filled still shows the object.
                     let known = |x: i64, y: i64| {
                         let inside = x >= 0 && y >= 0 && (x as usize) < size[0] && (y as usize) < size[1];

@@ -41,6 +41,8 @@ const CROSSING: f64 = 0.35;
 const DIRECTIONS: f64 = 0.6;
 /// Lines at most.
 const MOST: usize = 16;
+/// Strength, as a part of the greatest, from which on it counts for where the middle of a line is.
+const MIDDLE: f64 = 0.5;
 /// Difference from what is usual along a line from which on something else crosses it, as a part of its strength.
 const CROSSED: f64 = 0.5;
 /// Shortest piece of a line that is copied, pixels.
@@ -299,23 +301,33 @@ fn across(grey: &Grey, hole: &[bool], [low, high]: [DVec2; 2]) -> Vec<Line> {
     (0..directions).into_par_iter().flat_map_iter(in_direction).collect()
 }
 
-/// Moves a line, found in a reduced picture, to where it is in this one: each end to where it differs most from what is beside it,
-/// so many pixels to the side at most.
+/// Moves a line, found in a reduced picture, to where it is in this one: each end to the middle of what differs there from what is
+/// beside it, so many pixels to the side at most. A line is wide, and differs most all over its width.
 pub fn refined(grey: &Grey, line: &Line, most: f64) -> Line {
-    let middle = |end: DVec2, away: DVec2| {
+    let middle = |line: &Line, end: usize| {
+        let (end, away) = (line.ends[end], if end == 0 { -line.along() } else { line.along() });
         let strength = |aside: f64| {
             let places = (0..line.known.ceil() as usize).map(|i| end + away.perp() * aside + away * (i as f64 + 0.5));
             let known = places.map(|at| grey.ridge(at, away.perp(), line.beside)).filter(|v| v.is_finite());
             known.sum::<f64>().abs()
         };
         let steps = (2.0 * most).ceil() as i64;
-        let all = (-steps..=steps).map(|k| 0.5 * k as f64).map(|aside| (strength(aside), aside));
-        let best = all.max_by(|a, b| a.0.total_cmp(&b.0).then(b.1.abs().total_cmp(&a.1.abs())));
-        end + away.perp() * best.map_or(0.0, |(_, aside)| aside) + away * 0.5 * line.known
+        let all: Vec<(f64, f64)> =
+            (-steps..=steps).map(|k| 0.5 * k as f64).map(|aside| (strength(aside), aside)).collect();
+        let strongest = all.iter().map(|(strength, _)| *strength).fold(0.0, f64::max);
+        let weigh = |(sum, all): (f64, f64), (strength, aside): &(f64, f64)| {
+            let weight = (strength - MIDDLE * strongest).max(0.0);
+            (sum + weight * aside, all + weight)
+        };
+        let (sum, all) = all.iter().fold((0.0, 0.0), weigh);
+        end + away.perp() * if all > 0.0 { sum / all } else { 0.0 } + away * 0.5 * line.known
     };
-    let [a, b] = [middle(line.ends[0], -line.along()), middle(line.ends[1], line.along())];
-    let back = (b - a).normalize() * 0.5 * line.known;
-    Line { ends: [a + back, b - back], ..*line }
+    // Once more from there: of a line that was far to the side a part was beyond what is looked at.
+    (0..2).fold(*line, |line, _| {
+        let [a, b] = [0, 1].map(|end| middle(&line, end));
+        let back = (b - a).normalize() * 0.5 * line.known;
+        Line { ends: [a + back, b - back], ..line }
+    })
 }
 
 /// The piece of a line's end that is copied into the hole.
@@ -443,6 +455,29 @@ mod tests {
             lines += found(|x, y| 0.2 + 0.2 * (leaf(x, y, 1.0) + leaf(x, y, 3.0) + leaf(x, y, 7.0))).len();
         }
         assert!(lines <= 1, "{lines}");
+    }
+
+    /// A line eight pixels wide, found up to three pixels beside its middle, is brought there: it is as dark all over its width.
+    #[test]
+    fn a_wide_line_is_where_its_middle_is() {
+        let [w, h] = SIZE;
+        for k in 0..7 {
+            let along = DVec2::from_angle(0.2 + 0.4 * f64::from(k));
+            let through = DVec2::new(60.0, 50.0);
+            let off = |at: DVec2| along.perp_dot(at - through);
+            let color =
+                |i: usize| 0.7 - 0.3 * (4.5 - off(middle_of(i, w)).abs()).clamp(0.0, 1.0) as f32 + 0.01 * noise(i);
+            let rgb: Vec<[f32; 3]> = (0..w * h).map(|i| [color(i); 3]).collect();
+            let known: Vec<bool> = (0..w * h).map(|i| middle_of(i, w).distance(through) > 16.0).collect();
+            let grey = Grey::new(Picture { rgb: &rgb, known: &known, size: SIZE });
+            for aside in [-3.0, -1.0, 0.0, 2.0, 3.0] {
+                let ends = [-1.0, 1.0].map(|end| through + along * 17.0 * end + along.perp() * aside * end);
+                let line = Line { ends, beside: 9.0, known: 14.0, strength: 0.9 };
+                for end in refined(&grey, &line, 4.5).ends {
+                    assert!(off(end).abs() <= 0.5, "{k}, {aside}: {end} is {} off", off(end));
+                }
+            }
+        }
     }
 
     /// Two that cross are two.
