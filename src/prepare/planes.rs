@@ -28,8 +28,8 @@ const SIDE: usize = 320;
 pub const OFF: f64 = 4.0;
 /// What a pixel without a surface of its own costs: a plane that fits is preferred.
 pub const REST: f64 = 1.5;
-/// The same in the hole, where nothing fits better or worse; and where no photograph tells anything of it: what is off all
-/// planes around a hole, as most of what is rough is, would go on all over it.
+/// Cost of no surface in the hole, where nothing fits better or worse; and where no photograph tells anything of it: what is off
+/// all planes around a hole, as most of what is rough is, would go on all over it.
 const UNKNOWN_REST: [f64; 2] = [0.4, 2.0];
 /// What a pixel costs where its surface is impossible.
 pub const IMPOSSIBLE: f64 = 40.0;
@@ -406,6 +406,21 @@ mod tests {
             .collect()
     }
 
+    /// Finds the surfaces in a hole against which nothing speaks.
+    fn continued_in(seen: &[f32], unknown: &[bool]) -> Surfaces {
+        let (rays, outline) = (rays(), outline(unknown));
+        let hole = Hole {
+            size: SIZE,
+            disparity: seen,
+            rays: &rays,
+            unknown,
+            costs: &[],
+            outline: &outline,
+            against: |_, _| 0.0,
+        };
+        surfaces(&hole, around(seen, &rays, unknown, 5))
+    }
+
     /// A floor, and a table top above it that ends in the hole along a line: both go on as planes, and the border is the
     /// straight line between where it enters the hole and where it leaves it.
     #[test]
@@ -423,17 +438,7 @@ mod tests {
         let unknown: Vec<bool> =
             (0..truth.len()).map(|i| (30..80).contains(&(i % SIZE[0])) && (20..70).contains(&(i / SIZE[0]))).collect();
         let seen: Vec<f32> = truth.iter().zip(&unknown).map(|(d, u)| if *u { f32::NAN } else { *d }).collect();
-        let outline = outline(&unknown);
-        let hole = Hole {
-            size: SIZE,
-            disparity: &seen,
-            rays: &rays,
-            unknown: &unknown,
-            costs: &[],
-            outline: &outline,
-            against: |_, _| 0.0,
-        };
-        let found = surfaces(&hole, around(hole.disparity, hole.rays, hole.unknown, 5));
+        let found = continued_in(&seen, &unknown);
         assert_eq!(found.planes.len(), 2, "planes");
         let wrong = (0..truth.len()).filter(|i| unknown[*i] && (found.disparity[*i] / truth[*i] - 1.0).abs() > 0.01);
         let border = |i: usize| {
@@ -458,17 +463,7 @@ mod tests {
             })
             .collect();
         let unknown: Vec<bool> = seen.iter().map(|d| d.is_nan()).collect();
-        let outline = outline(&unknown);
-        let hole = Hole {
-            size: SIZE,
-            disparity: &seen,
-            rays: &rays,
-            unknown: &unknown,
-            costs: &[],
-            outline: &outline,
-            against: |_, _| 0.0,
-        };
-        let found = surfaces(&hole, around(hole.disparity, hole.rays, hole.unknown, 5));
+        let found = continued_in(&seen, &unknown);
         let on_it = (0..seen.len()).filter(|i| unknown[*i] && found.label[*i] == 0).count();
         assert!(on_it > 1000, "{on_it} of 1200 pixels");
     }

@@ -199,8 +199,8 @@ fn texel(texture: &Texture, wanted: &[bool], place: [f64; 2]) -> Option<[f32; 3]
     between(at, place)
 }
 
-/// What is known of a plane, on its chart; the hole is what is to be filled there. `its` says of the view's
-/// surfaces that it has how far what lies on them may be off the plane.
+/// Charts a plane with what is known of it; the hole is what is to be filled there. `its` says of the view's surfaces that it has
+/// how far what lies on them may be off the plane.
 fn charted(
     sights: &Sights,
     photographs: &[Photograph<'_>],
