@@ -10,7 +10,8 @@ use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 
 use super::gradient::{self, Equation};
-use super::surface::{APART, SAME, Sight, Sights, Window};
+use super::surface::{APART, SAME, Sight, Sights};
+use super::window::Window;
 use crate::prepare::planes::{self, neighbours};
 use crate::scene::{Camera, resample};
 

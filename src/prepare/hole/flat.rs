@@ -9,7 +9,8 @@ use rand::RngExt;
 use rand_pcg::Pcg64;
 use rayon::prelude::*;
 
-use super::surface::{SAME, Sight, Sights, Window};
+use super::surface::{SAME, Sight, Sights};
+use super::window::Window;
 use crate::prepare::planes::{self, Plane, neighbours};
 use crate::scene::resample;
 use crate::statistics::{median, quantile};

@@ -26,6 +26,7 @@ mod similar;
 mod support;
 mod surface;
 mod texture;
+mod window;
 mod witness;
 
 use std::collections::BTreeMap;
