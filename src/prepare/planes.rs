@@ -31,8 +31,6 @@ pub const REST: f64 = 1.5;
 /// Cost of no surface in the hole, where nothing fits better or worse; and where no photograph tells anything of it: what is off
 /// all planes around a hole, as most of what is rough is, would go on all over it.
 const UNKNOWN_REST: [f64; 2] = [0.4, 2.0];
-/// Cost of another surface in the hole than the one that its picture has go on there.
-const UNEXPECTED: f64 = 20.0;
 /// What a pixel costs where its surface is impossible.
 pub const IMPOSSIBLE: f64 = 40.0;
 /// What a border costs per pixel of its length.
@@ -57,9 +55,6 @@ pub struct Hole<'a, F> {
     /// `[pixel]` what each plane costs there, and at last to be off all of them, where more is known of that than the inverse
     /// depth. Empty where nothing is.
     pub costs: &'a [Option<Vec<f64>>],
-    /// `[pixel]` number of the surface that goes on there by what the picture looks like, planes before the rest. Empty where
-    /// nothing is known of it.
-    pub expected: &'a [Option<u8>],
     /// `[pixel]` whether it lies along the object's outline.
     pub outline: &'a [bool],
     /// What speaks against a surface of this inverse depth at the pixel (its number): from 0, nothing, to 1, it cannot be.
@@ -164,13 +159,8 @@ fn labels<F: Fn(usize, f64) -> f64 + Sync>(hole: &Hole<'_, F>, planes: &[Plane])
             // What speaks against all planes alike speaks against what is between them, too.
             let likely = against.iter().copied().filter(|against| *against < 0.5).reduce(f64::min);
             let of = |(surface, against): (f64, f64)| IMPOSSIBLE * if surface <= 0.0 { 1.0 } else { against };
-            let expected = hole.expected.get(i).copied().flatten().map(usize::from);
-            let unexpected =
-                |label: usize| if expected.is_some_and(|expected| expected != label) { UNEXPECTED } else { 0.0 };
-            let of_rest = if expected.is_some() { 0.0 } else { UNKNOWN_REST[usize::from(hole.costs.is_empty())] };
-            let of_rest = of_rest + IMPOSSIBLE * likely.unwrap_or(0.0);
-            let all = surfaces.zip(against).map(of).chain([of_rest]);
-            return all.enumerate().map(|(label, cost)| cost + unexpected(label)).collect();
+            let of_rest = UNKNOWN_REST[usize::from(hole.costs.is_empty())] + IMPOSSIBLE * likely.unwrap_or(0.0);
+            return surfaces.zip(against).map(of).chain([of_rest]).collect();
         }
         let d = f64::from(hole.disparity[i]);
         let is_known = d > 0.0 && d.is_finite();
@@ -418,18 +408,12 @@ mod tests {
 
     /// Finds the surfaces in a hole against which nothing speaks.
     fn continued_in(seen: &[f32], unknown: &[bool]) -> Surfaces {
-        continued_as(seen, unknown, &[])
-    }
-
-    /// Finds them where the picture has these go on.
-    fn continued_as(seen: &[f32], unknown: &[bool], expected: &[Option<u8>]) -> Surfaces {
         let (rays, outline) = (rays(), outline(unknown));
         let hole = Hole {
             size: SIZE,
             disparity: seen,
             rays: &rays,
             unknown,
-            expected,
             costs: &[],
             outline: &outline,
             against: |_, _| 0.0,
@@ -464,18 +448,6 @@ mod tests {
         let wrong: Vec<usize> = wrong.filter(|i| !border(*i)).collect();
         assert!(wrong.is_empty(), "{} pixels off the border are wrong", wrong.len());
         assert!(found.disparity.iter().all(|d| d.is_finite()));
-        // By the picture the table has a corner in the hole, which no straight line has.
-        let expected: Vec<Option<u8>> = (0..truth.len())
-            .map(|i| {
-                unknown[i].then(|| found.label[if i / SIZE[0] < 50 && i % SIZE[0] < 60 { 0 } else { truth.len() - 1 }])
-            })
-            .collect();
-        let as_expected = |surfaces: &Surfaces| {
-            let same = (0..truth.len()).filter(|i| unknown[*i] && expected[*i] == Some(surfaces.label[*i]));
-            same.count() as f64 / expected.iter().flatten().count() as f64
-        };
-        let cornered = continued_as(&seen, &unknown, &expected);
-        assert!(as_expected(&cornered) > 0.95 && as_expected(&found) < 0.8, "{}", as_expected(&cornered));
     }
 
     /// A hole that is mostly in what is rough, as most of a garden is: the plane beside it goes on in it.
@@ -510,7 +482,6 @@ mod tests {
             disparity: &truth,
             rays: &rays,
             unknown: &unknown,
-            expected: &[],
             costs: &[],
             outline: &outline,
             against,
@@ -538,7 +509,6 @@ mod tests {
             disparity: &truth,
             rays: &rays,
             unknown: &unknown,
-            expected: &[],
             costs: &[],
             outline: &outline,
             against: |_, _| 0.0,
@@ -559,7 +529,6 @@ mod tests {
             disparity: &nothing,
             rays: &rays,
             unknown: &unknown,
-            expected: &[],
             costs: &[],
             outline: &outline,
             against: |_, _| 0.0,

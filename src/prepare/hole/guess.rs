@@ -129,7 +129,7 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
             if let Some(chart) = Chart::new(*plane, &rays, focal, AROUND) {
                 let mut texture = charted(sights, photographs, of, filling, &chart, &its);
                 let wanted = texture.hole.clone();
-                let filled = texture::fill(&mut texture).is_some();
+                let filled = texture::fill(&mut texture);
                 for i in left.iter().filter(|_| filled) {
                     let color = ray(*i).and_then(|ray| chart.pixel(ray)).and_then(|at| texel(&texture, &wanted, at));
                     if let Some(color) = color {
@@ -160,7 +160,7 @@ fn nearly_one(sight: &Sight, plane: &Plane, rays: impl Iterator<Item = [f64; 2]>
 const LEAST_PART: f64 = 5e-4;
 
 /// Splits pixels into parts that are connected by their sides; parts too small for a texture are left out.
-pub fn parts(of: &[usize], size @ [w, h]: [usize; 2]) -> Vec<Vec<usize>> {
+fn parts(of: &[usize], size @ [w, h]: [usize; 2]) -> Vec<Vec<usize>> {
     let mut left = vec![false; w * h];
     of.iter().for_each(|i| left[*i] = true);
     let parts = of.iter().map(|first| planes::connected(*first, &mut left, size));
@@ -291,7 +291,7 @@ fn in_picture(filling: &mut Filling, size: [usize; 2], wanted: &[bool], surface:
                     hole: cells.iter().map(|i| wanted[*i]).collect(),
                     source: cells.par_iter().map(source).collect(),
                 };
-                if texture::fill(&mut texture).is_some() {
+                if texture::fill(&mut texture) {
                     for (cell, i) in cells.iter().enumerate().filter(|(cell, i)| wanted[**i] && !texture.hole[*cell]) {
                         filling.rgb[*i] = texture.rgb[cell];
                         filling.guessed[*i] = false;
@@ -303,7 +303,7 @@ fn in_picture(filling: &mut Filling, size: [usize; 2], wanted: &[bool], surface:
 }
 
 /// The box of some pixels and as much again on each side: its pixels, width and height.
-pub fn surroundings(of: &[usize], [w, h]: [usize; 2]) -> (Vec<usize>, [usize; 2]) {
+fn surroundings(of: &[usize], [w, h]: [usize; 2]) -> (Vec<usize>, [usize; 2]) {
     let bounds = |f: &dyn Fn(usize) -> usize, end: usize| {
         let (low, high) = of.iter().fold((end, 0), |(low, high), i| (low.min(f(*i)), high.max(f(*i) + 1)));
         let margin = high.saturating_sub(low).max(MARGIN as usize);

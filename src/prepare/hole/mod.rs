@@ -5,7 +5,6 @@
 //! - `residue`: what is left of a shadow that was taken out goes with the object.
 //! - `complete`: masks that end before the object does grow.
 //! - `surface`: the depth of what is behind the object, in all views, by what they know of a point (`witness`).
-//! - `whole`: where surfaces end in a hole of which no photograph tells, by how its picture goes on.
 //! - `color`: what photographs show of it, and what views that were filled before show of it.
 //! - `guess`: what nobody shows is filled with pieces of the same surface, seen straight on (`texture`), lines that
 //!   cross the hole first (`lines`), or by a network.
@@ -27,7 +26,6 @@ mod similar;
 mod support;
 mod surface;
 mod texture;
-mod whole;
 mod window;
 mod witness;
 
@@ -60,7 +58,7 @@ const AT_ONCE: usize = 16;
 /// Name of the way in which holes are filled: a scene that was filled in another way is filled anew.
 pub const METHOD: &str = "one surface with smooth ends, nothing where others look through it, no colour from a rim that looks like nothing near it, \
      lights joined, doubts left to training, nothing stands on what only crosses the floor, lines go on through holes, a foot is all that is unseen around it, \
-     what is nearly one plane is one, a hole of which nothing is known goes on as its picture does";
+     what is nearly one plane is one";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 
@@ -171,8 +169,6 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
     }
     let mut filled: Vec<(usize, Filled)> = vec![];
     let expected = part(&shown[&of]);
-    let is_guessed = task.inpainting.is_none() && !task.given.contains_key(&of);
-    let whole = is_guessed.then(|| whole::expect(&mut sights, &photographs, of, task.seed)).flatten();
     sights.solve(of, task.seed);
     // After the reference those that show most of what is still unknown.
     let unknown = |i: usize| {
@@ -210,9 +206,6 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
             } else if let Some(network) = task.inpainting {
                 network.fill(&mut filling.rgb, &filling.guessed, cameras[i].size.map(|n| n as usize))?;
             } else {
-                if let Some(whole) = whole.as_ref().filter(|_| i == of) {
-                    whole.paint(&mut filling);
-                }
                 guess::fill(&sights, &photographs, i, &mut filling);
             }
             if i == of {

@@ -44,8 +44,6 @@ const UNSHOWN: f64 = 1.0;
 const UNSHOWN_BEHIND: f64 = 2.0;
 /// Part of the depth that a site was carried to before which no plane takes it: a bare surface is measured wrong, not so wrong.
 const NEARER: f64 = 0.5;
-/// Half the width in which depth goes over from one surface to the next where the picture alone has said where that is, sites.
-const PASSAGE: i64 = 3;
 /// Sites of a hole that are filled from their neighbours where no more than these are unknown.
 const FEW: usize = 12;
 
@@ -67,9 +65,6 @@ pub struct Sight {
     /// Planes around the hole that were found before it is solved; none where the views are too near each
     /// other to tell.
     pub(super) around: Vec<planes::Plane>,
-    /// `[site of the hole]` number of the surface that its picture has go on there, as [`Sight::surface`] has them; empty where
-    /// nothing has been looked at.
-    pub(super) expected: Vec<Option<u8>>,
     /// Whether every site has its depth.
     pub solved: bool,
     /// How many views were solved before it.
@@ -184,15 +179,9 @@ impl Sight {
             surface: vec![0; sites],
             planes: vec![],
             around: vec![],
-            expected: vec![],
             solved: false,
             rank: 0,
         }
-    }
-
-    /// Whether planes around its hole are known by more than the depth there.
-    pub fn knows_planes(&self) -> bool {
-        !self.around.is_empty()
     }
 
     /// Where the camera stands.
@@ -323,17 +312,6 @@ impl Sight {
             (turn.transpose() * plane / (1.0 - plane.dot(shift))).to_array()
         };
         self.planes.iter().map(plane).collect()
-    }
-
-    /// Sites where the picture alone has said where one surface ends and the next begins, or that there is none: that is a guess, and
-    /// a step in depth there would tear apart in all other views what was copied as one piece.
-    fn passages(&self, unknown: &[bool], surface: &[u8], planes: usize) -> Vec<usize> {
-        let is_passage = |site: &usize| {
-            let beside = || self.grid.around(*site, PASSAGE).filter(|near| unknown[*near]);
-            unknown[*site]
-                && (usize::from(surface[*site]) == planes || beside().any(|near| surface[near] != surface[*site]))
-        };
-        (0..self.expected.len()).filter(is_passage).collect()
     }
 
     /// The planes, of these of the view, that the object stands on.
@@ -645,28 +623,27 @@ impl Sights {
         let open: Vec<bool> = sites.iter().map(|site| unknown[*site] || ring(*site)).collect();
         let known: Vec<f32> = sites.iter().map(|site| disparity[*site]).collect();
         let size = window.size;
-        let planes = if own.knows_planes() { own.around.clone() } else { planes::around(&known, &rays, &open, seed) };
+        let planes =
+            if own.around.is_empty() { planes::around(&known, &rays, &open, seed) } else { own.around.clone() };
         let supports = own.supports(&planes);
         let under = |site: &usize| {
             let depths = supports.iter().filter_map(|support| support.under(own.ray(*site)));
             depths.reduce(f64::min).filter(|_| own.hole[*site])
         };
         let under: Vec<Option<f64>> = sites.iter().map(under).collect();
-        let expected: Vec<Option<u8>> = sites.iter().map(|site| *own.expected.get(*site)?).collect();
         let against = |cell: usize, d: f64| {
             let site = sites[cell];
             let object = own.hole[site] && own.grid.confirmed[site];
             if d.is_nan() || d <= 0.0 || object && 1.0 / d < (1.0 - APART) * own.grid.depth[site] {
                 return 1.0;
             }
-            let hidden = expected[cell].is_none() && under[cell].is_some_and(|z| 1.0 / d > (1.0 + SAME) * z);
+            let hidden = under[cell].is_some_and(|z| 1.0 / d > (1.0 + SAME) * z);
             self.against(of, own.point(site, 1.0 / d)).max(if hidden { BELOW } else { 0.0 })
         };
-        let told = own.knows_planes();
+        let told = !own.around.is_empty();
         let costs = if told { self.evidence(of, &sites, size, disparity, &planes) } else { vec![] };
         let hole = planes::Hole {
             costs: &costs,
-            expected: &expected,
             size,
             disparity: &known,
             rays: &rays,
@@ -711,11 +688,8 @@ impl Sights {
         let mut disparity: Vec<f32> = (0..own.hole.len()).map(|site| (1.0 / known(site)) as f32).collect();
         let (mut surface, mut found_planes) = (vec![0; own.hole.len()], vec![]);
         let rank = self.0.iter().filter(|sight| sight.solved).count();
-        if rank == 0 || own.knows_planes() || unknown.iter().filter(|unknown| **unknown).count() > FEW {
+        if rank == 0 || !own.around.is_empty() || unknown.iter().filter(|unknown| **unknown).count() > FEW {
             (surface, found_planes) = self.continued(of, &unknown, &mut disparity, seed);
-        }
-        for site in own.passages(&unknown, &surface, found_planes.len()) {
-            disparity[site] = f32::NAN;
         }
         planes::membrane(&mut disparity, size, |site| own.hole[site]);
         let own = &mut self.0[of];

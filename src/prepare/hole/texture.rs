@@ -394,19 +394,18 @@ impl Texture {
     }
 }
 
-/// Fills the hole, as far as there is anything to copy. Returns `[pixel]` the one that it is copied from; nothing without any to copy.
-pub fn fill(texture: &mut Texture) -> Option<Vec<Option<usize>>> {
+/// Fills the hole, as far as there is anything to copy. Returns whether there was.
+pub fn fill(texture: &mut Texture) -> bool {
     if !texture.hole.iter().any(|hole| *hole) || !texture.source.iter().any(|source| *source) {
-        return None;
+        return false;
     }
     let by = texture.size[0].max(texture.size[1]).div_ceil(SIDE).max(1);
-    let (lines, along) = go_on(texture, by);
-    let lines: Vec<Line> = lines.iter().map(|line| line.scaled(1.0 / by as f64)).collect();
+    let lines: Vec<Line> = go_on(texture, by).iter().map(|line| line.scaled(1.0 / by as f64)).collect();
     let small = texture.reduced(by);
     let materials = small.materials(&lines);
     let coarse = small.shifts(&materials);
     if coarse.is_empty() {
-        return None;
+        return false;
     }
     let labels = small.labels(&coarse, &materials);
     let shifts = refined(texture, &small, &labels, &coarse, by);
@@ -428,18 +427,16 @@ pub fn fill(texture: &mut Texture) -> Option<Vec<Option<usize>>> {
     for (i, hole) in texture.hole.iter_mut().enumerate() {
         *hole &= copied[i].is_none() && !(between[i] && texture.rgb[i][0].is_finite());
     }
-    // What is copied from a line was copied there before.
-    Some((0..w * h).map(|i| along[i].or(copied[i].map(|from| along[from].unwrap_or(from)))).collect())
+    true
 }
 
-/// Fills the lines that cross the hole, each along itself, so wide that a cell of so many pixels is within it. Returns them, and
-/// `[pixel]` the one that it is copied from.
-fn go_on(texture: &mut Texture, cell: usize) -> (Vec<Line>, Vec<Option<usize>>) {
+/// Fills the lines that cross the hole, each along itself, so wide that a cell of so many pixels is within it. Returns them.
+fn go_on(texture: &mut Texture, cell: usize) -> Vec<Line> {
     let by = texture.size[0].max(texture.size[1]).div_ceil(LINES).max(1);
     let small = texture.reduced(by);
     let found = lines::lines(small.picture(), &small.hole);
     if found.is_empty() {
-        return (found, vec![None; texture.hole.len()]);
+        return found;
     }
     let grey = Grey::new(texture.picture());
     let at_full_size = |line: Line| {
@@ -469,7 +466,7 @@ fn go_on(texture: &mut Texture, cell: usize) -> (Vec<Line>, Vec<Option<usize>>) 
     for i in (0..copied.len()).filter(|i| copied[*i].is_some()) {
         (texture.hole[i], texture.source[i]) = (false, true);
     }
-    (found.into_iter().map(|(line, ..)| line).collect(), copied)
+    found.into_iter().map(|(line, ..)| line).collect()
 }
 
 /// Copies pixels and joins them with each other and with what is around them.
@@ -658,7 +655,7 @@ mod tests {
             };
             let (mut tiles, truth) = texture(size, hole, color);
             let before = tiles.hole.clone();
-            assert!(fill(&mut tiles).is_some() && !tiles.hole.contains(&true));
+            assert!(fill(&mut tiles) && !tiles.hole.contains(&true));
             let inside = || (0..truth.len()).filter(|i| before[*i]);
             let wrong = inside().filter(|i| (0..3).any(|c| (tiles.rgb[*i][c] - truth[*i][c]).abs() > 0.06)).count();
             let all = inside().count();
@@ -681,7 +678,7 @@ mod tests {
             .filter(|(i, _)| i % 160 > 135 || i % 160 < 25)
             .for_each(|(_, s)| *s = false);
         let before = floor.hole.clone();
-        assert!(fill(&mut floor).is_some());
+        assert!(fill(&mut floor));
         for i in (0..truth.len()).filter(|i| before[*i]) {
             assert!((0..3).all(|c| (floor.rgb[i][c] - truth[i][c]).abs() < 0.03), "{i}: {:?}", floor.rgb[i]);
         }
@@ -695,7 +692,7 @@ mod tests {
         let color = |x: usize, y: usize| if joint(x, y) { [0.35; 3] } else { [0.75, 0.73, 0.7] };
         let (mut floor, truth) = texture([160, 130], hole, color);
         let before = floor.hole.clone();
-        assert!(fill(&mut floor).is_some());
+        assert!(fill(&mut floor));
         let wrong = |i: &usize| (0..3).any(|c| (floor.rgb[*i][c] - truth[*i][c]).abs() > 0.06);
         let inside = || (0..truth.len()).filter(|i| before[*i]);
         assert!(inside().filter(wrong).count() * 20 < inside().count(), "{}", inside().filter(wrong).count());
@@ -709,7 +706,7 @@ mod tests {
         let color = |x: usize, y: usize| if upper(x, y) { [0.2, 0.3, 0.6] } else { [0.7, 0.6, 0.4] };
         let (mut two, truth) = texture([130, 100], hole, color);
         let before = two.hole.clone();
-        assert!(fill(&mut two).is_some());
+        assert!(fill(&mut two));
         for i in (0..truth.len()).filter(|i| before[*i]) {
             let (x, y) = ((i % 130) as f64, (i / 130) as f64);
             let off = (2.0 * y - 40.0 - x).abs() / 5f64.sqrt();
@@ -729,7 +726,7 @@ mod tests {
         };
         let (mut two, _) = texture([180, 130], hole, color);
         let before = two.hole.clone();
-        assert!(fill(&mut two).is_some());
+        assert!(fill(&mut two));
         let mixed = |i: &usize| (0.2..0.55).contains(&two.rgb[*i][0]);
         let inside = || (0..before.len()).filter(|i| before[*i]);
         let count = inside().filter(mixed).count();
@@ -747,7 +744,7 @@ mod tests {
             [0.56, 0.53, 0.47].map(|c| c + light + 0.0004 * speck(x, y) as f32)
         };
         let (mut stone, _) = texture(size, hole, color);
-        assert!(fill(&mut stone).is_some() && !stone.hole.contains(&true));
+        assert!(fill(&mut stone) && !stone.hole.contains(&true));
         let mean = |x: usize, y: usize| -> f32 {
             (0..4).flat_map(|v| (0..4).map(move |u| (y + v) * size[0] + x + u)).map(|i| stone.rgb[i][1]).sum::<f32>()
                 / 16.0
@@ -777,7 +774,7 @@ mod tests {
         };
         let (mut floor, truth) = texture(size, hole, color);
         let before = floor.hole.clone();
-        assert!(fill(&mut floor).is_some());
+        assert!(fill(&mut floor));
         let wrong = |i: &usize| (0..3).any(|c| (floor.rgb[*i][c] - truth[*i][c]).abs() > 0.12);
         let inside = || (0..truth.len()).filter(|i| before[*i]);
         let joints = inside().filter(|i| joint(i % size[0], i / size[0])).count();
@@ -804,8 +801,8 @@ mod tests {
     #[test]
     fn without_anything_to_copy_nothing_is_filled() {
         let (mut none, _) = texture([20, 20], |_, _| true, |_, _| [0.5; 3]);
-        assert!(fill(&mut none).is_none());
+        assert!(!fill(&mut none));
         let (mut whole, _) = texture([20, 20], |_, _| false, |_, _| [0.5; 3]);
-        assert!(fill(&mut whole).is_none());
+        assert!(!fill(&mut whole));
     }
 }
