@@ -236,9 +236,11 @@ fn charted(
                 return if is_its.is_some() { Texel::Hole } else { Texel::Nothing };
             }
             if inside {
-                let z = sight.depth_at(sight.grid.place(ray));
-                let same = its(sight.surface_at(sight.grid.place(ray))).unwrap_or(SAME);
-                if (z / point.z - 1.0).abs() <= same {
+                let place = sight.grid.place(ray);
+                let (z, its) = (sight.depth_at(place), its(sight.surface_at(place)));
+                // Where the object's depth has bled nothing is known but that.
+                let on_it = if z.is_nan() { its.is_some() } else { (z / point.z - 1.0).abs() <= its.unwrap_or(SAME) };
+                if on_it {
                     // What is to be filled still shows the object.
                     let known = |x: i64, y: i64| {
                         let inside = x >= 0 && y >= 0 && (x as usize) < size[0] && (y as usize) < size[1];
@@ -330,6 +332,38 @@ mod tests {
             let middle = (50 + w / 40) * w + w / 2 + w / 40;
             assert!(found[middle as usize], "{size:?}");
         }
+    }
+
+    /// Around a hole lies what the object's depth has bled into: what a photograph shows there is of the surface that goes on there.
+    #[test]
+    fn where_depth_has_bled_colours_are_known() {
+        use super::super::color;
+        use super::super::surface::tests::{SIZE, views};
+        let (mut grids, cameras, masks) = views(0.4);
+        grids.iter_mut().enumerate().filter(|(view, _)| *view != 2).for_each(|(_, grid)| grid.trusted = false);
+        let picture = image::RgbImage::from_pixel(SIZE[0], SIZE[1], image::Rgb([90, 120, 150]));
+        let photographs: Vec<Photograph<'_>> = (cameras.iter().zip(&masks))
+            .map(|(camera, hole)| Photograph { camera: *camera, picture: &picture, hole: hole.clone() })
+            .collect();
+        let mut sights = Sights::new(grids, &cameras, &masks, &masks);
+        let bled: Vec<usize> = (0..sights.0[2].hole.len())
+            .filter(|site| {
+                !sights.0[2].hole[*site] && sights.0[2].grid.around(*site, 2).any(|near| sights.0[2].hole[near])
+            })
+            .collect();
+        bled.iter().for_each(|site| sights.0[2].depth[*site] = f64::NAN);
+        sights.solve(2, 1);
+        let filling = color::gather(&sights, &photographs, 2);
+        let plane = sights.0[2].planes[0];
+        let rays: Vec<[f64; 2]> = (0..sights.0[2].hole.len()).map(|site| sights.0[2].ray(site)).collect();
+        let chart = Chart::new(plane, &rays, 40.0, 0.0).expect("a plane before the camera");
+        let texture = charted(&sights, &photographs, 2, &filling, &chart, &|_| Some(SAME));
+        let known = |site: &usize| {
+            let [x, y] = chart.pixel(sights.0[2].ray(*site)).expect("it is on the plane").map(|v| v as usize);
+            texture.source[y * texture.size[0] + x] || texture.hole[y * texture.size[0] + x]
+        };
+        assert!(bled.len() > 40 && texture.source.contains(&true), "{}", bled.len());
+        assert!(bled.iter().all(known), "{} of {}", bled.iter().filter(|site| known(site)).count(), bled.len());
     }
 
     /// A light mirrored in one of three photographs is not what the surface looks like; a little brighter it may be.

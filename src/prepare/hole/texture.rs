@@ -572,22 +572,19 @@ fn refine(texture: &Texture, columns: usize, cells: &[usize], large: Shift, by: 
 }
 
 impl Texture {
-    /// Whether two pixels that may be copied show one thing, be it in two lights: what is left of their difference without that
-    /// of their surroundings is small.
+    /// Whether two pixels that may be copied show one thing, be it in two lights: their surroundings have one hue, and what is left of
+    /// their difference, with or without that of their surroundings, is small.
     fn is_one(&self, one: usize, other: usize) -> bool {
-        if self.apart(one, other) <= ANOTHER {
-            return true;
-        }
         let means = [one, other].map(|at| self.mean_around(at));
         let off: [f32; 3] = std::array::from_fn(|c| means[0][c] - means[1][c]);
         let light = off.iter().sum::<f32>() / 3.0;
         let hue: f32 = off.iter().map(|off| (off - light).abs()).sum();
-        let left: f32 = (0..3).map(|c| (self.rgb[one][c] - self.rgb[other][c] - off[c]).abs()).sum();
-        light.abs() <= SHADED && hue <= HUE && left <= ANOTHER
+        let left = || (0..3).map(|c| (self.rgb[one][c] - self.rgb[other][c] - off[c]).abs()).sum::<f32>();
+        light.abs() <= SHADED && hue <= HUE && (self.apart(one, other) <= ANOTHER || left() <= ANOTHER)
     }
 }
 
-/// Gives the copied pixels the colours whose gradients are those of the copies, and that go on from what is known.
+/// Gives the copied pixels the light with which their gradients are those of the copies, and that goes on from what is known.
 fn join(texture: &mut Texture, copied: &[Option<usize>]) {
     let original = &texture.rgb;
     let less = |a: usize, b: usize| -> [f32; 3] { std::array::from_fn(|c| original[a][c] - original[b][c]) };
@@ -620,7 +617,13 @@ fn join(texture: &mut Texture, copied: &[Option<usize>]) {
     };
     let inside: Vec<usize> = (0..copied.len()).filter(|i| copied[*i].is_some()).collect();
     let equations: Vec<Equation> = inside.into_par_iter().map(equation).collect();
+    let copies = texture.rgb.clone();
     gradient::solve(&mut texture.rgb, texture.size[0], &equations);
+    // A place has its own light, not its own hue: a rim that is mixed with what stands beside it would tint all that is copied.
+    for i in (0..copied.len()).filter(|i| copied[*i].is_some()) {
+        let brighter = (0..3).map(|c| texture.rgb[i][c] - copies[i][c]).sum::<f32>() / 3.0;
+        texture.rgb[i] = copies[i].map(|v| (v + brighter).clamp(0.0, 1.0));
+    }
 }
 
 #[cfg(test)]
@@ -754,6 +757,36 @@ mod tests {
             let largest = steps.fold(0.0, f32::max);
             assert!(largest < 0.08, "{largest} in row {y}");
         }
+    }
+
+    /// A leaf as bright as the stone beside it is no stone: what is around it is not.
+    #[test]
+    fn what_has_the_colour_of_stone_among_leaves_is_none() {
+        let stone = |x: usize, y: usize| x >= 40 || (x, y) == (20, 20);
+        let (two, _) =
+            texture([80, 40], |_, _| false, |x, y| if stone(x, y) { [0.6, 0.62, 0.65] } else { [0.1, 0.3, 0.1] });
+        let at = |x: usize, y: usize| y * 80 + x;
+        assert!(two.is_one(at(60, 20), at(70, 10)) && two.is_one(at(20, 15), at(12, 20)));
+        assert!(!two.is_one(at(20, 20), at(60, 20)));
+    }
+
+    /// Stone whose rim on one side is mixed with the green of what stood before it: copies of it are as grey as it is.
+    #[test]
+    fn a_tinted_rim_tints_nothing() {
+        let hole = |x: usize, y: usize| (50..80).contains(&x) && (40..70).contains(&y);
+        let speck = |x: usize, y: usize| 0.0004 * ((x * 7919 + y * 104_729 + x * y * 31) % 97) as f32;
+        let rim = |x: usize, y: usize| (47..50).contains(&x) && (38..72).contains(&y);
+        let color = |x: usize, y: usize| {
+            let [r, g, b] = if rim(x, y) { [0.52, 0.57, 0.5] } else { [0.56, 0.54, 0.55] };
+            [r + speck(x, y), g + speck(x, y), b + speck(x, y)]
+        };
+        let (mut stone, _) = texture([140, 110], hole, color);
+        let before = stone.hole.clone();
+        assert!(fill(&mut stone));
+        let green = |i: &usize| stone.rgb[*i][1] - stone.rgb[*i][0];
+        let inside = (0..before.len()).filter(|i| before[*i]);
+        let greenest = inside.map(|i| green(&i)).fold(f32::MIN, f32::max);
+        assert!(greenest < 0.0, "{greenest}");
     }
 
     /// Joints of three pixels in tiles of 150, which the picture that pieces are chosen in hardly shows, with a hole where two cross:
