@@ -9,6 +9,7 @@ use rayon::prelude::*;
 use super::record::Batch;
 use super::splats::Splats;
 use super::{Error, Watch, network};
+use crate::multiview::DepthGrid;
 use crate::scene::doctor;
 use crate::scene::{self, Camera, Prior, PriorKind, Scene, resample};
 use crate::statistics::median;
@@ -40,6 +41,16 @@ impl DepthMap {
         let depth = drawn.depth.iter().zip(&drawn.transmittance);
         let depth = depth.map(|(z, left)| if 1.0 - left < COVERED { f32::NAN } else { z / (1.0 - left) }).collect();
         Ok(Self { camera: *camera, depth })
+    }
+
+    /// The measured depth of a view with this camera; nothing is known of one whose camera is wrong.
+    pub fn measured(grid: &DepthGrid, camera: &Camera) -> Self {
+        let one = |pixel: usize| -> Option<f32> {
+            let [x, y] = grid.place(camera.unproject(camera.pixel_center(pixel)).filter(|_| grid.trusted)?);
+            Some(grid.depth[grid.site(x.floor() as i64, y.floor() as i64)?] as f32)
+        };
+        let depth = (0..(camera.size[0] * camera.size[1]) as usize).map(|pixel| one(pixel).unwrap_or(f32::NAN));
+        Self { camera: *camera, depth: depth.collect() }
     }
 
     /// The depth at a pixel position, of the pixel it falls into; NaN outside.
@@ -244,6 +255,22 @@ mod tests {
             size: [20, 16],
         };
         DepthMap { camera, depth: vec![depth; 20 * 16] }
+    }
+
+    /// Every pixel has the depth of the site it falls into; of a camera that is wrong nothing is known.
+    #[test]
+    fn measured_depth_is_that_of_the_site() {
+        let camera = map(0.0, 4.0).camera;
+        let depth: Vec<f64> = (0..80).map(|site| 1.0 + f64::from(site)).collect();
+        let (confirmed, colors) = (vec![true; 80], vec![[0; 3]; 80]);
+        let mut grid = DepthGrid { camera, stride: 2, columns: 10, rows: 8, depth, confirmed, colors, trusted: true };
+        let measured = DepthMap::measured(&grid, &camera);
+        assert_eq!([0, 1, 2, 20, 40, 5 * 20 + 7].map(|pixel| measured.depth[pixel]), [1.0, 1.0, 2.0, 1.0, 11.0, 24.0]);
+        // A picture twice as large shows the same.
+        let large = DepthMap::measured(&grid, &camera.scaled([40, 32]));
+        assert_eq!((large.depth.len(), large.depth[11 * 40 + 15]), (1280, 24.0));
+        grid.trusted = false;
+        assert!(DepthMap::measured(&grid, &camera).depth.iter().all(|z| z.is_nan()));
     }
 
     #[test]

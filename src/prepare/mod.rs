@@ -330,22 +330,21 @@ fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(
     }
     let fit = preparation.fit(&scene)?;
     let mut splats = Splats::new(gpu, &fit.model, &fit.settings.render)?;
-    let masked = |preparation: &Preparation<'_>| preparation.masks_on_disk(&scene);
     if request.wants(Step::Masks) {
         preparation.masks(&scene, &fit, &mut splats, &object)?;
     }
     if request.wants(Step::Shadow) {
-        let masks = masked(&preparation)?;
-        preparation.shadow(&scene, &mut splats, &masks)?;
+        let masks = preparation.masks_on_disk(&scene)?;
+        preparation.shadow(&scene, &masks)?;
     }
     if request.wants(Step::Depth) {
-        let masks = masked(&preparation)?;
+        let masks = preparation.masks_on_disk(&scene)?;
         preparation.depth(&scene, &mut splats, &masks)?;
     } else if request.only.is_empty() && !request.depth {
         preparation.no_depth()?;
     }
     if request.wants(Step::Reference) {
-        let masks = masked(&preparation)?;
+        let masks = preparation.masks_on_disk(&scene)?;
         preparation.reference(&scene, &masks)?;
     }
     Ok(Some((scene, fit)))
@@ -702,9 +701,10 @@ impl Preparation<'_> {
         Ok(())
     }
 
-    fn shadow(&mut self, scene: &Scene, splats: &mut Splats, masks: &[GrayImage]) -> Result<(), Error> {
+    fn shadow(&mut self, scene: &Scene, masks: &[GrayImage]) -> Result<(), Error> {
         let answer = self.request.shadow;
-        let inputs = self.inputs_behind_masks(masks).with(answer.name()).with(self.request.seed.to_le_bytes()).finish();
+        let inputs = self.inputs_behind_masks(masks).with(shadow::METHOD).with(answer.name());
+        let inputs = inputs.with(self.request.seed.to_le_bytes()).finish();
         if self.skips(Step::Shadow, &inputs)? {
             return Ok(());
         }
@@ -714,9 +714,10 @@ impl Preparation<'_> {
             return self.write(Step::Shadow, inputs, batch);
         }
         let fine = self.load(shadow::SIDE, false)?;
-        self.watch.begin(Step::Shadow, 2 * scene.train.len() as u64 + 1);
-        let task = shadow::Task { scene, fine: &fine, masks, seed: self.request.seed };
-        batch = shadow::make(&task, splats, self.watch)?;
+        self.watch.begin(Step::Shadow, scene.train.len() as u64 + 1);
+        let grids = self.matched(scene)?.depths(&masked(scene, masks));
+        let task = shadow::Task { scene, grids: &grids, fine: &fine, masks, seed: self.request.seed };
+        batch = shadow::make(&task, self.watch)?;
         self.write(Step::Shadow, inputs, batch)?;
         self.watch.end();
         Ok(())
@@ -798,6 +799,15 @@ impl Preparation<'_> {
 const USUAL: std::ops::Range<f64> = 0.125..16.0;
 /// See [`USUAL`].
 const SCALED: f64 = 4.0;
+
+/// A scene whose views have these masks.
+fn masked(scene: &Scene, masks: &[GrayImage]) -> Scene {
+    let mut masked = scene.clone();
+    for (view, mask) in masked.train.iter_mut().zip(masks) {
+        view.mask = Some(crate::scene::resample::mask(mask, view.camera.size));
+    }
+    masked
+}
 
 /// A view shows a side of the object that no masked view shows if more than this part of the object there is unseen.
 const THIN: f64 = 0.3;

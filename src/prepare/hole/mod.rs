@@ -115,11 +115,7 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
     let cameras: Vec<Camera> = task.fine.train.iter().map(|view| view.camera).collect();
     let mut masks: Vec<GrayImage> =
         task.masks.par_iter().zip(&cameras).map(|(mask, camera)| resample::mask(mask, camera.size)).collect();
-    let mut masked = task.scene.clone();
-    for (view, mask) in masked.train.iter_mut().zip(task.masks) {
-        view.mask = Some(resample::mask(mask, view.camera.size));
-    }
-    let grids = task.matched.depths(&masked);
+    let grids = task.matched.depths(&super::masked(task.scene, task.masks));
     watch.turn(n)?;
     log::debug!("hole: depth is measured");
     let mut batch = Batch::default();

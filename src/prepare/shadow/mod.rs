@@ -15,12 +15,13 @@ pub mod texture;
 
 use glam::DVec3;
 use image::GrayImage;
+use rayon::prelude::*;
 
 use super::depth::{self, DepthMap};
 use super::record::Batch;
-use super::splats::Splats;
 use super::{Error, Watch};
 use crate::export::up;
+use crate::multiview::DepthGrid;
 use crate::scene::{Camera, Scene};
 use detect::{Shadow, Verdict};
 use plane::Support;
@@ -40,6 +41,8 @@ pub struct Ground<'a> {
 
 /// The longer side of the photographs that a shadow is looked for in, pixels.
 pub const SIDE: u32 = 1024;
+/// Name of the way in which it is looked for: where that was another one it is looked for anew.
+pub const METHOD: &str = "on the plane of measured depth";
 /// A picture of what was found, below the scene's folder.
 pub const PICTURE: &str = "prepare/shadow.png";
 /// Places that are looked at, of the object and of what is around it.
@@ -76,8 +79,10 @@ impl Answer {
 
 /// What a shadow is looked for in.
 pub struct Task<'a> {
-    /// The scene at the fit's size.
+    /// The scene at the size that depth is measured at.
     pub scene: &'a Scene,
+    /// The measured depth of its views, object and all.
+    pub grids: &'a [DepthGrid],
     /// The scene at [`SIDE`].
     pub fine: &'a Scene,
     /// By view, as large as the photographs.
@@ -101,14 +106,10 @@ pub struct Found {
 /// Looks for the shadow, and writes what of the light is left at each pixel of each photograph.
 ///
 /// # Errors
-/// When the device has no room, or is lost.
-pub fn make(task: &Task<'_>, splats: &mut Splats, watch: &mut dyn Watch) -> Result<Batch, Error> {
-    let n = task.scene.train.len() as u64;
-    let mut maps = vec![];
-    for (i, view) in task.scene.train.iter().enumerate() {
-        maps.push(DepthMap::of(splats, &view.camera)?);
-        watch.turn(i as u64 + 1)?;
-    }
+/// When it is interrupted.
+pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
+    let views = task.scene.train.par_iter().zip(task.grids);
+    let maps: Vec<DepthMap> = views.map(|(view, grid)| DepthMap::measured(grid, &view.camera)).collect();
     let views = task.fine.train.iter().zip(task.masks);
     let masks: Vec<GrayImage> = views.map(|(view, mask)| depth::enlarged(mask, view.camera.size)).collect();
     let photographs: Vec<Photograph<'_>> = task
@@ -127,7 +128,7 @@ pub fn make(task: &Task<'_>, splats: &mut Splats, watch: &mut dyn Watch) -> Resu
             return Ok(batch);
         }
     };
-    watch.turn(n + 1)?;
+    watch.turn(1)?;
     let [alike, all] = found.views;
     let share = alike as f64 / all.max(1) as f64;
     let left = found.shadow.ratio.iter().sum::<f64>() / 3.0;
@@ -137,7 +138,7 @@ pub fn make(task: &Task<'_>, splats: &mut Splats, watch: &mut dyn Watch) -> Resu
             batch.rgb_aside(relight::path(&view.name), &map, "the object's shadow, found on its surface")?;
             lit += 1;
         }
-        watch.turn(n + 2 + i as u64)?;
+        watch.turn(2 + i as u64)?;
     }
     batch.rgb(PICTURE, &relight::picture(&found, &photographs), "the surface from above, the shadow, and without it");
     batch.notes.push(format!(
@@ -161,9 +162,6 @@ pub fn look(task: &Task<'_>, maps: &[DepthMap], photographs: &[Photograph<'_>]) 
     let support = plane::find(&around, &object, up::estimate(&cameras), task.seed)
         .ok_or("no surface is known that it stands on")?;
     log::debug!("shadow: {support:?}, {} places of the object, {} around", object.len(), around.len());
-    let refined = texture::refined(&support, photographs);
-    log::debug!("shadow: {refined:?}");
-    let support = refined;
     let texture = Texture::of(&support, photographs);
     let middle = 0.5 * texture.side as f64;
     let in_cells = |point: &DVec3| {
@@ -214,7 +212,7 @@ fn world(map: &DepthMap, pixel: usize) -> Option<DVec3> {
     z.is_finite().then(place).flatten().map(DVec3::from)
 }
 
-/// Places of the object: what the fit has within the masks, where the masks of most views agree.
+/// Places of the object: what is measured within the masks, where the masks of most views agree.
 fn object(maps: &[DepthMap], masks: &[GrayImage]) -> Vec<DVec3> {
     let small: Vec<GrayImage> =
         maps.iter().zip(masks).map(|(map, mask)| crate::scene::resample::mask(mask, map.camera.size)).collect();
@@ -236,7 +234,7 @@ fn object(maps: &[DepthMap], masks: &[GrayImage]) -> Vec<DVec3> {
     kept.into_iter().step_by(every).collect()
 }
 
-/// Places around the object: points of the model and what the fit has, outside the masks and near it.
+/// Places around the object: points of the model and what is measured, outside the masks and near it.
 fn around(scene: &Scene, maps: &[DepthMap], photographs: &[Photograph<'_>], object: &[DVec3]) -> Vec<DVec3> {
     let Some((middle, radius)) = plane::extent(object) else { return vec![] };
     let near = |p: &DVec3| (*p - middle).length() <= NEAR * radius;

@@ -40,13 +40,6 @@ impl Support {
         DVec3::new(from.dot(self.along[0]), from.dot(self.along[1]), from.dot(self.up))
     }
 
-    /// The plane moved along its normal, world units, and tilted about its two directions, radians.
-    pub fn moved(&self, by: f64, [a, b]: [f64; 2]) -> Self {
-        let up = (self.up + self.along[0] * a + self.along[1] * b).normalize();
-        let first = (self.along[0] - up * self.along[0].dot(up)).normalize();
-        Self { foot: self.foot + self.up * by, up, along: [first, up.cross(first)], height: self.height - by, ..*self }
-    }
-
     /// A world point from places along the plane and above it.
     pub fn world(&self, local: DVec3) -> DVec3 {
         self.foot + self.along[0] * local.x + self.along[1] * local.y + self.up * local.z

@@ -10,14 +10,12 @@ use crate::scene::{Camera, resample};
 use crate::statistics::median;
 
 /// Cells on each side of the texture, at most.
-const MOST: usize = 320;
+const MOST: usize = 512;
 /// Cells along a pixel of the median photograph at the foot of the object.
 const FINER: f64 = 1.6;
-/// Photographs that are compared to find the surface more exactly; of more, every so many.
-const ASKED: usize = 24;
 /// The texture reaches so far beyond the object's radius, in its heights (or radii, where it is wider than high).
 const REACH: f64 = 2.6;
-/// A fit's depth may be off by this part before it hides a place of the surface.
+/// Depth may be off by this part before it hides a place of the surface.
 const HIDDEN: f64 = 0.1;
 /// A place that a photograph sees through by more than this part of the depth is none of the surface.
 const THROUGH: f64 = 0.2;
@@ -25,12 +23,6 @@ const THROUGH: f64 = 0.2;
 const FEWEST: usize = 2;
 /// Levels below which a stored value says nothing of a ratio.
 const DARK: f32 = 4.0;
-
-/// Places that photographs are compared at to find the surface more exactly, on each side.
-const COMPARED: usize = 44;
-/// First steps of that: along the normal, in heights of the object, and tilts; they are halved so often.
-const STEPS: [f64; 2] = [0.08, 0.06];
-const HALVED: u32 = 6;
 
 /// A photograph and what is known of it.
 pub struct Photograph<'a> {
@@ -40,7 +32,7 @@ pub struct Photograph<'a> {
     pub picture: &'a RgbImage,
     /// Not 0 on the object, enlarged.
     pub mask: &'a GrayImage,
-    /// The fit's depth, with the object; its camera is the same at any size.
+    /// Its depth, with the object; its camera is the same at any size.
     pub depth: &'a DepthMap,
 }
 
@@ -62,57 +54,6 @@ impl Photograph<'_> {
     fn log(&self, position: [f64; 2]) -> [f32; 3] {
         resample::color_at(self.picture, position).map(|v| (v as f32).max(DARK).ln())
     }
-}
-
-/// How much photographs differ on a surface: the mean deviation from the median, of logarithms of the brightness.
-fn disagreement(support: &Support, photographs: &[Photograph<'_>]) -> f64 {
-    let half = reach(support);
-    let one = |i: usize| {
-        let at = |n: usize| ((n as f64 + 0.5) / COMPARED as f64 - 0.5) * 2.0 * half;
-        let place = support.world(DVec3::new(at(i % COMPARED), at(i / COMPARED), 0.0)).to_array();
-        let of = |photograph: &Photograph<'_>| {
-            let log = photograph.log(photograph.shows(place)?);
-            Some(log[0] + log[1] + log[2])
-        };
-        let every = photographs.len().div_ceil(ASKED).max(1);
-        let values: Vec<f32> = photographs.iter().step_by(every).filter_map(of).collect();
-        if values.len() < 4 {
-            return None;
-        }
-        let median = median(values.iter().copied())? as f32;
-        let mut apart: Vec<f32> = values.iter().map(|v| (v - median).abs()).collect();
-        apart.sort_unstable_by(f32::total_cmp);
-        // The farthest quarter sees something else.
-        let kept = &apart[..apart.len() * 3 / 4];
-        Some(f64::from(kept.iter().sum::<f32>()) / kept.len() as f64)
-    };
-    let all: Vec<Option<f64>> = (0..COMPARED * COMPARED).into_par_iter().map(one).collect();
-    let count = all.iter().flatten().count();
-    all.iter().flatten().sum::<f64>() / count.max(1) as f64
-}
-
-/// The surface, moved and tilted until the photographs agree best on what it looks like.
-pub fn refined(support: &Support, photographs: &[Photograph<'_>]) -> Support {
-    let (mut best, mut least) = (*support, disagreement(support, photographs));
-    let mut scale = 1.0;
-    for _ in 0..HALVED {
-        for _ in 0..2 {
-            let before = least;
-            for (which, sign) in [(0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0), (2, 1.0), (2, -1.0)] {
-                let step = |i: usize, by: f64| if which == i { sign * scale * by } else { 0.0 };
-                let tried = best.moved(step(0, STEPS[0] * support.height), [step(1, STEPS[1]), step(2, STEPS[1])]);
-                let found = disagreement(&tried, photographs);
-                if found < least {
-                    (best, least) = (tried, found);
-                }
-            }
-            if least == before {
-                break;
-            }
-        }
-        scale *= 0.5;
-    }
-    best
 }
 
 /// Half the side of the texture, world units.
