@@ -55,6 +55,8 @@ const ANOTHER: f32 = 0.3;
 /// Largest difference of the surroundings of one thing in two lights: of the mean of the channels, and of the channels without it.
 const SHADED: f32 = 0.25;
 const HUE: f32 = 0.12;
+/// Difference of the channels without their mean by which a copy takes less of the hue of its place than its gradients ask for.
+const TINT: f32 = 0.03;
 /// Mean difference of the channels up to which surroundings are of one material in another light, which costs nothing: copies
 /// take the light of their place.
 const LIGHT: f32 = 0.05;
@@ -619,10 +621,15 @@ fn join(texture: &mut Texture, copied: &[Option<usize>]) {
     let equations: Vec<Equation> = inside.into_par_iter().map(equation).collect();
     let copies = texture.rgb.clone();
     gradient::solve(&mut texture.rgb, texture.size[0], &equations);
-    // A place has its own light, not its own hue: a rim that is mixed with what stands beside it would tint all that is copied.
+    // A place has its own light. Of another hue it is hardly: a rim that is mixed with what stands beside it would tint all that is
+    // copied.
     for i in (0..copied.len()).filter(|i| copied[*i].is_some()) {
-        let brighter = (0..3).map(|c| texture.rgb[i][c] - copies[i][c]).sum::<f32>() / 3.0;
-        texture.rgb[i] = copies[i].map(|v| (v + brighter).clamp(0.0, 1.0));
+        let off: [f32; 3] = std::array::from_fn(|c| texture.rgb[i][c] - copies[i][c]);
+        let brighter = off.iter().sum::<f32>() / 3.0;
+        let hue: f32 = off.iter().map(|off| (off - brighter).abs()).sum();
+        let kept = 1.0 - (TINT / hue).min(1.0);
+        texture.rgb[i] =
+            std::array::from_fn(|c| (copies[i][c] + brighter + kept * (off[c] - brighter)).clamp(0.0, 1.0));
     }
 }
 
@@ -770,14 +777,14 @@ mod tests {
         assert!(!two.is_one(at(20, 20), at(60, 20)));
     }
 
-    /// Stone whose rim on one side is mixed with the green of what stood before it: copies of it are as grey as it is.
+    /// Stone whose rim on one side is a little mixed with the green of what stood before it: copies of it are as grey as it is.
     #[test]
     fn a_tinted_rim_tints_nothing() {
         let hole = |x: usize, y: usize| (50..80).contains(&x) && (40..70).contains(&y);
         let speck = |x: usize, y: usize| 0.0004 * ((x * 7919 + y * 104_729 + x * y * 31) % 97) as f32;
         let rim = |x: usize, y: usize| (47..50).contains(&x) && (38..72).contains(&y);
         let color = |x: usize, y: usize| {
-            let [r, g, b] = if rim(x, y) { [0.52, 0.57, 0.5] } else { [0.56, 0.54, 0.55] };
+            let [r, g, b] = if rim(x, y) { [0.545, 0.55, 0.535] } else { [0.56, 0.54, 0.55] };
             [r + speck(x, y), g + speck(x, y), b + speck(x, y)]
         };
         let (mut stone, _) = texture([140, 110], hole, color);
@@ -786,7 +793,7 @@ mod tests {
         let green = |i: &usize| stone.rgb[*i][1] - stone.rgb[*i][0];
         let inside = (0..before.len()).filter(|i| before[*i]);
         let greenest = inside.map(|i| green(&i)).fold(f32::MIN, f32::max);
-        assert!(greenest < 0.0, "{greenest}");
+        assert!(greenest < -0.015, "{greenest}");
     }
 
     /// Joints of three pixels in tiles of 150, which the picture that pieces are chosen in hardly shows, with a hole where two cross:
