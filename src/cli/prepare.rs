@@ -66,7 +66,7 @@ pub(super) struct Args {
     #[arg(long, value_name = "FILE", conflicts_with = "no_depth")]
     depth_model: Option<PathBuf>,
     /// Steps of the fit
-    #[arg(long, value_name = "N", default_value_t = 600, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u32).range(1..))]
     fit_steps: u32,
     /// Longer side of the pictures that the fit is made with, pixels
     #[arg(long, value_name = "PIXELS", default_value_t = 256, value_parser = clap::value_parser!(u32).range(32..))]

@@ -145,6 +145,18 @@ impl Matched {
         Ok(Self { neighbors, confirmed, surfaces })
     }
 
+    /// Points that the photographs add to those of the sparse model, none of views whose cameras are wrong.
+    pub fn points(&self, scene: &Scene) -> Vec<Point> {
+        let pictures: Vec<Picture> = scene.train.par_iter().map(Picture::new).collect();
+        let wrong = agree::wrong(&agree::shares(&pictures, &self.neighbors, &self.confirmed));
+        let known = |(surface, wrong): (&fuse::Surface, bool)| match wrong {
+            true => vec![f64::NAN; surface.len()],
+            false => surface.clone(),
+        };
+        let surfaces: Vec<fuse::Surface> = self.confirmed.iter().zip(wrong).map(known).collect();
+        super::at_most(super::points(&pictures, &surfaces, &scene.points).0, &scene.train)
+    }
+
     /// [`depths`] of the same views, with the masks that they have in this scene.
     pub fn depths(&self, scene: &Scene) -> Vec<DepthGrid> {
         let pictures = scene.train.par_iter().map(Picture::new).collect();

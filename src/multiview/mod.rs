@@ -131,21 +131,13 @@ pub fn look(gpu: &Gpu, scene: &Scene) -> Result<Stereo, Error> {
         .map(|(_, (view, _))| view.name.clone())
         .collect();
     let (pictures, surfaces) = (&pictures[..train], &surfaces[..train]);
-    let mut cloud = fuse::Cloud::new(pictures, surfaces, &scene.points);
-    cloud.add_confirmed();
-    let confirmed = cloud.points.len();
-    cloud.add_filled(&fill::fill(pictures, surfaces));
-    let mut points = cloud.points;
+    let (mut points, confirmed) = points(pictures, surfaces, &scene.points);
     let filled = points.len() - confirmed;
     let on_object = crate::scene::on_object(&scene.train);
     let all = points.len();
     points.retain(|point| !on_object(point));
     let dropped = all - points.len();
-    let pixels: usize = scene.train.iter().map(|v| v.image.as_raw().len() / 3).sum();
-    let most = (pixels / PIXELS_PER_POINT).max(1);
-    if points.len() > most {
-        points = (0..most).map(|i| points[i * points.len() / most]).collect();
-    }
+    let points = at_most(points, &scene.train);
     let on_it = if dropped > 0 { format!(", {dropped} of them on the object and left out") } else { String::new() };
     let note = format!(
         "{} points are added to the {} of the model: {confirmed} where photographs agree on the depth, {filled} on planes and \
@@ -154,6 +146,22 @@ pub fn look(gpu: &Gpu, scene: &Scene) -> Result<Stereo, Error> {
         scene.points.len(),
     );
     Ok(Stereo { points, wrong, note })
+}
+
+/// Points where views agree, and after so many of these where planes and shells are continued.
+fn points(pictures: &[Picture], surfaces: &[fuse::Surface], sparse: &[Point]) -> (Vec<Point>, usize) {
+    let mut cloud = fuse::Cloud::new(pictures, surfaces, sparse);
+    cloud.add_confirmed();
+    let confirmed = cloud.points.len();
+    cloud.add_filled(&fill::fill(pictures, surfaces));
+    (cloud.points, confirmed)
+}
+
+/// Evenly as many of these points as there is room for.
+fn at_most(points: Vec<Point>, views: &[View]) -> Vec<Point> {
+    let pixels: usize = views.iter().map(|view| view.image.as_raw().len() / 3).sum();
+    let most = (pixels / PIXELS_PER_POINT).max(1);
+    if points.len() <= most { points } else { (0..most).map(|i| points[i * points.len() / most]).collect() }
 }
 
 #[cfg(test)]

@@ -6,7 +6,8 @@ use super::record::Batch;
 use super::{Error, Request, Watch};
 use crate::config::Settings;
 use crate::gpu::Gpu;
-use crate::model::files::{POINT_CLOUD, WEIGHTS};
+use crate::model::config::Form;
+use crate::model::files::POINT_CLOUD;
 use crate::model::stored::Stored;
 use crate::scene::Scene;
 use crate::signal::Signal;
@@ -24,11 +25,9 @@ pub struct Fit {
     pub settings: Settings,
 }
 
-/// Points that become anchors one by one; of more, several share an anchor.
-const POINTS: f64 = 2500.0;
-
-/// The settings of the fit to a scene of so many points: those of the preset `lavapipe`, its schedule shortened.
-pub fn settings(request: &Request, points: usize) -> Settings {
+/// The settings of the fit: those of the preset `gaussians`, its schedule shortened. Its Gaussians begin where the photographs have
+/// been measured, and have the same colour from everywhere.
+pub fn settings(request: &Request) -> Settings {
     let steps = request.fit_steps.max(1);
     let mut settings = Settings::default();
     let part = |share: f64| ((f64::from(steps) * share).round() as u32).max(1);
@@ -37,8 +36,8 @@ pub fn settings(request: &Request, points: usize) -> Settings {
     train.seed = request.seed;
     train.log_interval = part(0.1);
     (train.eval_interval, train.checkpoint_interval) = (0, 0);
-    settings.model.voxel = 0.0;
-    settings.model.voxel_factor = (points as f64 / POINTS).sqrt().clamp(1.0, 6.0);
+    settings.model.form = Form::Gaussians;
+    settings.model.degree = 0;
     settings.model.attention.enabled = false;
     settings.losses.depth.enabled = false;
     let densify = &mut settings.densify;
@@ -75,11 +74,9 @@ pub fn make(gpu: &Gpu, scene: &Scene, settings: Settings, watch: &mut dyn Watch)
     drop(run);
     let mut batch = Batch::default();
     let model = work.path().join("model");
-    for name in [POINT_CLOUD, WEIGHTS] {
-        let path = model.join(name);
-        let bytes = std::fs::read(&path).map_err(|source| Error::Io { path, source })?;
-        batch.bytes(format!("{FOLDER}/{name}"), bytes, "a short fit to the photographs");
-    }
+    let path = model.join(POINT_CLOUD);
+    let bytes = std::fs::read(&path).map_err(|source| Error::Io { path, source })?;
+    batch.bytes(format!("{FOLDER}/{POINT_CLOUD}"), bytes, "a short fit to the photographs");
     batch.figures.insert("anchors".into(), f64::from(summary.anchors));
     let mut model = Stored::load(&model)?;
     model.rescale(1.0 / scene.unit);

@@ -201,7 +201,7 @@ impl Request {
             reference: None,
             only: vec![],
             ready: None,
-            fit_steps: 600,
+            fit_steps: 200,
             fit_side: 256,
             depth: true,
             shadow: shadow::Answer::Remove,
@@ -480,7 +480,7 @@ impl Preparation<'_> {
         if let Some(ready) = &self.request.ready {
             return Ok(ready.fit.clone());
         }
-        let settings = fit::settings(self.request, scene.points.len());
+        let settings = fit::settings(self.request);
         let fingerprint = serde_json::to_string(&Fingerprint::of(scene)).expect("names and hashes");
         let inputs = Inputs::default().with(fingerprint).with(settings.to_toml()).finish();
         if self.skips(Step::Fit, &inputs)? {
@@ -490,7 +490,9 @@ impl Preparation<'_> {
             self.watch.say("fit: the photographs or the settings have changed since; the fit is made again");
         }
         self.watch.begin(Step::Fit, u64::from(settings.train.iterations));
-        let (batch, fit) = fit::make(self.gpu, scene, settings, self.watch)?;
+        let mut dense = scene.clone();
+        dense.dense = self.matched(scene)?.points(scene);
+        let (batch, fit) = fit::make(self.gpu, &dense, settings, self.watch)?;
         self.write(Step::Fit, inputs, batch)?;
         self.watch.end();
         Ok(fit)

@@ -83,7 +83,7 @@ pub(super) struct Args {
     #[arg(long, value_name = "N", conflicts_with = "iterations", value_parser = train::positive)]
     minutes: Option<f64>,
     /// Steps of the fit that masks, depth and reference are made with
-    #[arg(long, value_name = "N", default_value_t = 600, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u32).range(1..))]
     fit_steps: u32,
     /// Steps by which the exported files are refined
     #[arg(long, value_name = "N", default_value_t = export::Options::default().steps)]
@@ -102,7 +102,7 @@ impl Args {
         Ok(Work {
             form: settings.model.form,
             views,
-            fit: f64::from(self.fit_steps) / 600.0,
+            fit: f64::from(self.fit_steps) / 200.0,
             files: f64::from(self.export_steps) / f64::from(export::Options::default().steps),
             splat: read::is_splat(&self.photographs),
         })

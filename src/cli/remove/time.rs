@@ -1,6 +1,6 @@
 //! The time of a whole removal: `--minutes N` counts from Remove, or from the command, to the files.
 //!
-//! The number of views tells what a part takes ([`COSTS`], after two captures of 24 and 60 views), and as soon as the masks are
+//! The number of views tells what a part takes ([`COSTS`], after captures of 24, 60 and 96 views), and as soon as the masks are
 //! there, so does the pace that was measured. Training has what the others leave ([`crate::cli::minutes`]).
 
 use std::cell::Cell;
@@ -27,8 +27,8 @@ const fn cost(part: &'static str, once: f64, view: f64) -> Cost {
 /// The parts in their order, with the fit and the files of the usual steps. Training's is the least worth the name.
 const COSTS: [Cost; 9] = [
     cost("poses", 0.3, 0.02),
-    cost("fit", 60.0, 0.0),
-    cost("masks", 2.0, 1.0),
+    cost("fit", 6.0, 1.0),
+    cost("masks", 1.0, 0.7),
     cost("shadow", 1.0, 0.15),
     cost("depth", 0.3, 0.1),
     cost("reference", 5.0, 1.8),

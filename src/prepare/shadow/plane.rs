@@ -7,7 +7,7 @@ use crate::multiview::plane::{self, Plane};
 use crate::statistics::{median, quantile};
 
 /// Planes drawn.
-const DRAWS: usize = 600;
+const DRAWS: usize = 4000;
 /// On the plane: within this share of the object's size.
 const ON: f64 = 0.03;
 /// Share of the object's places that lie above the plane, at least; what lies below is an error of their depth.
