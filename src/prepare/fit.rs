@@ -19,7 +19,7 @@ pub const FOLDER: &str = "prepare/fit";
 /// A fit.
 #[derive(Clone, Debug)]
 pub struct Fit {
-    /// Anchors that were fitted, or the plain Gaussians of a splat that the photographs are pictures of.
+    /// The plain Gaussians that were fitted, or those of a splat that the photographs are pictures of.
     pub model: Stored,
     /// What it was made with.
     pub settings: Settings,

@@ -94,14 +94,14 @@ fn amount(found: &Found, photograph: &Photograph<'_>, pixel: [f64; 2]) -> f64 {
     if amount <= LEAST {
         return 0.0;
     }
-    // Near the object the fit's depth is the object's in part.
+    // Near the object measured depth is the object's in part.
     if photograph.mask.get_pixel(pixel[0] as u32, pixel[1] as u32).0[0] != 0 {
         return amount;
     }
     let small = photograph.depth.camera.size;
     let scaled = std::array::from_fn(|i| pixel[i] * f64::from(small[i]) / f64::from(camera.size[i]));
     let depth = f64::from(photograph.depth.smooth(scaled));
-    // On bare surfaces the fit's depth errs: what has the surface's colour is the surface.
+    // On bare surfaces measured depth errs: what has the surface's colour is the surface.
     let nearest = row * texture.side + column;
     let color = log(photograph.picture.get_pixel(pixel[0] as u32, pixel[1] as u32).0);
     if is_alike(color, texture.log[nearest]) {

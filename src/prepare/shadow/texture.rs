@@ -32,7 +32,7 @@ pub struct Photograph<'a> {
     pub picture: &'a RgbImage,
     /// Not 0 on the object, enlarged.
     pub mask: &'a GrayImage,
-    /// Its depth, with the object; its camera is the same at any size.
+    /// The measured depth, with the object; its camera is the same at any size.
     pub depth: &'a DepthMap,
 }
 
