@@ -7,12 +7,15 @@
 use image::{GrayImage, Luma};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 
-use super::splats::Splats;
+use super::splats::{Share, Splats};
 use crate::gpu::Error;
 use crate::scene::{Camera, View, resample};
 use crate::statistics::median;
 
-/// Anchors seen less than this (pixels) in the masked views count as unseen: what shines through the object.
+/// A Gaussian of whose footprint less than this part shows in a view has no vote there. A short fit's object lets a tenth and
+/// more of what stands behind it through, all of it inside the mask.
+const SHOWN: f32 = 0.25;
+/// Anchors seen less than this (pixels) in the masked views count as unseen.
 const SEEN: f32 = 1.0;
 /// Votes (pixels) that a Gaussian's surroundings have beside its own.
 const PRIOR: f32 = 1.0;
@@ -60,13 +63,16 @@ impl Votes {
         Self { inside: vec![0.0; splats.len()], all: vec![0.0; splats.len()] }
     }
 
-    /// Adds a view's: `inside` is the mask's part of each pixel, 0 to 1.
+    /// Adds a view's: `inside` is the mask's part of each pixel, 0 to 1. What stands behind others there has no vote.
     ///
     /// # Errors
     /// When the device has no room, or is lost.
     pub fn add(&mut self, splats: &mut Splats, camera: &Camera, inside: &[f32]) -> Result<(), Error> {
         let weights: Vec<[f32; 3]> = inside.iter().map(|part| [*part, 1.0, 0.0]).collect();
-        for (name, [inside, all, _]) in splats.shares(camera, &weights)? {
+        for Share { name, sums: [inside, all, _], alone } in splats.shares(camera, &weights)? {
+            if all < SHOWN * alone {
+                continue;
+            }
             self.inside[name as usize] += inside;
             self.all[name as usize] += all;
         }
@@ -223,6 +229,10 @@ pub fn without_specks(mask: &GrayImage, share: f64) -> GrayImage {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::gpu::testing;
+    use crate::model::gaussians::Cloud;
+    use crate::model::stored::Stored;
+    use crate::render::Config;
 
     fn mask(rows: &[&str]) -> GrayImage {
         let (w, h) = (rows[0].len() as u32, rows.len() as u32);
@@ -243,6 +253,34 @@ mod tests {
         let small = parts(&large, [2, 2]);
         assert_eq!(small, [1.0, 0.0, 0.25, 0.0]);
         assert_eq!(threshold(&small, [2, 2], [2, 2], 0.5), mask(&["#.", ".."]));
+    }
+
+    /// An object that lets a tenth of what is behind it through, something small right behind it, and something beside it.
+    #[test]
+    fn what_shines_through_the_object_has_no_vote() {
+        let cloud = Cloud {
+            position: vec![[0.0, 0.0, 2.0], [0.0, 0.0, 4.0], [1.0, 0.0, 4.0]],
+            log_scale: vec![[0.1f32.ln(); 3], [0.05f32.ln(); 3], [0.05f32.ln(); 3]],
+            rotation: vec![[1.0, 0.0, 0.0, 0.0]; 3],
+            logit: vec![9f32.ln(); 3],
+            harmonics: vec![[0.0; 3]; 3],
+            ..Cloud::default()
+        };
+        let camera = Camera {
+            rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            translation: [0.0; 3],
+            focal: [64.0; 2],
+            principal: [32.0; 2],
+            distortion: [0.0; 4],
+            size: [64; 2],
+        };
+        let mut splats = Splats::new(&testing::gpu(), &Stored::Gaussians(cloud), &Config::default()).expect("room");
+        let inside = |i: u32| f32::from(u8::from((i % 64u32).abs_diff(32) < 8 && (i / 64).abs_diff(32) < 8));
+        let mut votes = Votes::new(&splats);
+        votes.add(&mut splats, &camera, &(0..64 * 64).map(inside).collect::<Vec<_>>()).expect("room");
+        assert!(votes.all[0] > 10.0 && votes.inside[0] > 0.9 * votes.all[0], "{:?}", votes.inside);
+        assert_eq!((votes.inside[1], votes.all[1]), (0.0, 0.0));
+        assert!(votes.all[2] > 1.0 && votes.inside[2] == 0.0, "{:?}", votes.all);
     }
 
     /// Four anchors of two Gaussians each: inside, outside, and two that were not seen, as near to the one as to the other,

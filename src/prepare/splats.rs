@@ -35,6 +35,16 @@ impl Canvas {
     }
 }
 
+/// A Gaussian in a view.
+pub struct Share {
+    /// Its name.
+    pub name: u32,
+    /// Sum over the pixels of its share in each (alpha x transmittance) times the pixel's weights.
+    pub sums: [f32; 3],
+    /// Sum over the pixels of its shares if nothing stood before it and the picture had no border: `2 pi opacity sqrt(det)`.
+    pub alone: f32,
+}
+
 /// Draws and questions a model Gaussian by Gaussian.
 pub struct Splats {
     gpu: Gpu,
@@ -102,8 +112,8 @@ impl Splats {
         Ok(names.into_iter().map(|(slot, name)| (name, colors[slot as usize])).collect())
     }
 
-    /// For every Gaussian that this camera draws, its name and the sum over the pixels of its share in the pixel
-    /// (alpha x transmittance) times the pixel's weights.
+    /// For every Gaussian that this camera draws, the sum over the pixels of its share in the pixel (alpha x transmittance)
+    /// times the pixel's weights.
     ///
     /// The rasteriser's backward pass says it: the colour of a pixel is linear in the Gaussians' colours, with those
     /// shares as factors, so that the gradient of a weighted sum of the pixels' colours is just that.
@@ -113,7 +123,7 @@ impl Splats {
     ///
     /// # Panics
     /// Unless there is a weight per pixel.
-    pub fn shares(&mut self, camera: &Camera, weights: &[[f32; 3]]) -> Result<Vec<(u32, [f32; 3])>, Error> {
+    pub fn shares(&mut self, camera: &Camera, weights: &[[f32; 3]]) -> Result<Vec<Share>, Error> {
         assert_eq!(weights.len(), camera.size[0] as usize * camera.size[1] as usize, "a weight per pixel");
         let names = self.decode(camera)?;
         let gpu = self.gpu.clone();
@@ -129,9 +139,17 @@ impl Splats {
         let count = gpu.read(&drawn.count)?[0] as usize;
         let drawn = gpu.read_range(&drawn.list, count)?;
         let sums = gpu.read(&stages.own.backward.grad_color)?;
+        let projected = stages.forward.projected();
+        let (covariance, opacity) = (gpu.read(projected.covariance)?, gpu.read(projected.opacity)?);
         let mut of_slot = vec![u32::MAX; sums.len()];
         names.iter().for_each(|(slot, name)| of_slot[*slot as usize] = *name);
-        Ok(drawn.into_iter().map(|slot| (of_slot[slot as usize], sums[slot as usize])).collect())
+        let share = |slot: u32| {
+            let slot = slot as usize;
+            let [across, _, down] = covariance[slot];
+            let alone = opacity[slot] * std::f32::consts::TAU * (across * down).sqrt();
+            Share { name: of_slot[slot], sums: sums[slot], alone }
+        };
+        Ok(drawn.into_iter().map(share).collect())
     }
 
     /// Draws the view with other colours: `look` takes a Gaussian's name and its own colour and returns the one to draw it
