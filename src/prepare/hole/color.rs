@@ -10,6 +10,7 @@ use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 
 use super::gradient::{self, Equation};
+use super::relief::Relief;
 use super::surface::{APART, SAME, Sight, Sights};
 use super::window::Window;
 use crate::prepare::planes::{self, neighbours};
@@ -317,6 +318,15 @@ pub struct Filled {
     /// `[pixel]` whether its colour was made for this view and serves others: nothing has told it, neither a photograph nor
     /// another view.
     pub made: Vec<bool>,
+    /// Its surface.
+    relief: Relief,
+}
+
+impl Filled {
+    /// With these colours, of which these were made for it.
+    pub fn new(sight: &Sight, rgb: Vec<[f32; 3]>, made: Vec<bool>) -> Self {
+        Self { rgb, made, relief: Relief::new(sight) }
+    }
 }
 
 /// What views that were filled before tell of the colours of a view's hole that no photograph shows: their gradients, so
@@ -332,11 +342,16 @@ pub fn repaint(
     let (own, sight) = (&photographs[of], &sights.0[of]);
     let size @ [w, h] = own.camera.size.map(|n| n as usize);
     // Beside what was made another view shows what photographs show, which have been asked.
+    let ranges: Vec<Option<[f64; 2]>> = filled.iter().map(|(_, filled)| filled.relief.range(sight)).collect();
+    let eye = DVec3::from(own.camera.center());
     let repainted = |i: usize, beside: bool| -> Option<[f32; 3]> {
-        let (_, point) = shown(own, sight, i)?;
-        filled.iter().find_map(|(view, Filled { rgb, made })| {
+        let way = DVec3::from(own.camera.along(own.camera.unproject(own.camera.pixel_center(i))?, 1.0)) - eye;
+        let near = shown(own, sight, i).map(|(_, point)| point);
+        filled.iter().zip(&ranges).find_map(|((view, Filled { rgb, made, relief }), range)| {
             let (other, there) = (&photographs[*view], &sights.0[*view]);
-            there.agrees(point, SAME)?;
+            // Its surfaces end where they end there.
+            let met = || Some(eye + way / relief.meets(there, eye, way, (*range)?)?);
+            let point = near.filter(|point| there.agrees(*point, SAME).is_some()).or_else(met)?;
             let pixel = other.camera.project(point.to_array())?;
             let width = other.camera.size[0] as usize;
             let [x, y] = pixel.map(|v| v.max(0.0) as usize);
@@ -511,8 +526,8 @@ mod tests {
             .collect();
         let hole = |view: usize| photographs[view].hole.as_raw().iter().map(|v| *v != 0).collect::<Vec<bool>>();
         let colors = |view: usize| (0..pixels).map(|i| pattern(&cameras[view], i)).collect::<Vec<_>>();
-        let blank = Filled { rgb: vec![[0.9, 0.1, 0.1]; pixels], made: vec![false; pixels] };
-        let filled = [(0, blank), (2, Filled { rgb: colors(2), made: hole(2) })];
+        let blank = Filled::new(&sights.0[0], vec![[0.9, 0.1, 0.1]; pixels], vec![false; pixels]);
+        let filled = [(0, blank), (2, Filled::new(&sights.0[2], colors(2), hole(2)))];
         let mut filling =
             Filling { rgb: colors(1), guessed: hole(1), seen: vec![false; pixels], doubtful: vec![false; pixels] };
         let inside: Vec<usize> = (0..pixels).filter(|i| filling.guessed[*i]).collect();

@@ -5,7 +5,7 @@
 //! - `residue`: what is left of a shadow that was taken out goes with the object.
 //! - `complete`: masks that end before the object does grow.
 //! - `surface`: the depth of what is behind the object, in all views, by what they know of a point (`witness`).
-//! - `color`: what photographs show of it, and what views that were filled before show of it.
+//! - `color`: what photographs show of it, and what views that were filled before show of it (`relief`).
 //! - `guess`: what nobody shows is filled with pieces of the same surface, seen straight on (`texture`), lines that
 //!   cross the hole first (`lines`), or by a network.
 //!
@@ -20,6 +20,7 @@ mod gradient;
 pub mod ground;
 mod guess;
 mod lines;
+mod relief;
 mod residue;
 mod shade;
 mod similar;
@@ -58,7 +59,7 @@ const AT_ONCE: usize = 16;
 /// Name of the way in which holes are filled: a scene that was filled in another way is filled anew.
 pub const METHOD: &str = "one surface with smooth ends, nothing where others look through it, no colour from a rim that looks like nothing near it, \
      lights joined, doubts left to training, nothing stands on what only crosses the floor, lines go on through holes, a foot is all that is unseen around it, \
-     what is nearly one plane is one, copies nearly keep their hue";
+     what is nearly one plane is one, copies nearly keep their hue, ends are where the first view has them";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 
@@ -219,7 +220,7 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
                 );
             }
             if made.contains(&true) {
-                filled.push((i, Filled { rgb: filling.rgb, made }));
+                filled.push((i, Filled::new(&sights.0[i], filling.rgb, made)));
             }
             done += 1;
             watch.turn(n + 1 + done)?;

@@ -205,6 +205,12 @@ impl Sight {
         self.grid.site(x as i64, y as i64).filter(|_| inside).map(|site| (site, place, at.z))
     }
 
+    /// The place in sites of the points `eye` plus `way` over d, times z d, and z d, of which the first is for d = 0, and the second to
+    /// be added for each unit of d.
+    pub(super) fn homogeneous(&self, eye: DVec3, way: DVec3) -> (DVec3, DVec3) {
+        (self.forward.0 * way, self.forward.0 * eye + self.forward.1)
+    }
+
     /// Depth z at a place in sites, linear in its inverse between sites of one surface; NaN where nothing is known.
     pub fn depth_at(&self, place: [f64; 2]) -> f64 {
         self.depth_from(place.map(|v| v.floor() as i64), place)
