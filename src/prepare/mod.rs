@@ -9,6 +9,7 @@ pub mod lens;
 mod made;
 pub mod masks;
 mod min_cut;
+mod misplaced;
 pub mod network;
 mod object;
 pub mod outline;
@@ -35,6 +36,7 @@ use crate::signal::Signal;
 use crate::train::checkpoint::Fingerprint;
 
 use fit::Fit;
+use misplaced::Looks;
 use network::Inpainting;
 pub use object::Evidence;
 use object::{Given, USERS, corrected, given, no_such_view};
@@ -564,9 +566,22 @@ impl Preparation<'_> {
         let pictures: Vec<Result<_, scene::Error>> =
             others.par_iter().map(|view| scene::photograph_within(&files[&view.name], outline::SIDE)).collect();
         let pictures = pictures.into_iter().collect::<Result<Vec<_>, _>>()?;
-        let refine = |carried: &[masks::Carried]| -> Vec<GrayImage> {
+        let learnt: Vec<(image::RgbImage, &GrayImage)> = given
+            .iter()
+            .map(|(name, Given { mask, .. })| Ok((scene::photograph_within(&files[name], outline::SIDE)?, mask)))
+            .collect::<Result<_, scene::Error>>()?;
+        let looks = Looks::of(learnt.iter().map(|(picture, mask)| (picture, *mask)));
+        // Each mask, and whether it was moved.
+        let refine = |carried: &[masks::Carried]| -> Vec<(GrayImage, bool)> {
             let all = others.par_iter().zip(&pictures).zip(carried);
-            all.map(|((view, picture), carried)| outline::of(picture, &carried.object, view.camera.size)).collect()
+            let refined = all.map(|((view, picture), carried)| {
+                let size = view.camera.size;
+                let rough = masks::threshold(&carried.object, size, size, masks::OBJECT);
+                let shift = looks.as_ref().and_then(|looks| looks.shift(picture, &rough));
+                let moved = shift.map(|shift| misplaced::moved(&carried.object, size, shift));
+                (outline::of(picture, moved.as_ref().unwrap_or(&carried.object), size), moved.is_some())
+            });
+            refined.collect()
         };
         let carried = carry(&shares, splats)?;
         let thin =
@@ -579,7 +594,11 @@ impl Preparation<'_> {
             let every = scene.train.len().div_ceil(outline::VOTERS).max(1);
             for view in scene.train.iter().step_by(every) {
                 let at = others.iter().position(|other| other.name == view.name);
-                let mask = at.map_or_else(|| &given[&view.name].mask, |at| &outlines[at]);
+                let (mask, moved) =
+                    at.map_or_else(|| (&given[&view.name].mask, false), |at| (&outlines[at].0, outlines[at].1));
+                if moved {
+                    continue;
+                }
                 votes.add(splats, &view.camera, &masks::parts(mask, view.camera.size))?;
                 self.watch.go_on()?;
             }
@@ -593,7 +612,7 @@ impl Preparation<'_> {
             }
             shown += usize::from(mask.as_raw().iter().any(|v| *v != 0));
         }
-        for (view, mask) in others.iter().zip(&outlines) {
+        for (view, (mask, _)) in others.iter().zip(&outlines) {
             let size = picture_size(&files[&view.name])?;
             let small = [mask.width(), mask.height()];
             let mask = masks::threshold(&masks::parts(mask, small), small, size, 0.5);
@@ -616,6 +635,15 @@ impl Preparation<'_> {
                  {:.0} % of the object there were not seen",
                 weak.len(),
                 100.0 * part
+            ));
+        }
+        let moved = others.iter().zip(&outlines).filter(|(_, (_, moved))| *moved);
+        let moved: Vec<&str> = moved.map(|(view, _)| view.name.as_str()).collect();
+        if !moved.is_empty() {
+            batch.notes.push(format!(
+                "the object is not where the cameras of these photographs have it, and their masks are moved onto it: {}; \
+                 train --set 'scene.leave_out={moved:?}' leaves them out",
+                abridged(&moved)
             ));
         }
         batch.figures.insert("views with the object".into(), shown as f64);

@@ -1,4 +1,4 @@
-//! Masks that end before the object does are completed by what all views know of it.
+//! What all views know of the object: masks that end before it does are completed, and views that have it elsewhere are found.
 
 use glam::DVec3;
 use image::GrayImage;
@@ -17,6 +17,12 @@ const LIKE_ITSELF: u32 = 12;
 /// Points of the object that must fall into a site for it to be the object's.
 const FEWEST_POINTS: u32 = 2;
 
+/// Sites of a mask, and of the object in a picture, from which on they are compared; the share of each that must be of the other one.
+const FEWEST_SITES: usize = 30;
+const OVERLAP: f64 = 0.8;
+/// Of so many views one may have the object elsewhere.
+const MOST_ASTRAY: usize = 4;
+
 /// The sites of which this is said that hang together with what is inside.
 fn beside(grid: &DepthGrid, inside: &[bool], of: impl Fn(usize) -> bool) -> Vec<usize> {
     let mut found = vec![false; inside.len()];
@@ -32,28 +38,70 @@ fn beside(grid: &DepthGrid, inside: &[bool], of: impl Fn(usize) -> bool) -> Vec<
     (0..found.len()).filter(|site| found[*site]).collect()
 }
 
-/// Adds to the masks (as large as the pictures of these cameras) where points of the object fall that most other masks cover:
-/// a mask that stops short of the object is completed by what all views know of it. Returns the views whose masks grew.
-pub fn complete(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage]) -> Vec<usize> {
-    let sites = |grid: &DepthGrid| 0..grid.depth.len();
-    let inside = inside(grids, cameras, masks);
-    let on_object = |point: DVec3| {
-        let (framed, covered) = framing(grids.iter(), &inside, point);
-        framed >= HULL_VIEWS && covered as f64 >= SHARED * framed as f64
-    };
-    let points: Vec<(DVec3, [u8; 3])> = (grids.par_iter().zip(&inside))
-        .flat_map_iter(|(grid, inside)| {
+/// Points of the object, with what they look like: those deep inside a mask that most of the masks cover.
+pub struct Object(Vec<(DVec3, [u8; 3])>);
+
+impl Object {
+    /// By what is `inside` the masks of the views.
+    fn new(grids: &[DepthGrid], inside: &[Vec<bool>]) -> Self {
+        let on_object = |point: DVec3| {
+            let (framed, covered) = framing(grids.iter(), inside, point);
+            framed >= HULL_VIEWS && covered as f64 >= SHARED * framed as f64
+        };
+        let points = grids.par_iter().zip(inside).flat_map_iter(|(grid, inside)| {
             let deep = |site: usize| {
                 // Beyond the picture nothing is.
                 grid.around(site, WITHIN).filter(|near| inside[*near]).count() == (2 * WITHIN as usize + 1).pow(2)
             };
-            let known = sites(grid).filter(|site| inside[*site] && grid.confirmed[*site]).filter(|site| deep(*site));
+            let known = (0..grid.depth.len()).filter(|site| inside[*site] && grid.confirmed[*site]);
             known
+                .filter(|site| deep(*site))
                 .filter_map(|site| Some((grid.point(site)?, grid.colors[site])))
                 .filter(|(point, _)| on_object(*point))
                 .collect::<Vec<_>>()
-        })
-        .collect();
+        });
+        Self(points.collect())
+    }
+
+    /// How much of what is `inside` the mask of a view is the object, and how much of the object in its picture is inside; nothing where little
+    /// of it is in the picture.
+    fn overlap(&self, grid: &DepthGrid, inside: &[bool]) -> Option<[f64; 2]> {
+        let mut hit = vec![false; inside.len()];
+        for (point, _) in &self.0 {
+            if let Some((site, ..)) = grid.see(*point) {
+                hit[site] = true;
+            }
+        }
+        // Points are sparse.
+        let near = |site: usize| grid.around(site, WITHIN).any(|at| hit[at]);
+        let share = |of: &dyn Fn(usize) -> bool, also: &dyn Fn(usize) -> bool| {
+            let all = (0..inside.len()).filter(|site| of(*site));
+            let (both, count) = all.fold((0, 0), |(both, n), site| (both + usize::from(also(site)), n + 1));
+            (count >= FEWEST_SITES).then(|| both as f64 / count as f64)
+        };
+        Some([share(&|site| inside[site], &near)?, share(&|site| hit[site], &|site| inside[site])?])
+    }
+}
+
+/// The views in which the object is not where its mask is: of wrong cameras, or with the mask of something else. Where something hides
+/// a part of the object only that is outside the mask, and none of the mask is beside the object.
+pub fn astray(grids: &[DepthGrid], cameras: &[Camera], masks: &[GrayImage]) -> Vec<usize> {
+    let inside = inside(grids, cameras, masks);
+    let object = Object::new(grids, &inside);
+    let is_astray = |view: usize| {
+        let overlap = object.overlap(&grids[view], &inside[view]);
+        overlap.is_some_and(|shares| shares.iter().all(|share| *share < OVERLAP))
+    };
+    let found: Vec<usize> = (0..grids.len()).into_par_iter().filter(|view| is_astray(*view)).collect();
+    // What many views contradict is not known.
+    if found.len() <= grids.len() / MOST_ASTRAY { found } else { vec![] }
+}
+
+/// Adds to the masks (as large as the pictures of these cameras) where points of the object fall that most other masks cover:
+/// a mask that stops short of the object is completed by what all views know of it. Returns the views whose masks grew.
+pub fn complete(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage]) -> Vec<usize> {
+    let inside = inside(grids, cameras, masks);
+    let Object(points) = Object::new(grids, &inside);
     let added: Vec<Vec<usize>> = (grids.par_iter().zip(&inside))
         .map(|(grid, inside)| {
             // Points of the object that fall into a site, and those that it looks like.
@@ -114,6 +162,25 @@ mod tests {
         // Its rim is left, where no point of the object is deep enough in the others' masks.
         assert!(left.count() * 2 < missing, "of {missing}");
         assert!(masks.iter().zip(&whole).enumerate().all(|(view, (now, whole))| view == 3 || now == whole));
+    }
+
+    /// A mask beside the object is of a wrong camera; one that ends too early is none, and two of five are too many.
+    #[test]
+    fn a_mask_beside_the_object_is_astray() {
+        let (grids, cameras, whole) = views(0.6);
+        let beside = |mask: &GrayImage| {
+            let (w, h) = mask.dimensions();
+            GrayImage::from_fn(w, h, |x, y| *mask.get_pixel((x + w - 12) % w, y))
+        };
+        let mut masks = whole.clone();
+        assert_eq!(astray(&grids, &cameras, &masks), [0usize; 0]);
+        masks[3] = beside(&whole[3]);
+        assert_eq!(astray(&grids, &cameras, &masks), [3]);
+        masks[1] = beside(&whole[1]);
+        assert_eq!(astray(&grids, &cameras, &masks), [0usize; 0]);
+        masks = whole;
+        masks[3].enumerate_pixels_mut().filter(|(x, ..)| *x < 18).for_each(|(.., pixel)| pixel.0 = [0]);
+        assert_eq!(astray(&grids, &cameras, &masks), [0usize; 0]);
     }
 
     /// Where the object is hidden by something of another colour, whose depth nobody knows, its mask is complete.

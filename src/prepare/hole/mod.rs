@@ -3,7 +3,7 @@
 //! - `front`: what stands before the object stays.
 //! - `flat`: what is bare lies on the planes around it.
 //! - `residue`: what is left of a shadow that was taken out goes with the object.
-//! - `complete`: masks that end before the object does grow.
+//! - `complete`: masks that end before the object does grow, and views that have it elsewhere are not asked.
 //! - `surface`: the depth of what is behind the object, in all views, by what they know of a point (`witness`).
 //! - `color`: what photographs show of it, and what views that were filled before show of it (`relief`).
 //! - `guess`: what nobody shows is filled with pieces of the same surface, seen straight on (`texture`), lines that
@@ -59,7 +59,8 @@ const AT_ONCE: usize = 16;
 /// Name of the way in which holes are filled: a scene that was filled in another way is filled anew.
 pub const METHOD: &str = "one surface with smooth ends, nothing where others look through it, no colour from a rim that looks like nothing near it, \
      lights joined, doubts left to training, nothing stands on what only crosses the floor, lines go on through holes, a foot is all that is unseen around it, \
-     what is nearly one plane is one, copies nearly keep their hue, ends are where the first view has them";
+     what is nearly one plane is one, copies nearly keep their hue, ends are where the first view has them, \
+     nothing from views with the object elsewhere";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 
@@ -116,10 +117,18 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
     let cameras: Vec<Camera> = task.fine.train.iter().map(|view| view.camera).collect();
     let mut masks: Vec<GrayImage> =
         task.masks.par_iter().zip(&cameras).map(|(mask, camera)| resample::mask(mask, camera.size)).collect();
-    let grids = task.matched.depths(&super::masked(task.scene, task.masks));
+    let mut grids = task.matched.depths(&super::masked(task.scene, task.masks));
     watch.turn(n)?;
     log::debug!("hole: depth is measured");
     let mut batch = Batch::default();
+    for view in complete::astray(&grids, &cameras, &masks) {
+        grids[view].trusted = false;
+        batch.notes.push(format!(
+            "{}: the object is not where this photograph's camera and mask have it, by what the others show of it; no hole is filled from \
+             this photograph",
+            task.scene.train[view].name
+        ));
+    }
     let grown = complete::complete(&grids, &cameras, &mut masks);
     if let Some(first) = grown.first() {
         batch.notes.push(format!(
