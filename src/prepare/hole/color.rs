@@ -39,6 +39,8 @@ const NEAR_RIM: f64 = 0.25;
 const THROUGH: usize = 2;
 /// Share of a hole that is doubtful from which on all that is guessed in it is.
 const DISTRUST: f64 = 0.25;
+/// How far from a site what shows behind it may be known, sites.
+const BEHIND: i64 = 5;
 /// Share of a pixel's sites that must have a source for it to be seen.
 const ENOUGH: f32 = 0.5;
 
@@ -62,6 +64,8 @@ pub struct Filling {
     pub seen: Vec<bool>,
     /// `[pixel]` whether its depth is likely wrong, and with it what is shown: photographs disagree about it, or look through it.
     pub doubtful: Vec<bool>,
+    /// `[pixel]` the surface that shows instead of the one that the view's site has, where another view looks through that.
+    pub behind: Vec<Option<u8>>,
 }
 
 /// Bilinear, 0 to 1; nothing within half a pixel of the border and outside.
@@ -341,9 +345,12 @@ pub fn repaint(
 ) {
     let (own, sight) = (&photographs[of], &sights.0[of]);
     let size @ [w, h] = own.camera.size.map(|n| n as usize);
-    // Beside what was made another view shows what photographs show, which have been asked.
     let ranges: Vec<Option<[f64; 2]>> = filled.iter().map(|(_, filled)| filled.relief.range(sight)).collect();
     let eye = DVec3::from(own.camera.center());
+    // What another view looks through is not there.
+    let through =
+        |point: DVec3| filled.iter().any(|(view, filled)| filled.relief.sees_through(&sights.0[*view], point));
+    // Beside what was made another view shows what photographs show, which have been asked.
     let repainted = |i: usize, beside: bool| -> Option<[f32; 3]> {
         let way = DVec3::from(own.camera.along(own.camera.unproject(own.camera.pixel_center(i))?, 1.0)) - eye;
         let near = shown(own, sight, i).map(|(_, point)| point);
@@ -351,7 +358,7 @@ pub fn repaint(
             let (other, there) = (&photographs[*view], &sights.0[*view]);
             // Its surfaces end where they end there.
             let met = || Some(eye + way / relief.meets(there, eye, way, (*range)?)?);
-            let point = near.filter(|point| there.agrees(*point, SAME).is_some()).or_else(met)?;
+            let point = near.filter(|point| there.has(*point, SAME)).or_else(met)?;
             let pixel = other.camera.project(point.to_array())?;
             let width = other.camera.size[0] as usize;
             let [x, y] = pixel.map(|v| v.max(0.0) as usize);
@@ -379,11 +386,30 @@ pub fn repaint(
         equation
     };
     let equations: Vec<Equation> = inside.par_iter().map(|i| equation(*i)).collect();
+    filling.behind = (0..w * h)
+        .into_par_iter()
+        .map(|i| if filling.guessed[i] && told[i].is_none() { behind(own, sight, through, i) } else { None })
+        .collect();
     for i in inside {
         filling.rgb[i] = told[i].unwrap_or(filling.rgb[i]);
         filling.guessed[i] = false;
     }
     gradient::solve(&mut filling.rgb, w, &equations);
+}
+
+/// The surface that a pixel shows where other views look through the point that its site has: of those near it that lie farther, and that
+/// nobody looks through, the one that most sites have.
+fn behind(own: &Photograph<'_>, sight: &Sight, through: impl Fn(DVec3) -> bool, i: usize) -> Option<u8> {
+    let ray = own.camera.unproject(own.camera.pixel_center(i))?;
+    let (_, point) = shown(own, sight, i).filter(|(_, point)| through(*point))?;
+    let (site, _, z) = sight.seen(point)?;
+    let mut counts = vec![0u32; sight.planes.len() + 1];
+    sight.grid.around(site, BEHIND).for_each(|site| counts[usize::from(sight.surface[site])] += 1);
+    let is_there =
+        |d: f64| d > 0.0 && d * z * (1.0 + SAME) <= 1.0 && !through(DVec3::from(own.camera.along(ray, 1.0 / d)));
+    let farther = sight.planes.iter().enumerate();
+    let farther = farther.filter(|(label, plane)| counts[*label] > 0 && is_there(planes::on(plane, ray)));
+    farther.max_by_key(|(label, _)| counts[*label]).map(|(label, _)| label as u8)
 }
 
 /// Whether two colours of one place differ in brightness alone.
@@ -426,6 +452,7 @@ pub fn gather(sights: &Sights, photographs: &[Photograph<'_>], of: usize) -> Fil
         guessed: own.hole.as_raw().iter().map(|v| *v != 0).collect(),
         seen: vec![false; w * h],
         doubtful: vec![false; w * h],
+        behind: vec![None; w * h],
     };
     for i in (0..w * h).filter(|i| hole(*i)) {
         let site = shown(own, sight, i).and_then(|([x, y], _)| sight.grid.site(x.floor() as i64, y.floor() as i64));
@@ -503,6 +530,44 @@ const OF_ANOTHER_HUE: f32 = 0.035;
 mod tests {
     use super::*;
 
+    /// The middle view has a board at z = 3, left of its middle, before the wall, and it was filled. The fifth has the board three
+    /// pixels too far: the first two of these show wall that nobody has seen, and the third wall that the middle view has.
+    #[test]
+    fn what_another_view_looks_through_is_not_there() {
+        use super::super::surface::tests::{SIZE, views};
+        let (grids, cameras, masks) = views(0.6);
+        let mut sights = Sights::new(grids, &cameras, &masks, &masks);
+        for (view, end) in [(2, 24), (4, 19)] {
+            let sight = &mut sights.0[view];
+            sight.planes = vec![[0.0, 0.0, 1.0 / 3.0], [0.0, 0.0, 0.25]];
+            for site in (0..sight.hole.len()).filter(|site| sight.hole[*site]) {
+                let is_board = site % (SIZE[0] as usize) < end;
+                (sight.depth[site], sight.surface[site]) = if is_board { (3.0, 0) } else { (4.0, 1) };
+            }
+        }
+        let picture = RgbImage::new(SIZE[0], SIZE[1]);
+        let photographs: Vec<Photograph<'_>> = (cameras.iter().zip(masks))
+            .map(|(camera, hole)| Photograph { camera: *camera, picture: &picture, hole })
+            .collect();
+        let pixels = (SIZE[0] * SIZE[1]) as usize;
+        let hole = |view: usize| photographs[view].hole.as_raw().iter().map(|v| *v != 0).collect::<Vec<bool>>();
+        let filled = [(2, Filled::new(&sights.0[2], vec![[0.5; 3]; pixels], hole(2)))];
+        let mut filling = Filling {
+            rgb: vec![[0.0; 3]; pixels],
+            guessed: hole(4),
+            seen: vec![false; pixels],
+            doubtful: vec![false; pixels],
+            behind: vec![None; pixels],
+        };
+        repaint(&sights, &photographs, &filled, 4, &mut filling);
+        for y in 12..20 {
+            let row: Vec<(bool, Option<u8>)> =
+                (10..22).map(|x| y * SIZE[0] as usize + x).map(|i| (filling.guessed[i], filling.behind[i])).collect();
+            let told = [(false, None)];
+            assert_eq!(row, [&told.repeat(6)[..], &[(true, Some(1)); 2], &told.repeat(4)].concat(), "{y}");
+        }
+    }
+
     /// A view that made nothing tells nothing, though it comes first; from the one that made the hole the pattern of the wall
     /// goes on.
     #[test]
@@ -528,8 +593,13 @@ mod tests {
         let colors = |view: usize| (0..pixels).map(|i| pattern(&cameras[view], i)).collect::<Vec<_>>();
         let blank = Filled::new(&sights.0[0], vec![[0.9, 0.1, 0.1]; pixels], vec![false; pixels]);
         let filled = [(0, blank), (2, Filled::new(&sights.0[2], colors(2), hole(2)))];
-        let mut filling =
-            Filling { rgb: colors(1), guessed: hole(1), seen: vec![false; pixels], doubtful: vec![false; pixels] };
+        let mut filling = Filling {
+            rgb: colors(1),
+            guessed: hole(1),
+            seen: vec![false; pixels],
+            doubtful: vec![false; pixels],
+            behind: vec![None; pixels],
+        };
         let inside: Vec<usize> = (0..pixels).filter(|i| filling.guessed[*i]).collect();
         inside.iter().for_each(|i| filling.rgb[*i] = [0.0; 3]);
         repaint(&sights, &photographs, &filled, 1, &mut filling);

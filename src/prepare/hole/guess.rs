@@ -106,7 +106,8 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
     // What is thin between known pixels needs no texture, and would draw the chart out to wherever it is.
     let thick = thick(&filling.guessed, own.camera.size);
     let ray = |i: usize| own.camera.unproject([(i % w) as f64 + 0.5, (i / w) as f64 + 0.5]);
-    let surface = |i: usize| ray(i).map(|ray| sight.surface_at(sight.grid.place(ray)));
+    let behind = std::mem::take(&mut filling.behind);
+    let surface = |i: usize| behind[i].or_else(|| ray(i).map(|ray| sight.surface_at(sight.grid.place(ray))));
     let surfaces: Vec<(usize, u8)> = guessed.par_iter().filter_map(|i| Some((*i, surface(*i)?))).collect();
     let focal = f64::from(own.camera.focal[0].max(own.camera.focal[1]));
     for (number, plane) in sight.planes.iter().enumerate() {
@@ -127,7 +128,7 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
         while let Some(part) = parts(&left, [w, h]).into_iter().max_by_key(Vec::len) {
             let rays: Vec<[f64; 2]> = part.iter().filter(|i| thick[**i]).filter_map(|i| ray(*i)).collect();
             if let Some(chart) = Chart::new(*plane, &rays, focal, AROUND) {
-                let mut texture = charted(sights, photographs, of, filling, &chart, &its);
+                let mut texture = charted(sights, photographs, of, filling, &behind, &chart, &its);
                 let wanted = texture.hole.clone();
                 let filled = texture::fill(&mut texture);
                 for i in left.iter().filter(|_| filled) {
@@ -206,6 +207,7 @@ fn charted(
     photographs: &[Photograph<'_>],
     of: usize,
     filling: &Filling,
+    behind: &[Option<u8>],
     chart: &Chart,
     its: &(dyn Fn(u8) -> Option<f64> + Sync),
 ) -> Texture {
@@ -232,7 +234,7 @@ fn charted(
             let inside = x >= 0.0 && y >= 0.0 && (x as usize) < size[0] && (y as usize) < size[1];
             let pixel = if inside { y as usize * w + x as usize } else { 0 };
             if inside && filling.guessed[pixel] {
-                let is_its = its(sight.surface_at(sight.grid.place(ray)));
+                let is_its = its(behind[pixel].unwrap_or_else(|| sight.surface_at(sight.grid.place(ray))));
                 return if is_its.is_some() { Texel::Hole } else { Texel::Nothing };
             }
             if inside {
@@ -357,7 +359,7 @@ mod tests {
         let plane = sights.0[2].planes[0];
         let rays: Vec<[f64; 2]> = (0..sights.0[2].hole.len()).map(|site| sights.0[2].ray(site)).collect();
         let chart = Chart::new(plane, &rays, 40.0, 0.0).expect("a plane before the camera");
-        let texture = charted(&sights, &photographs, 2, &filling, &chart, &|_| Some(SAME));
+        let texture = charted(&sights, &photographs, 2, &filling, &filling.behind, &chart, &|_| Some(SAME));
         let known = |site: &usize| {
             let [x, y] = chart.pixel(sights.0[2].ray(*site)).expect("it is on the plane").map(|v| v as usize);
             texture.source[y * texture.size[0] + x] || texture.hole[y * texture.size[0] + x]

@@ -60,7 +60,7 @@ const AT_ONCE: usize = 16;
 pub const METHOD: &str = "one surface with smooth ends, nothing where others look through it, no colour from a rim that looks like nothing near it, \
      lights joined, doubts left to training, nothing stands on what only crosses the floor, lines go on through holes, a foot is all that is unseen around it, \
      what is nearly one plane is one, copies nearly keep their hue, ends are where the first view has them, \
-     nothing from views with the object elsewhere";
+     nothing from views with the object elsewhere, and nothing stands where the first view looks through";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 

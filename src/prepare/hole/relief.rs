@@ -3,10 +3,12 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::surface::{SAME, Sight};
+use super::surface::{APART, SAME, Sight};
 
 /// Cells of a relief along a side of a site.
 const CELLS: usize = 4;
+/// Steps along a ray at most, as a multiple of the cells along both sides.
+const LONGEST: usize = 4;
 
 /// What a view has behind its object, ends between its sites included.
 pub struct Relief {
@@ -57,8 +59,10 @@ impl Relief {
         // A little more on both sides, for the surface to be between two steps.
         let (low, high) = (low * (1.0 - SAME), high * (1.0 + SAME));
         let [from, to] = [place(low)?.0, place(high)?.0];
-        let cells = (from[0] - to[0]).abs().max((from[1] - to[1]).abs()).ceil().max(2.0);
         let rows = self.inverse.len() / self.columns;
+        // A ray that nearly meets this view's centre has no end in its picture.
+        let most = (LONGEST * (self.columns + rows)) as f64;
+        let cells = (from[0] - to[0]).abs().max((from[1] - to[1]).abs()).ceil().clamp(2.0, most);
         // How much nearer than the surface the last point was, the surface's inverse depth there, and the point's.
         let mut before: Option<(f64, f64, f64)> = None;
         for step in 0..=cells as usize {
@@ -81,6 +85,15 @@ impl Relief {
             before = Some((nearer, there, d));
         }
         None
+    }
+
+    /// Whether the view sees farther than a world point: nothing is there.
+    pub fn sees_through(&self, sight: &Sight, point: DVec3) -> bool {
+        let Some((site, [x, y], z)) = sight.seen(point) else { return false };
+        let [x, y] = [x, y].map(|v| (v * CELLS as f64) as usize);
+        let there =
+            if sight.hole[site] { 1.0 / f64::from(self.inverse[y * self.columns + x]) } else { sight.depth[site] };
+        there > z * (1.0 + APART)
     }
 }
 

@@ -287,6 +287,11 @@ impl Sight {
         ((self.depth_at(place) / z - 1.0).abs() <= part).then_some(site)
     }
 
+    /// As [`Sight::agrees`], by surfaces that end in smooth lines.
+    pub fn has(&self, point: DVec3, part: f64) -> bool {
+        self.seen(point).is_some_and(|(_, place, z)| (self.smooth_depth_at(place) / z - 1.0).abs() <= part)
+    }
+
     /// As [`Sight::agrees`], where the photograph shows it: beside the object.
     pub fn shows(&self, point: DVec3, part: f64) -> Option<usize> {
         self.agrees(point, part).filter(|site| !self.hole[*site])
