@@ -571,40 +571,35 @@ impl Preparation<'_> {
             .map(|(name, Given { mask, .. })| Ok((scene::photograph_within(&files[name], outline::SIDE)?, mask)))
             .collect::<Result<_, scene::Error>>()?;
         let looks = Looks::of(learnt.iter().map(|(picture, mask)| (picture, *mask)));
-        // Each mask, and whether it was moved.
-        let refine = |carried: &[masks::Carried]| -> Vec<(GrayImage, bool)> {
-            let all = others.par_iter().zip(&pictures).zip(carried);
-            let refined = all.map(|((view, picture), carried)| {
-                let size = view.camera.size;
-                let rough = masks::threshold(&carried.object, size, size, masks::OBJECT);
-                let shift = looks.as_ref().and_then(|looks| looks.shift(picture, &rough));
-                let moved = shift.map(|shift| misplaced::moved(&carried.object, size, shift));
-                (outline::of(picture, moved.as_ref().unwrap_or(&carried.object), size), moved.is_some())
-            });
-            refined.collect()
+        // A view's mask, and whether it was moved.
+        let refine = |carried: &masks::Carried, at: usize| -> (GrayImage, bool) {
+            let (size, picture) = (others[at].camera.size, &pictures[at]);
+            let rough = masks::threshold(&carried.object, size, size, masks::OBJECT);
+            let shift = looks.as_ref().and_then(|looks| looks.shift(picture, &rough));
+            let moved = shift.map(|shift| misplaced::moved(&carried.object, size, shift));
+            (outline::of(picture, moved.as_ref().unwrap_or(&carried.object), size), moved.is_some())
         };
-        let carried = carry(&shares, splats)?;
+        let mut carried = carry(&shares, splats)?;
         let thin =
             others.iter().zip(&carried).filter_map(|(view, carried)| Some((carried.thinness()?, view.name.as_str())));
         let mut thin: Vec<(f64, &str)> = thin.collect();
-        let mut outlines = refine(&carried);
-        // What the first views miss of the object's other sides the masks of all views have between them.
+        // What the first views miss of the object's other sides the masks of more views have between them.
+        let every = others.len().div_ceil(outline::VOTERS).max(1);
         for _ in 0..outline::ROUNDS {
+            let voters = (0..others.len()).into_par_iter().step_by(every);
+            let outlines: Vec<_> = voters.map(|at| (others[at], refine(&carried[at], at))).collect();
+            let given = scene.train.iter().filter_map(|view| Some((view, &given.get(&view.name)?.mask)));
+            let found = outlines.iter().filter(|(_, (_, moved))| !moved).map(|(view, (mask, _))| (*view, mask));
             let mut votes = masks::Votes::new(splats);
-            let every = scene.train.len().div_ceil(outline::VOTERS).max(1);
-            for view in scene.train.iter().step_by(every) {
-                let at = others.iter().position(|other| other.name == view.name);
-                let (mask, moved) =
-                    at.map_or_else(|| (&given[&view.name].mask, false), |at| (&outlines[at].0, outlines[at].1));
-                if moved {
-                    continue;
-                }
+            for (view, mask) in given.chain(found) {
                 votes.add(splats, &view.camera, &masks::parts(mask, view.camera.size))?;
                 self.watch.go_on()?;
             }
             shares = votes.count(fit.positions(), &colors);
-            outlines = refine(&carry(&shares, splats)?);
+            carried = carry(&shares, splats)?;
         }
+        let outlines: Vec<(GrayImage, bool)> =
+            (0..others.len()).into_par_iter().map(|at| refine(&carried[at], at)).collect();
         let mut shown = 0;
         for (name, Given { mask, from }) in given {
             if from != USERS {

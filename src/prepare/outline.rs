@@ -12,7 +12,7 @@ use super::masks;
 use crate::scene::resample;
 
 /// Name of the way in which masks are carried: those that were carried in another way are carried anew.
-pub const METHOD: &str = "all views vote on what shows in them, without what the given masks rule out, moved to where its colours are, \
+pub const METHOD: &str = "given masks and those of other views vote on what shows in them, without what the given masks rule out, moved to where its colours are, \
      refined by the photographs";
 /// Half the width of the band, as a part of the longer side of the object's box.
 const BAND: f64 = 0.10;
@@ -31,7 +31,7 @@ const SMOOTHNESS: f64 = 20.0;
 pub const SIDE: u32 = 768;
 /// Rounds in which the masks of all views vote again.
 pub const ROUNDS: usize = 1;
-/// Views that vote; of more, every so many.
+/// Views without a given mask that vote beside those with one; of more, every so many.
 pub const VOTERS: usize = 24;
 /// Pieces of a carried mask that are smaller than this share of its largest piece are taken away.
 const SPECK: f64 = 0.02;
