@@ -89,7 +89,7 @@ impl Looks {
         likelier.iter().all(|v| v.is_finite()).then_some(Self { likelier })
     }
 
-    /// By what parts of the picture's width and height a mask of any size is to be moved to lie on the object; nothing where it does, and
+    /// The parts of the picture's width and height by which a mask of any size is to be moved to lie on the object; nothing where it does, and
     /// where colours do not tell.
     pub fn shift(&self, picture: &RgbImage, mask: &GrayImage) -> Option<[f64; 2]> {
         let size @ [w, h] = reduced(picture.dimensions().into());

@@ -322,7 +322,7 @@ pub struct Filled {
     /// `[pixel]` whether its colour was made for this view and serves others: nothing has told it, neither a photograph nor
     /// another view.
     pub made: Vec<bool>,
-    /// Its surface.
+    /// The view's surface, for the rays of others.
     relief: Relief,
 }
 

@@ -1,4 +1,4 @@
-//! What all views know of the object: masks that end before it does are completed, and views that have it elsewhere are found.
+//! The object as all views know it: masks that end before it does are completed, and views that have it elsewhere are found.
 
 use glam::DVec3;
 use image::GrayImage;
@@ -20,7 +20,7 @@ const FEWEST_POINTS: u32 = 2;
 /// Sites of a mask, and of the object in a picture, from which on they are compared; the share of each that must be of the other one.
 const FEWEST_SITES: usize = 30;
 const OVERLAP: f64 = 0.8;
-/// Of so many views one may have the object elsewhere.
+/// One of so many views may have the object elsewhere.
 const MOST_ASTRAY: usize = 4;
 
 /// The sites of which this is said that hang together with what is inside.

@@ -10,7 +10,7 @@ const CELLS: usize = 4;
 /// Steps along a ray at most, as a multiple of the cells along both sides.
 const LONGEST: usize = 4;
 
-/// What a view has behind its object, ends between its sites included.
+/// A view's surface behind its object, with ends between its sites.
 pub struct Relief {
     /// Columns of cells.
     columns: usize,
@@ -21,7 +21,7 @@ pub struct Relief {
 }
 
 impl Relief {
-    /// Of a view that is solved.
+    /// The relief of a view that is solved.
     pub fn new(sight: &Sight) -> Self {
         let columns = sight.grid.columns as usize * CELLS;
         let inverse = |cell: usize| {
