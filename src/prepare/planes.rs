@@ -57,6 +57,8 @@ pub struct Hole<'a, F> {
     pub costs: &'a [Option<Vec<f64>>],
     /// `[pixel]` whether it lies along the object's outline.
     pub outline: &'a [bool],
+    /// Whether photographs tell what is in the hole.
+    pub told: bool,
     /// What speaks against a surface of this inverse depth at the pixel (its number): from 0, nothing, to 1, it cannot be.
     pub against: F,
 }
@@ -159,7 +161,7 @@ fn labels<F: Fn(usize, f64) -> f64 + Sync>(hole: &Hole<'_, F>, planes: &[Plane])
             // What speaks against all planes alike speaks against what is between them, too.
             let likely = against.iter().copied().filter(|against| *against < 0.5).reduce(f64::min);
             let of = |(surface, against): (f64, f64)| IMPOSSIBLE * if surface <= 0.0 { 1.0 } else { against };
-            let of_rest = UNKNOWN_REST[usize::from(hole.costs.is_empty())] + IMPOSSIBLE * likely.unwrap_or(0.0);
+            let of_rest = UNKNOWN_REST[usize::from(!hole.told)] + IMPOSSIBLE * likely.unwrap_or(0.0);
             return surfaces.zip(against).map(of).chain([of_rest]).collect();
         }
         let d = f64::from(hole.disparity[i]);
@@ -416,6 +418,7 @@ mod tests {
             unknown,
             costs: &[],
             outline: &outline,
+            told: false,
             against: |_, _| 0.0,
         };
         surfaces(&hole, around(seen, &rays, unknown, 5))
@@ -484,6 +487,7 @@ mod tests {
             unknown: &unknown,
             costs: &[],
             outline: &outline,
+            told: false,
             against,
         };
         let found = surfaces(&hole, around(hole.disparity, hole.rays, hole.unknown, 5));
@@ -511,6 +515,7 @@ mod tests {
             unknown: &unknown,
             costs: &[],
             outline: &outline,
+            told: false,
             against: |_, _| 0.0,
         };
         let found = surfaces(&hole, around(hole.disparity, hole.rays, hole.unknown, 5));
@@ -531,6 +536,7 @@ mod tests {
             unknown: &unknown,
             costs: &[],
             outline: &outline,
+            told: false,
             against: |_, _| 0.0,
         };
         let found = surfaces(&hole, around(hole.disparity, hole.rays, hole.unknown, 0));

@@ -9,6 +9,7 @@ use rand::RngExt;
 use rand_pcg::Pcg64;
 use rayon::prelude::*;
 
+use super::covered::Covered;
 use super::surface::{SAME, Sight, Sights};
 use super::window::Window;
 use crate::prepare::planes::{self, Plane, neighbours};
@@ -57,7 +58,7 @@ const COMMON: f64 = 0.5;
 
 /// A plane `normal . x = offset` of world points.
 #[derive(Clone, Copy, Debug)]
-struct Common {
+pub(super) struct Common {
     normal: DVec3,
     offset: f64,
 }
@@ -71,7 +72,7 @@ struct Flat {
 
 /// A point that a camera at `eye` sees.
 #[derive(Clone, Copy)]
-struct Measured {
+pub(super) struct Measured {
     point: DVec3,
     eye: DVec3,
 }
@@ -107,7 +108,7 @@ impl Common {
     }
 
     /// As a view sees it; nothing where its camera stands in it.
-    fn seen_by(&self, sight: &Sight) -> Option<Plane> {
+    pub(super) fn seen_by(&self, sight: &Sight) -> Option<Plane> {
         let camera = &sight.grid.camera;
         let distance = self.offset - self.normal.dot(DVec3::from(camera.center()));
         let turned = camera.rotation.map(|row| DVec3::from(row.map(f64::from)).dot(self.normal) / distance);
@@ -115,52 +116,67 @@ impl Common {
     }
 }
 
+/// The largest planes of so many of these points at least, the largest first.
+pub(super) fn largest(mut points: Vec<Measured>, least: usize, rng: &mut Pcg64) -> Vec<Common> {
+    let least = least.max(12);
+    let mut found = vec![];
+    while found.len() < PLANES && points.len() >= least {
+        let tried: Vec<Common> = (0..TRIES)
+            .filter_map(|_| {
+                // Two of one view, so that the three are near each other more often.
+                Common::through(std::array::from_fn(|_| points[rng.random_range(0..points.len())].point))
+            })
+            .collect();
+        let count = |plane: &Common| points.iter().filter(|at| plane.off(at).abs() <= THICKNESS).count();
+        let Some((_, mut plane)) = (tried.par_iter().enumerate())
+            .map(|(i, plane)| ((count(plane), std::cmp::Reverse(i)), *plane))
+            .max_by_key(|(count, _)| *count)
+        else {
+            break;
+        };
+        for _ in 0..4 {
+            let inliers: Vec<Measured> = points.iter().filter(|at| plane.off(at).abs() <= THICKNESS).copied().collect();
+            if inliers.len() >= 3 {
+                plane = plane.fitted(&inliers);
+            }
+        }
+        let on_it = points.iter().filter(|at| plane.off(at).abs() <= THICKNESS).count();
+        points.retain(|at| plane.off(at).abs() > 3.0 * THICKNESS);
+        if on_it < least {
+            break;
+        }
+        found.push(plane);
+    }
+    found
+}
+
 impl Sights {
     /// The largest planes of what all views together show around their holes.
     fn common(&self, seed: u64) -> Vec<Common> {
-        let mut points: Vec<Measured> = (self.0.par_iter())
-            .flat_map_iter(|sight| {
+        let points: Vec<Measured> =
+            self.around_holes().into_iter().map(|(view, site)| self.measured(view, site)).collect();
+        let least = (LEAST * points.len() as f64).ceil() as usize;
+        largest(points, least, &mut Pcg64::new(seed.into(), 43))
+    }
+
+    /// Views and sites, some of each, whose depth others confirm around their holes.
+    pub(super) fn around_holes(&self) -> Vec<(usize, usize)> {
+        let views = self.0.par_iter().enumerate().filter(|(_, sight)| sight.grid.trusted);
+        views
+            .flat_map_iter(|(view, sight)| {
                 let near = sight.surroundings();
                 let known = |site: &usize| near[*site] && sight.grid.confirmed[*site] && sight.depth[*site].is_finite();
-                let sites: Vec<usize> = (0..near.len()).filter(|site| sight.grid.trusted && known(site)).collect();
+                let sites: Vec<usize> = (0..near.len()).filter(known).collect();
                 let every = sites.len().div_ceil(POINTS).max(1);
-                let eye = sight.eye();
-                let point = |site: usize| Measured { point: sight.point(site, sight.depth[site]), eye };
-                sites.into_iter().step_by(every).map(point).collect::<Vec<_>>()
+                sites.into_iter().step_by(every).map(move |site| (view, site)).collect::<Vec<_>>()
             })
-            .collect();
-        let mut rng = Pcg64::new(seed.into(), 43);
-        let least = (LEAST * points.len() as f64).ceil().max(12.0) as usize;
-        let mut found = vec![];
-        while found.len() < PLANES && points.len() >= least {
-            let tried: Vec<Common> = (0..TRIES)
-                .filter_map(|_| {
-                    // Two of one view, so that the three are near each other more often.
-                    Common::through(std::array::from_fn(|_| points[rng.random_range(0..points.len())].point))
-                })
-                .collect();
-            let count = |plane: &Common| points.iter().filter(|at| plane.off(at).abs() <= THICKNESS).count();
-            let Some((_, mut plane)) = (tried.par_iter().enumerate())
-                .map(|(i, plane)| ((count(plane), std::cmp::Reverse(i)), *plane))
-                .max_by_key(|(count, _)| *count)
-            else {
-                break;
-            };
-            for _ in 0..4 {
-                let inliers: Vec<Measured> =
-                    points.iter().filter(|at| plane.off(at).abs() <= THICKNESS).copied().collect();
-                if inliers.len() >= 3 {
-                    plane = plane.fitted(&inliers);
-                }
-            }
-            let on_it = points.iter().filter(|at| plane.off(at).abs() <= THICKNESS).count();
-            points.retain(|at| plane.off(at).abs() > 3.0 * THICKNESS);
-            if on_it < least {
-                break;
-            }
-            found.push(plane);
-        }
-        found
+            .collect()
+    }
+
+    /// What a view measures at a site.
+    pub(super) fn measured(&self, view: usize, site: usize) -> Measured {
+        let sight = &self.0[view];
+        Measured { point: sight.point(site, sight.depth[site]), eye: sight.eye() }
     }
 
     /// Brings what is bare around the holes of all views onto the planes there. The same seed finds the same.
@@ -168,12 +184,18 @@ impl Sights {
         self.flatten_from(PARALLAX, seed);
     }
 
-    /// The same for views with at least this parallax.
+    /// The same for views with at least this parallax; others get the surfaces of one material around the holes.
     fn flatten_from(&mut self, parallax: f64, seed: u64) {
         let common = self.common(seed);
         let of = |view: usize| self.flat(view, &common, parallax, seed + view as u64);
         let flat: Vec<Flat> = (0..self.0.len()).into_par_iter().map(of).collect();
+        let untold = flat.iter().any(|flat| flat.planes.is_empty());
+        let covered = if untold { self.covered(seed) } else { vec![] };
         for (sight, Flat { planes, sites }) in self.0.iter_mut().zip(flat) {
+            if planes.is_empty() {
+                sight.covered =
+                    covered.iter().filter_map(|(plane, color)| Covered::seen_by(plane, *color, sight)).collect();
+            }
             sight.around = planes;
             sites.into_iter().for_each(|(site, depth)| sight.depth[site] = depth);
         }

@@ -9,6 +9,7 @@ use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
 use super::color::{Filling, Photograph, between};
+use super::material::{MATERIAL, of_another};
 use super::surface::{APART, SAME, Sight, Sights};
 use super::texture::{self, Texture};
 use crate::prepare::planes::{self, Plane, membrane};
@@ -106,6 +107,8 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
     // What is thin between known pixels needs no texture, and would draw the chart out to wherever it is.
     let thick = thick(&filling.guessed, own.camera.size);
     let ray = |i: usize| own.camera.unproject([(i % w) as f64 + 0.5, (i / w) as f64 + 0.5]);
+    let site = f64::from(sight.grid.stride) * f64::from(own.camera.size[0]) / f64::from(sight.grid.camera.size[0]);
+    borders(filling, [w, h], &thick, ASIDE * site);
     let behind = std::mem::take(&mut filling.behind);
     let surface = |i: usize| behind[i].or_else(|| ray(i).map(|ray| sight.surface_at(sight.grid.place(ray))));
     let surfaces: Vec<(usize, u8)> = guessed.par_iter().filter_map(|i| Some((*i, surface(*i)?))).collect();
@@ -115,15 +118,18 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
             |label: usize| surfaces.iter().filter(move |(_, l)| usize::from(*l) == label).filter_map(|(i, _)| ray(*i));
         let one: Vec<bool> =
             (0..sight.planes.len()).map(|l| l == number || nearly_one(sight, plane, rays(l))).collect();
-        let its = |label: u8| {
+        let materials: Vec<[f32; 3]> =
+            (0..one.len()).filter(|label| one[*label]).filter_map(|label| sight.material(label)).collect();
+        let off = |label: u8| {
             let other = if usize::from(label) == number { SAME } else { APART };
             one.get(usize::from(label)).is_some_and(|one| *one).then_some(other)
         };
         let mut left: Vec<usize> = surfaces
             .iter()
-            .filter(|(i, label)| filling.guessed[*i] && its(*label).is_some())
+            .filter(|(i, label)| filling.guessed[*i] && off(*label).is_some())
             .map(|(i, _)| *i)
             .collect();
+        let its = Its { off: &off, materials };
         // Around the largest part first: another may be far away on the same plane, and a chart of all would be coarse.
         while let Some(part) = parts(&left, [w, h]).into_iter().max_by_key(Vec::len) {
             let rays: Vec<[f64; 2]> = part.iter().filter(|i| thick[**i]).filter_map(|i| ray(*i)).collect();
@@ -159,6 +165,11 @@ fn nearly_one(sight: &Sight, plane: &Plane, rays: impl Iterator<Item = [f64; 2]>
 
 /// Smallest part of a hole that has a texture, as a part of the picture.
 const LEAST_PART: f64 = 5e-4;
+
+/// Smallest part that straight borders are looked for in, as a part of the picture.
+const LARGE: f64 = 2e-3;
+/// Sites to each side of such a border that it fills: which surface is where is known to within one.
+const ASIDE: f64 = 1.5;
 
 /// Splits pixels into parts that are connected by their sides; parts too small for a texture are left out.
 fn parts(of: &[usize], size @ [w, h]: [usize; 2]) -> Vec<Vec<usize>> {
@@ -200,8 +211,16 @@ fn texel(texture: &Texture, wanted: &[bool], place: [f64; 2]) -> Option<[f32; 3]
     between(at, place)
 }
 
-/// Charts a plane with what is known of it; the hole is what is to be filled there. `its` says of the view's surfaces that it has
-/// how far what lies on them may be off the plane.
+/// The surfaces of a view that lie on one plane.
+struct Its<'a> {
+    /// How far what lies on a surface may be off the plane, if it is one of these.
+    off: &'a (dyn Fn(u8) -> Option<f64> + Sync),
+    /// What they are covered with; nothing where that is not known.
+    materials: Vec<[f32; 3]>,
+}
+
+/// Charts a plane with what is known of it; the hole is what is to be filled there. `its` are the
+/// surfaces that lie on it.
 fn charted(
     sights: &Sights,
     photographs: &[Photograph<'_>],
@@ -209,8 +228,9 @@ fn charted(
     filling: &Filling,
     behind: &[Option<u8>],
     chart: &Chart,
-    its: &(dyn Fn(u8) -> Option<f64> + Sync),
+    its: &Its<'_>,
 ) -> Texture {
+    let Its { off, materials } = its;
     let (own, sight) = (&photographs[of], &sights.0[of]);
     let size @ [w, _] = own.camera.size.map(|n| n as usize);
     // The views with the most of the surroundings: those that look most alike.
@@ -234,15 +254,23 @@ fn charted(
             let inside = x >= 0.0 && y >= 0.0 && (x as usize) < size[0] && (y as usize) < size[1];
             let pixel = if inside { y as usize * w + x as usize } else { 0 };
             if inside && filling.guessed[pixel] {
-                let is_its = its(behind[pixel].unwrap_or_else(|| sight.surface_at(sight.grid.place(ray))));
+                let is_its = off(behind[pixel].unwrap_or_else(|| sight.surface_at(sight.grid.place(ray))));
                 return if is_its.is_some() { Texel::Hole } else { Texel::Nothing };
             }
             if inside {
                 let place = sight.grid.place(ray);
-                let (z, its) = (sight.depth_at(place), its(sight.surface_at(place)));
+                let (z, its) = (sight.depth_at(place), off(sight.surface_at(place)));
                 // Where the object's depth has bled nothing is known but that.
                 let on_it = if z.is_nan() { its.is_some() } else { (z / point.z - 1.0).abs() <= its.unwrap_or(SAME) };
-                if on_it {
+                // Around the hole each site has its surface, beyond it is of what it looks like.
+                let is_of = || match usize::from(sight.surface_at(place)) < sight.planes.len() {
+                    true => materials.is_empty() || its.is_some(),
+                    false => {
+                        let site = sight.grid.site(place[0].floor() as i64, place[1].floor() as i64);
+                        site.is_some_and(|site| one_of(materials, sight.color_around(site)))
+                    }
+                };
+                if on_it && is_of() {
                     // What is to be filled still shows the object.
                     let known = |x: i64, y: i64| {
                         let inside = x >= 0 && y >= 0 && (x as usize) < size[0] && (y as usize) < size[1];
@@ -253,8 +281,12 @@ fn charted(
                 }
             }
         }
-        let seen = others.iter();
-        let seen = seen.filter_map(|k| sights.0[*k].shows(world, SAME).and_then(|_| photographs[*k].color(world)));
+        let shows = |k: &usize| {
+            let sight = &sights.0[*k];
+            let site = sight.shows(world, SAME).filter(|site| one_of(materials, sight.color_around(*site)));
+            site.and_then(|_| photographs[*k].color(world))
+        };
+        let seen = others.iter().filter_map(shows);
         common(&seen.collect::<Vec<_>>()).map_or(Texel::Nothing, Texel::Known)
     };
     let texels: Vec<Texel> = (0..chart.size[0] * chart.size[1]).into_par_iter().map(one).collect();
@@ -266,6 +298,11 @@ fn charted(
     }
 }
 
+/// Whether surroundings are of one of these materials, or of any where none is known.
+fn one_of(materials: &[[f32; 3]], color: [f32; 3]) -> bool {
+    materials.is_empty() || materials.iter().any(|material| of_another(color, *material) <= MATERIAL)
+}
+
 /// The first of the colours that several photographs show of one place that most of them come near: a highlight is elsewhere in
 /// each.
 fn common(colors: &[[f32; 3]]) -> Option<[f32; 3]> {
@@ -273,6 +310,28 @@ fn common(colors: &[[f32; 3]]) -> Option<[f32; 3]> {
     let middle: [f32; 3] =
         std::array::from_fn(|c| quantile(colors.iter().map(|color| color[c]), 0.5).map_or(f32::NAN, |v| v as f32));
     colors.iter().copied().find(|color| (0..3).all(|c| (color[c] - middle[c]).abs() <= GLARE))
+}
+
+/// Fills the straight borders between what looks different that cross what is `wanted`, so many pixels to each side: in the picture, where
+/// all that is around the hole is beside it, on whichever surface.
+fn borders(filling: &mut Filling, size: [usize; 2], wanted: &[bool], half: f64) {
+    let of: Vec<usize> = (0..wanted.len()).filter(|i| wanted[*i]).collect();
+    let large = parts(&of, size).into_iter().filter(|part| part.len() as f64 >= LARGE * wanted.len() as f64);
+    for part in large {
+        let (cells, size) = surroundings(&part, size);
+        let mut texture = Texture {
+            size,
+            rgb: cells.iter().map(|i| filling.rgb[*i]).collect(),
+            hole: cells.iter().map(|i| filling.guessed[*i]).collect(),
+            source: cells.iter().map(|i| !filling.guessed[*i]).collect(),
+        };
+        texture::borders(&mut texture, half);
+        for (cell, i) in cells.iter().enumerate().filter(|(cell, _)| !texture.hole[*cell]) {
+            if std::mem::take(&mut filling.guessed[*i]) {
+                filling.rgb[*i] = texture.rgb[cell];
+            }
+        }
+    }
 }
 
 /// Fills the parts that are left and `wanted` in the picture itself, each from the same surface, else from any.
@@ -359,7 +418,15 @@ mod tests {
         let plane = sights.0[2].planes[0];
         let rays: Vec<[f64; 2]> = (0..sights.0[2].hole.len()).map(|site| sights.0[2].ray(site)).collect();
         let chart = Chart::new(plane, &rays, 40.0, 0.0).expect("a plane before the camera");
-        let texture = charted(&sights, &photographs, 2, &filling, &filling.behind, &chart, &|_| Some(SAME));
+        let texture = charted(
+            &sights,
+            &photographs,
+            2,
+            &filling,
+            &filling.behind,
+            &chart,
+            &Its { off: &|_| Some(SAME), materials: vec![] },
+        );
         let known = |site: &usize| {
             let [x, y] = chart.pixel(sights.0[2].ray(*site)).expect("it is on the plane").map(|v| v as usize);
             texture.source[y * texture.size[0] + x] || texture.hole[y * texture.size[0] + x]

@@ -56,14 +56,14 @@ pub struct Line {
     /// Distance from its middle at which it is no more.
     pub beside: f64,
     /// Length of each end that was looked at.
-    known: f64,
+    pub known: f64,
     /// How much it differs from what is beside it, summed over the channels.
-    strength: f64,
+    pub strength: f64,
 }
 
 impl Line {
     /// The direction from where it goes in to where it comes out.
-    fn along(&self) -> DVec2 {
+    pub fn along(&self) -> DVec2 {
         (self.ends[1] - self.ends[0]).normalize()
     }
 
@@ -342,6 +342,20 @@ pub struct Piece {
 }
 
 impl Piece {
+    /// The piece from the hole on in this direction, as long as this or a little shorter.
+    pub fn new(away: DVec2, length: f64) -> Self {
+        Self::between(away, 0..length.max(1.0) as usize)
+    }
+
+    /// The piece in this direction between two distances, shortened to where whole pixels leave the line least.
+    fn between(away: DVec2, best: Range<usize>) -> Self {
+        let from = best.start as f64;
+        let leaves = |length: usize| away.perp_dot((away * (from + length as f64)).round()).abs();
+        let lengths = best.len().div_ceil(2)..=best.len();
+        let length = lengths.min_by(|a, b| leaves(*a).total_cmp(&leaves(*b))).unwrap_or(best.len());
+        Self { away, from, length: length as f64 }
+    }
+
     /// The way to what is copied to a place so far in the hole: over as many lengths of the piece as lead out of it, and `again`
     /// more.
     pub fn shift(&self, inside: f64, again: usize) -> [isize; 2] {
@@ -375,12 +389,7 @@ pub fn pieces(grey: &Grey, line: &Line, half: f64) -> [Piece; 2] {
         // Where something crosses it near the hole, what is farther away.
         let best = if 2.0 * near.len() as f64 >= line.known { near } else { longest(&plain) };
         let best = if best.len() < LEAST_PIECE { 0..n } else { best };
-        // Whole pixels that leave the line least.
-        let from = best.start as f64;
-        let leaves = |length: usize| away.perp_dot((away * (from + length as f64)).round()).abs();
-        let lengths = best.len().div_ceil(2)..=best.len();
-        let length = lengths.min_by(|a, b| leaves(*a).total_cmp(&leaves(*b))).unwrap_or(best.len());
-        Piece { away, from, length: length as f64 }
+        Piece::between(away, best)
     })
 }
 

@@ -4,22 +4,26 @@
 //! - `flat`: what is bare lies on the planes around it.
 //! - `residue`: what is left of a shadow that was taken out goes with the object.
 //! - `complete`: masks that end before the object does grow, and views that have it elsewhere are not asked.
+//! - `covered`: where depth does not tell surfaces apart, what they look like does (`material`).
 //! - `surface`: the depth of what is behind the object, in all views, by what they know of a point (`witness`).
 //! - `color`: what photographs show of it, and what views that were filled before show of it (`relief`).
-//! - `guess`: what nobody shows is filled with pieces of the same surface, seen straight on (`texture`), lines that
-//!   cross the hole first (`lines`), or by a network.
+//! - `guess`: what nobody shows is filled with pieces of the same surface, seen straight on (`texture`), lines and straight
+//!   borders of what looks different first (`lines`, `regions`), or by a network.
 //!
 //! One view is the reference: its picture goes to `reference/`, where a better one may take its place. All other views'
 //! holes are filled from the same surface, into `hole/`.
 
 mod color;
 mod complete;
+mod covered;
 mod flat;
 mod front;
 mod gradient;
 pub mod ground;
 mod guess;
 mod lines;
+mod material;
+mod regions;
 mod relief;
 mod residue;
 mod shade;
@@ -60,7 +64,8 @@ const AT_ONCE: usize = 16;
 pub const METHOD: &str = "one surface with smooth ends, nothing where others look through it, no colour from a rim that looks like nothing near it, \
      lights joined, doubts left to training, nothing stands on what only crosses the floor, lines go on through holes, a foot is all that is unseen around it, \
      what is nearly one plane is one, copies nearly keep their hue, ends are where the first view has them, \
-     nothing from views with the object elsewhere, and nothing stands where the first view looks through";
+     nothing from views with the object elsewhere, nothing stands where the first view looks through, surfaces by what they are covered with, \
+     straight borders go on, and grain is kept";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 

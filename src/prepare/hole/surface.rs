@@ -9,6 +9,7 @@ use glam::{DMat3, DVec3};
 use image::GrayImage;
 use rayon::prelude::*;
 
+use super::covered::Covered;
 use super::flat;
 use super::support::Support;
 use super::window::Window;
@@ -65,6 +66,9 @@ pub struct Sight {
     /// Planes around the hole that were found before it is solved; none where the views are too near each
     /// other to tell.
     pub(super) around: Vec<planes::Plane>,
+    /// Surfaces of one material around the holes, where the views are too near each other to tell planes apart by what they look like on
+    /// them.
+    pub(super) covered: Vec<Covered>,
     /// Whether every site has its depth.
     pub solved: bool,
     /// How many views were solved before it.
@@ -179,6 +183,7 @@ impl Sight {
             surface: vec![0; sites],
             planes: vec![],
             around: vec![],
+            covered: vec![],
             solved: false,
             rank: 0,
         }
@@ -634,8 +639,11 @@ impl Sights {
         let open: Vec<bool> = sites.iter().map(|site| unknown[*site] || ring(*site)).collect();
         let known: Vec<f32> = sites.iter().map(|site| disparity[*site]).collect();
         let size = window.size;
-        let planes =
-            if own.around.is_empty() { planes::around(&known, &rays, &open, seed) } else { own.around.clone() };
+        let planes = match (own.around.is_empty(), own.covered.is_empty()) {
+            (false, _) => own.around.clone(),
+            (true, false) => own.covered.iter().map(|covered| covered.plane).collect(),
+            (true, true) => planes::around(&known, &rays, &open, seed),
+        };
         let supports = own.supports(&planes);
         let under = |site: &usize| {
             let depths = supports.iter().filter_map(|support| support.under(own.ray(*site)));
@@ -652,8 +660,13 @@ impl Sights {
             self.against(of, own.point(site, 1.0 / d)).max(if hidden { BELOW } else { 0.0 })
         };
         let told = !own.around.is_empty();
-        let costs = if told { self.evidence(of, &sites, size, disparity, &planes) } else { vec![] };
+        let costs = match (told, own.covered.is_empty()) {
+            (true, _) => self.evidence(of, &sites, size, disparity, &planes),
+            (false, false) => own.material_costs(&sites, &known, &against),
+            (false, true) => vec![],
+        };
         let hole = planes::Hole {
+            told,
             costs: &costs,
             size,
             disparity: &known,
@@ -668,7 +681,7 @@ impl Sights {
         let better = |cell: usize| {
             let label = usize::from(found.label[cell]);
             let costs = costs.get(cell).and_then(Option::as_ref);
-            costs.is_some_and(|costs| costs[label] > costs[costs.len() - 1] + BETTER)
+            told && costs.is_some_and(|costs| costs[label] > costs[costs.len() - 1] + BETTER)
         };
         for (cell, &site) in sites.iter().enumerate() {
             surface[site] = found.label[cell];

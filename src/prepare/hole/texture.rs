@@ -14,6 +14,8 @@ use rayon::prelude::*;
 
 use super::gradient::{self, Equation};
 use super::lines::{self, Grey, Line, Piece};
+use super::material::{MATERIAL, of_another};
+use super::regions::{Edge, Regions};
 use super::similar::{DIFFERENT, Picture, RADIUS, Shift, most_alike};
 use crate::prepare::planes;
 use crate::scene::resample;
@@ -40,6 +42,8 @@ const ASIDE: f64 = 1.5;
 const WIDE: f64 = 1.5;
 /// Longer side of the picture that shifts are chosen on, pixels.
 const SIDE: usize = 128;
+/// Smallest part of a hole, pixels of that picture, that borders go through.
+const LEAST_PART: usize = 16;
 /// Shifts that are tried in the hole because they repeat.
 const SHIFTS: usize = 48;
 /// More of them, that fit all around the hole, as judged by so many pixels of it and of its rim.
@@ -57,17 +61,12 @@ const SHADED: f32 = 0.25;
 const HUE: f32 = 0.12;
 /// Difference of the channels without their mean by which a copy takes less of the hue of its place than its gradients ask for.
 const TINT: f32 = 0.03;
-/// Mean difference of the channels up to which surroundings are of one material in another light, which costs nothing: copies
-/// take the light of their place.
-const LIGHT: f32 = 0.05;
 /// Cost of a copy at the hole's border for each unit, summed over the channels, by which the colours of its surroundings differ
 /// from those that go on into the hole; it falls by a factor e every `FADES` of the hole's half width.
 const UNLIKE: f64 = 6.0;
 const FADES: f64 = 0.6;
-/// The same difference of surroundings from which on they are of a material that is not beside the hole, and what there must
-/// be of those that are for each pixel of the hole.
-const MATERIAL: f32 = 0.25;
-const ENOUGH: f64 = 0.25;
+/// What there must be of the materials beside a hole for each pixel of it.
+pub(super) const ENOUGH: f64 = 0.25;
 /// How many times the contrast of a hole's rim may be copied into it, contrast that may always be, and half the width of what
 /// belongs to a line on the rim, pixels.
 const BUSIER: f32 = 1.5;
@@ -88,7 +87,7 @@ impl Texture {
     }
 
     /// The pixel at a shift from another, if it is in the picture.
-    fn shifted(&self, pixel: usize, [dx, dy]: Shift) -> Option<usize> {
+    pub(super) fn shifted(&self, pixel: usize, [dx, dy]: Shift) -> Option<usize> {
         let [w, h] = self.size.map(|n| n as isize);
         let (x, y) = (pixel as isize % w + dx, pixel as isize / w + dy);
         (x >= 0 && y >= 0 && x < w && y < h).then(|| (y * w + x) as usize)
@@ -295,21 +294,14 @@ fn apart(one: [f32; 3], other: [f32; 3]) -> f32 {
     (0..3).map(|c| (one[c] - other[c]).abs()).sum()
 }
 
-/// How much the colours of two surroundings are those of different materials, summed over the channels.
-fn of_another(one: [f32; 3], other: [f32; 3]) -> f32 {
-    let off: [f32; 3] = std::array::from_fn(|c| one[c] - other[c]);
-    let light = off.iter().sum::<f32>() / 3.0;
-    // Light is alike in all channels; the rest is another colour.
-    let color: f32 = off.iter().map(|off| (off - light).abs()).sum();
-    color + 3.0 * (light.abs() - LIGHT).max(0.0)
-}
-
 /// Materials of a picture: they say which pixels may be copied into which part of the hole.
 struct Materials {
     /// The number of its part for each `[pixel]` of the hole.
     part: Vec<usize>,
     /// Whether a pixel may be copied into a part: `[part][pixel]`.
     allowed: Vec<Vec<bool>>,
+    /// Regions of one material, where few borders run into the hole.
+    regions: Vec<Option<Regions>>,
     /// The mean of what is known around each `[pixel]`; NaN where nothing is.
     around: Vec<[f32; 3]>,
 }
@@ -317,11 +309,15 @@ struct Materials {
 impl Texture {
     /// The mean of what is known around a pixel; NaN where nothing is.
     fn mean_around(&self, pixel: usize) -> [f32; 3] {
+        self.mean_within(pixel, SURROUNDINGS)
+    }
+
+    /// The same of what is known so near.
+    pub(super) fn mean_within(&self, pixel: usize, reach: usize) -> [f32; 3] {
         let [w, h] = self.size;
         let (x, y) = (pixel % w, pixel / w);
-        let rows = y.saturating_sub(SURROUNDINGS)..(y + SURROUNDINGS + 1).min(h);
-        let near =
-            rows.flat_map(|v| (x.saturating_sub(SURROUNDINGS)..(x + SURROUNDINGS + 1).min(w)).map(move |u| v * w + u));
+        let rows = y.saturating_sub(reach)..(y + reach + 1).min(h);
+        let near = rows.flat_map(|v| (x.saturating_sub(reach)..(x + reach + 1).min(w)).map(move |u| v * w + u));
         let known: Vec<usize> = near.filter(|j| self.source[*j]).collect();
         let n = known.len() as f32;
         std::array::from_fn(|c| known.iter().map(|j| self.rgb[*j][c]).sum::<f32>() / n)
@@ -342,7 +338,7 @@ impl Texture {
     fn materials(&self, lines: &[Line]) -> Materials {
         let around: Vec<[f32; 3]> = (0..self.hole.len()).into_par_iter().map(|i| self.mean_around(i)).collect();
         let known: Vec<usize> = (0..self.source.len()).filter(|i| self.source[*i]).collect();
-        let (mut of, mut all) = (vec![0; self.hole.len()], vec![]);
+        let (mut of, mut all, mut regions) = (vec![0; self.hole.len()], vec![], vec![]);
         let mut left = self.hole.clone();
         for first in (0..left.len()).filter(|i| self.hole[*i]) {
             let part = planes::connected(first, &mut left, self.size);
@@ -361,15 +357,21 @@ impl Texture {
             let enough = like.len() as f64 >= ENOUGH * part.len() as f64;
             let mut allowed = vec![!enough; self.source.len()];
             like.into_iter().for_each(|i| allowed[i] = true);
+            regions.push(Regions::around(self, &part).filter(|regions| regions.hold(self, &part, &allowed)));
             part.into_iter().for_each(|i| of[i] = all.len());
             all.push(allowed);
         }
-        Materials { part: of, allowed: all, around }
+        Materials { part: of, allowed: all, regions, around }
     }
 
     /// The pixel that a pixel of the hole is copied from at a shift, if it may be.
     fn copy(&self, materials: &Materials, pixel: usize, shift: Shift) -> Option<usize> {
-        self.source(pixel, shift).filter(|from| materials.allowed[materials.part[pixel]][*from])
+        let part = materials.part[pixel];
+        let may = |from: &usize| {
+            let regions = materials.regions[part].as_ref();
+            materials.allowed[part][*from] && regions.is_none_or(|regions| regions.may(pixel, *from))
+        };
+        self.source(pixel, shift).filter(may)
     }
 
     /// What it costs a pixel of the hole to be copied from another: the colours around that one are compared with those that
@@ -447,6 +449,32 @@ fn go_on(texture: &mut Texture, cell: usize) -> Vec<Line> {
         (line, half, lines::pieces(&grey, &line, half))
     };
     let found: Vec<(Line, f64, [Piece; 2])> = found.into_iter().map(at_full_size).collect();
+    along(texture, &found);
+    found.into_iter().map(|(line, ..)| line).collect()
+}
+
+/// Fills the straight borders of regions that cross the hole, each along itself, so many pixels to each side.
+pub fn borders(texture: &mut Texture, half: f64) {
+    let by = texture.size[0].max(texture.size[1]).div_ceil(SIDE).max(1);
+    let small = texture.reduced(by);
+    let mut left = small.hole.clone();
+    let mut edges: Vec<Edge> = vec![];
+    for first in 0..left.len() {
+        let part = planes::connected(first, &mut left, small.size);
+        if part.len() >= LEAST_PART {
+            edges.extend(Regions::around(&small, &part).iter().flat_map(|regions| regions.edges(&small, &part)));
+        }
+    }
+    let full = |edge: &Edge| {
+        let line = edge.refined(texture, by as f64);
+        (line, half, edge.pieces(&line, by as f64))
+    };
+    let found: Vec<(Line, f64, [Piece; 2])> = edges.iter().map(full).collect();
+    along(texture, &found);
+}
+
+/// Fills what is so near to lines along them.
+fn along(texture: &mut Texture, found: &[(Line, f64, [Piece; 2])]) {
     let copy = |i: usize| {
         let on = found.iter().filter_map(|(line, half, pieces)| {
             let [from_first, aside] = line.place(lines::middle_of(i, texture.size[0]));
@@ -468,7 +496,6 @@ fn go_on(texture: &mut Texture, cell: usize) -> Vec<Line> {
     for i in (0..copied.len()).filter(|i| copied[*i].is_some()) {
         (texture.hole[i], texture.source[i]) = (false, true);
     }
-    found.into_iter().map(|(line, ..)| line).collect()
 }
 
 /// Copies pixels and joins them with each other and with what is around them.

@@ -1,0 +1,368 @@
+//! Regions of one material around a hole, and in it.
+//!
+//! Where one material ends at another around a hole, the border goes on into it the shortest way, and a straight one that comes out on
+//! the other side is copied along itself. What repeats, as tiles of two colours do, has many borders, and is left to the shifts
+//! by which it is like itself.
+
+use glam::DVec2;
+
+use super::lines::{Line, Piece, middle_of};
+use super::material::{MATERIAL, materials, of_another};
+use super::texture::{ENOUGH, Texture};
+use crate::prepare::planes;
+
+/// Pixels to each side whose mean says what a pixel is of.
+const REACH: usize = 2;
+/// Cost of a pixel at most, by its distance from the region's colour in [`MATERIAL`], and of a border per pixel of its length.
+const MOST: f64 = 4.0;
+const BORDER: f64 = 3.0;
+/// Most regions.
+const REGIONS: usize = 16;
+/// Fewest pixels that are known around a hole.
+const FEWEST: usize = 50;
+/// Least margin around a hole, pixels.
+const MARGIN: usize = 8;
+/// Parts of a hole's rim, each of one region, at most: of two borders across it; and longest part that is none, pixels.
+const ARCS: usize = 4;
+const SHORT: usize = 2;
+/// Pixels to each side of a border where what is of either region may be copied: the border itself is.
+const BAND: isize = 2;
+/// Pixels from a border to each side at which colours must be apart, by this part of how far the regions are, for it to be one.
+const NEAR: isize = 2;
+const STEP: f32 = 0.5;
+/// Length of a border's ends that is looked at, as a part of its way through the hole, and at least, pixels.
+const END: f64 = 0.35;
+const LEAST_END: f64 = 8.0;
+/// Pixels that a border may be beside a line, share of both its ends along which it is there, and shortest way through the hole.
+const STRAIGHT: f64 = 1.0;
+const WHOLE: f64 = 0.75;
+const LEAST_GAP: f64 = 3.0;
+/// Places of a border between which lines are tried.
+const PLACES: usize = 80;
+/// Pixels from a border at which the regions are to its sides.
+const BESIDE: f64 = 2.0;
+/// How far from there a border is looked for at full size, in pixels of the reduced picture, and difference of what is to its sides, as
+/// a part of that of the regions, from which on it is seen.
+const ASIDE: f64 = 3.0;
+const SEEN: f64 = 0.4;
+
+/// Regions around a part of a hole.
+pub struct Regions {
+    /// Mean colour of each.
+    means: Vec<[f32; 3]>,
+    /// `[pixel]` the number of its region; in the hole, too.
+    of: Vec<u8>,
+    /// `[pixel]` set of the regions near it.
+    near: Vec<u16>,
+}
+
+/// A straight border between two regions that goes through a hole.
+pub struct Edge {
+    /// Where it goes in and comes out.
+    line: Line,
+    /// Colours to its sides.
+    between: [[f32; 3]; 2],
+    /// Length of each end on which the regions are to its sides.
+    lengths: [f64; 2],
+}
+
+/// The pixels of a picture so near to one, to each side.
+fn within(texture: &Texture, i: usize, reach: isize) -> impl Iterator<Item = usize> {
+    let shifts = (-reach..=reach).flat_map(move |dy| (-reach..=reach).map(move |dx| [dx, dy]));
+    shifts.filter_map(move |shift| texture.shifted(i, shift))
+}
+
+/// The pixel of a picture at a place, where it may be copied.
+fn source(texture: &Texture, at: DVec2) -> Option<usize> {
+    let [w, h] = texture.size;
+    let inside = at.cmpge(DVec2::ZERO).all() && at.x < w as f64 && at.y < h as f64;
+    inside.then(|| at.y as usize * w + at.x as usize).filter(|i| texture.source[*i])
+}
+
+/// The way out of the hole along a line's end.
+fn away(line: &Line, end: usize) -> DVec2 {
+    if end == 0 { -line.along() } else { line.along() }
+}
+
+/// Makes one of regions that go over into each other: of one material in a light that falls off.
+fn gradual(texture: &Texture, means: &[[f32; 3]], of: &mut [u8]) {
+    // `[pair]` sums of the colours just beside their border, and number.
+    let mut beside = std::collections::BTreeMap::<[u8; 2], ([[f32; 3]; 2], f32)>::new();
+    for i in (0..of.len()).filter(|i| texture.source[*i]) {
+        for [dx, dy] in [[1, 0], [0, 1]] {
+            let at = |steps: isize| texture.shifted(i, [dx * steps, dy * steps]).filter(|j| texture.source[*j]);
+            let (Some(before), Some(next), Some(after)) = (at(-NEAR), at(1), at(1 + NEAR)) else { continue };
+            if of[i] == of[next] {
+                continue;
+            }
+            let mut pair = [(of[i], before), (of[next], after)];
+            pair.sort_unstable();
+            let (sums, count) = beside.entry(pair.map(|(region, _)| region)).or_default();
+            for (sum, (_, j)) in sums.iter_mut().zip(pair) {
+                let color = texture.mean_within(j, REACH);
+                (0..3).for_each(|c| sum[c] += color[c]);
+            }
+            *count += 1.0;
+        }
+    }
+    for ([a, b], (sums, count)) in beside {
+        let [one, other] = sums.map(|sum| sum.map(|v| v / count));
+        if of_another(one, other) < STEP * of_another(means[usize::from(a)], means[usize::from(b)]) {
+            let [a, b] = [a, b].map(|k| of.iter().position(|label| *label == k).map_or(k, |i| of[i]));
+            of.iter_mut().filter(|label| **label == b).for_each(|label| *label = a);
+        }
+    }
+}
+
+impl Regions {
+    /// The regions around a part of a hole; nothing where there is one alone.
+    pub fn around(texture: &Texture, part: &[usize]) -> Option<Self> {
+        let [w, h] = texture.size;
+        let bounds = |of: &dyn Fn(usize) -> usize, end: usize| {
+            let (low, high) = part.iter().fold((end, 0), |(low, high), i| (low.min(of(*i)), high.max(of(*i) + 1)));
+            let margin = (high - low).max(MARGIN);
+            low.saturating_sub(margin)..(high + margin).min(end)
+        };
+        let (columns, rows) = (bounds(&|i| i % w, w), bounds(&|i| i / w, h));
+        let size = [columns.len(), rows.len()];
+        let pixels: Vec<usize> = rows.flat_map(|y| columns.clone().map(move |x| y * w + x)).collect();
+        let color = |i: usize| Some(texture.mean_within(i, REACH)).filter(|_| texture.source[i]);
+        let colors: Vec<Option<[f32; 3]>> = pixels.iter().map(|i| color(*i)).collect();
+        let known: Vec<[f32; 3]> = colors.iter().flatten().copied().collect();
+        let mut means = if known.len() < FEWEST { vec![] } else { materials(&known) };
+        means.truncate(REGIONS);
+        if means.len() < 2 {
+            return None;
+        }
+        let cost = |mean: &[f32; 3], color: &Option<[f32; 3]>| {
+            color.map_or(0.0, |color| f64::from(of_another(color, *mean) / MATERIAL).min(MOST))
+        };
+        let costs: Vec<Vec<f64>> =
+            means.iter().map(|mean| colors.iter().map(|color| cost(mean, color)).collect()).collect();
+        let found = planes::cheapest(&costs, &planes::Border { between: |_| BORDER, at: |_, _| 0.0 }, size);
+        let nearest = |color: [f32; 3]| {
+            let apart = |k: &usize| of_another(color, means[*k]);
+            (0..means.len()).min_by(|a, b| apart(a).total_cmp(&apart(b))).unwrap_or(0)
+        };
+        // Beyond by its own colour.
+        let mut of: Vec<u8> = (0..w * h).map(|i| color(i).map_or(0, nearest) as u8).collect();
+        pixels.iter().zip(found).for_each(|(i, label)| of[*i] = label as u8);
+        gradual(texture, &means, &mut of);
+        let near = |i: usize| {
+            let told = within(texture, i, BAND).filter(|j| texture.hole[*j] || texture.source[*j]);
+            told.fold(0, |set: u16, j| set | 1 << of[j])
+        };
+        let near = (0..w * h).map(near).collect();
+        Some(Self { means, of, near })
+    }
+
+    /// Whether a pixel of the hole may be copied from another.
+    pub fn may(&self, pixel: usize, from: usize) -> bool {
+        self.near[pixel] & (1 << self.of[from]) != 0
+    }
+
+    /// Whether borders run into a part of the hole, few of them, and enough of what may be copied is of each region in it.
+    pub fn hold(&self, texture: &Texture, part: &[usize], allowed: &[bool]) -> bool {
+        let mut rim = vec![false; self.of.len()];
+        let beside = part.iter().flat_map(|i| within(texture, *i, 1));
+        beside.filter(|i| texture.source[*i]).for_each(|i| rim[i] = true);
+        let mut arcs = 0;
+        for first in 0..rim.len() {
+            let mut arc: Vec<usize> = Some(first).filter(|i| std::mem::take(&mut rim[*i])).into_iter().collect();
+            let mut at = 0;
+            while at < arc.len() {
+                let next = within(texture, arc[at], 2).filter(|j| self.of[*j] == self.of[first]);
+                arc.extend(next.filter(|j| std::mem::take(&mut rim[*j])));
+                at += 1;
+            }
+            arcs += usize::from(arc.len() > SHORT);
+        }
+        let mut counts = vec![[0.0; 2]; self.means.len()];
+        part.iter().for_each(|i| counts[usize::from(self.of[*i])][0] += 1.0);
+        let sources = (0..allowed.len()).filter(|i| allowed[*i] && texture.source[*i]);
+        sources.for_each(|i| counts[usize::from(self.of[i])][1] += 1.0);
+        arcs <= ARCS && counts.iter().all(|[wanted, there]| *there >= ENOUGH * wanted)
+    }
+
+    /// The straight borders that go into a part of the hole and come out of it.
+    pub fn edges(&self, texture: &Texture, part: &[usize]) -> Vec<Edge> {
+        let w = texture.size[0];
+        let mut places = std::collections::BTreeMap::<[u8; 2], Vec<DVec2>>::new();
+        for i in (0..self.of.len()).filter(|i| texture.source[*i]) {
+            for j in [[1, 0], [0, 1]].into_iter().filter_map(|shift| texture.shifted(i, shift)) {
+                let pair = [self.of[i].min(self.of[j]), self.of[i].max(self.of[j])];
+                if texture.source[j] && pair[0] < pair[1] {
+                    places.entry(pair).or_default().push(0.5 * (middle_of(i, w) + middle_of(j, w)));
+                }
+            }
+        }
+        places.into_iter().filter_map(|(pair, places)| self.edge(texture, part, pair, &places)).collect()
+    }
+
+    /// The straight border between two regions through a part of the hole, of which these are places.
+    fn edge(&self, texture: &Texture, part: &[usize], pair: [u8; 2], places: &[DVec2]) -> Option<Edge> {
+        let middles: Vec<DVec2> = part.iter().map(|i| middle_of(*i, texture.size[0])).collect();
+        let (low, high) =
+            middles.iter().fold((DVec2::MAX, DVec2::MIN), |(low, high), at| (low.min(*at), high.max(*at)));
+        let reach = DVec2::splat((high - low).max_element().max(LEAST_END));
+        let is_near = |at: &&DVec2| at.cmpge(low - reach).all() && at.cmple(high + reach).all();
+        let near: Vec<DVec2> = places.iter().filter(is_near).copied().collect();
+        let some: Vec<DVec2> = near.iter().copied().step_by(near.len().div_ceil(PLACES).max(1)).collect();
+        let pairs = (0..some.len()).flat_map(|a| (0..a).map(move |b| [b, a])).map(|pair| pair.map(|k| some[k]));
+        let [one, other] = pair.map(|k| self.means[usize::from(k)]);
+        let strength = (0..3).map(|c| f64::from((one[c] - other[c]).abs())).sum();
+        let lines = pairs.filter(|[a, b]| a.distance(*b) >= LEAST_END).filter_map(|ends| {
+            let line = Line { ends, beside: 1.0, known: 0.0, strength };
+            let inside = middles.iter().map(|at| line.place(*at)).filter(|[_, aside]| aside.abs() <= 0.75);
+            let (from, to) = inside.fold((f64::MAX, f64::MIN), |(from, to), [at, _]| (from.min(at), to.max(at)));
+            (to - from >= LEAST_GAP).then_some(())?;
+            let (from, to) = (from - 1.0, to + 1.0);
+            let known = (END * (to - from)).max(LEAST_END);
+            let mut on = [0, 1].map(|_| vec![false; known as usize]);
+            // Of lines that lie on it the one that is nearest to all of it.
+            let mut sum = 0.0;
+            for [along, aside] in near.iter().map(|at| line.place(*at)) {
+                let (end, off) = if 2.0 * along < from + to { (0, from - along) } else { (1, along - to) };
+                if (0.0..known).contains(&off) && aside.abs() <= 2.0 * STRAIGHT {
+                    sum += 1.0 - (aside / (2.0 * STRAIGHT)).powi(2);
+                    let place = on[end].get_mut(off as usize).filter(|_| aside.abs() <= STRAIGHT);
+                    place.into_iter().for_each(|place| *place = true);
+                }
+            }
+            let whole = |on: &Vec<bool>| on.iter().filter(|on| **on).count() as f64 >= WHOLE * on.len() as f64;
+            let ends = [from, to].map(|at| line.ends[0] + line.along() * at);
+            on.iter().all(whole).then_some((sum, Line { ends, known, ..line }))
+        });
+        let (_, line) = lines.reduce(|best, next| if next.0 > best.0 { next } else { best })?;
+        let lengths = [0, 1].map(|end| self.length(texture, &line, end, pair));
+        Some(Edge { line, between: [one, other], lengths })
+    }
+
+    /// How far a border's end has the two regions to its sides.
+    fn length(&self, texture: &Texture, line: &Line, end: usize, pair: [u8; 2]) -> f64 {
+        let away = away(line, end);
+        let are = |i: &usize| {
+            let at = line.ends[end] + away * (*i as f64 + 0.5);
+            let [one, other] = [BESIDE, -BESIDE].map(|off| source(texture, at + away.perp() * off).map(|i| self.of[i]));
+            let pair = pair.map(Some);
+            [one, other] == pair || [other, one] == pair
+        };
+        // What is at the rim of the hole may be mixed.
+        let from = (0..=BESIDE as usize).find(are).unwrap_or(0);
+        from as f64 + (from..line.length() as usize).take_while(are).count() as f64
+    }
+}
+
+impl Edge {
+    /// The line in a picture so many times as large, where the colours to both sides differ most.
+    pub fn refined(&self, texture: &Texture, by: f64) -> Line {
+        let [one, other] = self.between.map(|color| color.map(f64::from));
+        let off: [f64; 3] = std::array::from_fn(|c| one[c] - other[c]);
+        let square: f64 = off.iter().map(|v| v * v).sum();
+        // One on this side of the border, 0 on the other.
+        let value = |at: DVec2| -> Option<f64> {
+            let i = source(texture, at)?;
+            Some((0..3).map(|c| (f64::from(texture.rgb[i][c]) - other[c]) * off[c]).sum::<f64>() / square)
+        };
+        let half = (ASIDE * by).ceil() as i64;
+        let middle = |line: &Line, end: usize| {
+            let (at, away) = (line.ends[end], away(line, end));
+            let across = |aside: i64| -> Option<f64> {
+                let places =
+                    (0..line.known as usize).map(|i| at + away.perp() * aside as f64 + away * (i as f64 + 0.5));
+                let known: Vec<f64> = places.filter_map(value).collect();
+                (2 * known.len() > line.known as usize).then(|| known.iter().sum::<f64>() / known.len() as f64)
+            };
+            let profile: Vec<(i64, f64)> = (-half..=half).filter_map(|aside| Some((aside, across(aside)?))).collect();
+            // The step of least squares.
+            let split = |k: usize| {
+                let mean = |part: &[(i64, f64)]| part.iter().map(|(_, v)| v).sum::<f64>() / part.len() as f64;
+                let apart = (mean(&profile[..k]) - mean(&profile[k..])).abs();
+                let weight = (k as f64 * (profile.len() - k) as f64).sqrt();
+                (apart * weight, apart, 0.5 * (profile[k - 1].0 + profile[k].0) as f64)
+            };
+            let best = (1..profile.len()).map(split).max_by(|a, b| a.0.total_cmp(&b.0));
+            let aside = best.filter(|(_, apart, _)| *apart >= SEEN).map_or(0.0, |(.., aside)| aside);
+            at + away.perp() * aside + away * 0.5 * line.known
+        };
+        // Again from there: of a line that was far to the side a part was beyond what is looked at.
+        (0..3).fold(self.line.scaled(by), |line, _| {
+            let [a, b] = [0, 1].map(|end| middle(&line, end));
+            let back = (b - a).normalize() * 0.5 * line.known;
+            Line { ends: [a + back, b - back], ..line }
+        })
+    }
+
+    /// What is copied along the line in a picture so many times as large.
+    pub fn pieces(&self, line: &Line, by: f64) -> [Piece; 2] {
+        [0, 1].map(|end| Piece::new(away(line, end), self.lengths[end] * by))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn noise(x: usize, y: usize) -> f32 {
+        ((x * 7919 + y * 104_729) * 2_654_435_761 % 1000) as f32 / 1000.0
+    }
+
+    /// A picture with a round hole in its middle.
+    fn holed(size: [usize; 2], radius: f64, color: impl Fn(usize, usize) -> [f32; 3]) -> Texture {
+        let [w, h] = size;
+        let places = || (0..h).flat_map(|y| (0..w).map(move |x| (x, y)));
+        let inside = |(x, y): (usize, usize)| {
+            DVec2::new(x as f64, y as f64).distance(0.5 * DVec2::new(w as f64, h as f64)) < radius
+        };
+        let hole: Vec<bool> = places().map(inside).collect();
+        Texture {
+            size,
+            rgb: places().map(|(x, y)| color(x, y)).collect(),
+            source: hole.iter().map(|h| !h).collect(),
+            hole,
+        }
+    }
+
+    fn part(texture: &Texture) -> Vec<usize> {
+        (0..texture.hole.len()).filter(|i| texture.hole[*i]).collect()
+    }
+
+    /// Leaves end at stone in an oblique line, which goes through the hole: it is found where it is, to half a pixel at four times the
+    /// size, and nothing is copied across it.
+    #[test]
+    fn a_border_goes_through() {
+        let line = |x: f64| 46.0 + 0.37 * (x - 60.0);
+        let color = |by: f64| {
+            move |x: usize, y: usize| {
+                let stone = (y as f64 + 0.5) / by > line((x as f64 + 0.5) / by);
+                let n = noise(x, y);
+                if stone { [0.55 + 0.05 * n, 0.6, 0.7] } else { [0.15 + 0.1 * n, 0.3 + 0.1 * n, 0.15] }
+            }
+        };
+        let small = holed([120, 90], 18.0, color(1.0));
+        let hole = part(&small);
+        let regions = Regions::around(&small, &hole).expect("two");
+        assert!(regions.hold(&small, &hole, &small.source));
+        let edges = regions.edges(&small, &hole);
+        assert_eq!(edges.len(), 1);
+        let large = holed([480, 360], 72.0, color(4.0));
+        let found = edges[0].refined(&large, 4.0);
+        for end in found.ends {
+            assert!((end.y - 4.0 * line(end.x / 4.0)).abs() < 0.75, "{end}");
+        }
+        let (above, below) = (30 * 120 + 60, 60 * 120 + 60);
+        assert!(regions.may(35 * 120 + 60, above) && !regions.may(35 * 120 + 60, below));
+        assert!(regions.may(46 * 120 + 60, above) && regions.may(46 * 120 + 60, below));
+    }
+
+    /// Tiles of two colours have many borders, and one that bends in the hole is no line.
+    #[test]
+    fn tiles_and_bends_are_left_alone() {
+        let tiles = holed([120, 90], 18.0, |x, y| if (x / 12 + y / 12) % 2 == 0 { [0.2; 3] } else { [0.8; 3] });
+        let hole = part(&tiles);
+        assert!(Regions::around(&tiles, &hole).is_none_or(|regions| !regions.hold(&tiles, &hole, &tiles.source)));
+        let bent = holed([120, 90], 18.0, |x, y| if y > 45 && x > 60 { [0.2, 0.4, 0.2] } else { [0.6, 0.6, 0.7] });
+        let hole = part(&bent);
+        assert!(Regions::around(&bent, &hole).expect("two").edges(&bent, &hole).is_empty());
+    }
+}
