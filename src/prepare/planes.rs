@@ -6,6 +6,7 @@
 //! must not stand before the object nor where other views look through it, and borders are short. Along the
 //! object's outline they are dear, as the object hides by chance what ends there. In the hole each surface is continued, with what it was off at its border spread inwards.
 
+use glam::DVec2;
 use rand::RngExt;
 use rand_pcg::Pcg64;
 use rayon::prelude::*;
@@ -37,6 +38,9 @@ pub const IMPOSSIBLE: f64 = 40.0;
 const BORDER: f64 = 6.0;
 /// How many times more it costs along the object's outline: a surface that ends just there would be a coincidence.
 const COINCIDENCE: f64 = 4.0;
+/// What part of it it costs where a straight border of what looks different goes on, and how far before that begins, pixels.
+const GOES_ON: f64 = 0.25;
+const BEFORE: f64 = 3.0;
 /// Costs are whole numbers of this fraction.
 const UNIT: f64 = 64.0;
 /// Largest cost of a pair of nodes, in these fractions.
@@ -59,6 +63,8 @@ pub struct Hole<'a, F> {
     pub outline: &'a [bool],
     /// Whether photographs tell what is in the hole.
     pub told: bool,
+    /// Straight borders of what looks different that go into the hole, pixels: from where they do to where they come out of it, or would.
+    pub borders: &'a [[DVec2; 2]],
     /// What speaks against a surface of this inverse depth at the pixel (its number): from 0, nothing, to 1, it cannot be.
     pub against: F,
 }
@@ -176,7 +182,22 @@ fn labels<F: Fn(usize, f64) -> f64 + Sync>(hole: &Hole<'_, F>, planes: &[Plane])
     let of_nodes: Vec<Vec<f64>> = (0..nodes).into_par_iter().map(of).collect();
     let costs: Vec<Vec<f64>> =
         (0..=rest).map(|label| of_nodes.iter().map(|costs| scale * costs[label]).collect()).collect();
-    let between = |[p, q]: [usize; 2]| BORDER * if outline[p] || outline[q] { COINCIDENCE } else { 1.0 };
+    let place = |node: usize| DVec2::new((middle(node) % w) as f64, (middle(node) / w) as f64) + 0.5;
+    let goes_on = |p: usize, q: usize| {
+        hole.borders.iter().any(|[from, to]| {
+            let way = (to - from).normalize();
+            let [[s, u], [t, v]] = [p, q].map(|node| [way.dot(place(node) - from), way.perp_dot(place(node) - from)]);
+            u * v <= 0.0 && s.min(t) >= -BEFORE && s.max(t) <= from.distance(*to) + BEFORE
+        })
+    };
+    let between = |[p, q]: [usize; 2]| {
+        let times = match outline[p] || outline[q] {
+            _ if goes_on(p, q) => GOES_ON,
+            true => COINCIDENCE,
+            false => 1.0,
+        };
+        BORDER * times
+    };
     let current = cheapest(&costs, &Border { between, at: |_, _| 0.0 }, size);
     (0..w * h).map(|i| current[(i / w / stride) * gw + (i % w) / stride] as u8).collect()
 }
@@ -419,6 +440,7 @@ mod tests {
             costs: &[],
             outline: &outline,
             told: false,
+            borders: &[],
             against: |_, _| 0.0,
         };
         surfaces(&hole, around(seen, &rays, unknown, 5))
@@ -488,6 +510,7 @@ mod tests {
             costs: &[],
             outline: &outline,
             told: false,
+            borders: &[],
             against,
         };
         let found = surfaces(&hole, around(hole.disparity, hole.rays, hole.unknown, 5));
@@ -516,6 +539,7 @@ mod tests {
             costs: &[],
             outline: &outline,
             told: false,
+            borders: &[],
             against: |_, _| 0.0,
         };
         let found = surfaces(&hole, around(hole.disparity, hole.rays, hole.unknown, 5));
@@ -537,6 +561,7 @@ mod tests {
             costs: &[],
             outline: &outline,
             told: false,
+            borders: &[],
             against: |_, _| 0.0,
         };
         let found = surfaces(&hole, around(hole.disparity, hole.rays, hole.unknown, 0));

@@ -116,8 +116,9 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
     for (number, plane) in sight.planes.iter().enumerate() {
         let rays =
             |label: usize| surfaces.iter().filter(move |(_, l)| usize::from(*l) == label).filter_map(|(i, _)| ray(*i));
-        let one: Vec<bool> =
-            (0..sight.planes.len()).map(|l| l == number || nearly_one(sight, plane, rays(l))).collect();
+        let one: Vec<bool> = (0..sight.planes.len())
+            .map(|l| l == number || alike(sight, l, number) && nearly_one(sight, plane, rays(l)))
+            .collect();
         let materials: Vec<[f32; 3]> =
             (0..one.len()).filter(|label| one[*label]).filter_map(|label| sight.material(label)).collect();
         let off = |label: u8| {
@@ -154,6 +155,12 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
     if filling.guessed.contains(&true) {
         smooth(filling, [w, h]);
     }
+}
+
+/// Whether two surfaces of a view are of one material, as far as that is known.
+fn alike(sight: &Sight, one: usize, other: usize) -> bool {
+    let (Some(one), Some(other)) = (sight.material(one), sight.material(other)) else { return true };
+    of_another(one, other) <= MATERIAL
 }
 
 /// Whether what lies along these rays, on another plane of the view, is nearly on this one.
@@ -310,6 +317,30 @@ fn common(colors: &[[f32; 3]]) -> Option<[f32; 3]> {
     let middle: [f32; 3] =
         std::array::from_fn(|c| quantile(colors.iter().map(|color| color[c]), 0.5).map_or(f32::NAN, |v| v as f32));
     colors.iter().copied().find(|color| (0..3).all(|c| (color[c] - middle[c]).abs() <= GLARE))
+}
+
+/// The straight borders between what looks different that go into a view's hole, in sites: from where they do to where they come out of
+/// it, or would.
+pub fn ends(sight: &Sight, own: &Photograph<'_>) -> Vec<[DVec2; 2]> {
+    let [w, h] = own.camera.size.map(|n| n as usize);
+    let inside = |i: usize| own.hole.as_raw()[i] != 0;
+    let hole: Vec<usize> = (0..w * h).filter(|i| inside(*i)).collect();
+    let large = parts(&hole, [w, h]).into_iter().filter(|part| part.len() as f64 >= LARGE * (w * h) as f64);
+    let of = |part: Vec<usize>| {
+        let (cells, size) = surroundings(&part, [w, h]);
+        let color = |i: &usize| own.picture.get_pixel((i % w) as u32, (i / w) as u32).0.map(|v| f32::from(v) / 255.0);
+        let texture = Texture {
+            size,
+            rgb: cells.iter().map(color).collect(),
+            hole: cells.iter().map(|i| inside(*i)).collect(),
+            source: cells.iter().map(|i| !inside(*i)).collect(),
+        };
+        let corner = DVec2::new((cells[0] % w) as f64, (cells[0] / w) as f64);
+        let place = |at: DVec2| Some(DVec2::from(sight.grid.place(own.camera.unproject((at + corner).to_array())?)));
+        let found = texture::ends(&texture);
+        found.iter().filter_map(|line| Some([place(line.ends[0])?, place(line.ends[1])?])).collect::<Vec<_>>()
+    };
+    large.flat_map(of).collect()
 }
 
 /// Fills the straight borders between what looks different that cross what is `wanted`, so many pixels to each side: in the picture, where

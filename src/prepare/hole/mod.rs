@@ -5,6 +5,7 @@
 //! - `residue`: what is left of a shadow that was taken out goes with the object.
 //! - `complete`: masks that end before the object does grow, and views that have it elsewhere are not asked.
 //! - `covered`: where depth does not tell surfaces apart, what they look like does (`material`).
+//! - `corner`: a surface whose edge goes into the hole ends at a right angle.
 //! - `surface`: the depth of what is behind the object, in all views, by what they know of a point (`witness`).
 //! - `color`: what photographs show of it, and what views that were filled before show of it (`relief`).
 //! - `guess`: what nobody shows is filled with pieces of the same surface, seen straight on (`texture`), lines and straight
@@ -15,6 +16,7 @@
 
 mod color;
 mod complete;
+mod corner;
 mod covered;
 mod flat;
 mod front;
@@ -65,7 +67,7 @@ pub const METHOD: &str = "one surface with smooth ends, nothing where others loo
      lights joined, doubts left to training, nothing stands on what only crosses the floor, lines go on through holes, a foot is all that is unseen around it, \
      what is nearly one plane is one, copies nearly keep their hue, ends are where the first view has them, \
      nothing from views with the object elsewhere, nothing stands where the first view looks through, surfaces by what they are covered with, \
-     straight borders go on, and grain is kept";
+     straight borders go on, those that end in a hole too, surfaces end at right angles, and grain is kept";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 
@@ -180,6 +182,12 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
     }
     let mut filled: Vec<(usize, Filled)> = vec![];
     let expected = part(&shown[&of]);
+    if !sights.0[of].covered.is_empty() {
+        sights.0[of].borders = guess::ends(&sights.0[of], &photographs[of]);
+        let mut solved = sights.clone();
+        solved.solve(of, task.seed);
+        sights.0[of].borders = solved.0[of].cut_off();
+    }
     sights.solve(of, task.seed);
     // After the reference those that show most of what is still unknown.
     let unknown = |i: usize| {

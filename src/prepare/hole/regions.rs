@@ -1,8 +1,10 @@
 //! Regions of one material around a hole, and in it.
 //!
 //! Where one material ends at another around a hole, the border goes on into it the shortest way, and a straight one that comes out on
-//! the other side is copied along itself. What repeats, as tiles of two colours do, has many borders, and is left to the shifts
+//! the other side is copied along itself. One that does not come out goes straight on, as far as there is anything to its sides. What repeats, as tiles of two colours do, has many borders, and is left to the shifts
 //! by which it is like itself.
+
+use std::collections::BTreeMap;
 
 use glam::DVec2;
 
@@ -37,6 +39,11 @@ const LEAST_END: f64 = 8.0;
 const STRAIGHT: f64 = 1.0;
 const WHOLE: f64 = 0.75;
 const LEAST_GAP: f64 = 3.0;
+/// How far ends of different borders are apart at least, pixels, and how far a quarter of an end may be beside its line.
+const APART: f64 = 8.0;
+const BENT: f64 = 0.35;
+/// How often a line is refined.
+const AGAIN: usize = 3;
 /// Places of a border between which lines are tried.
 const PLACES: usize = 80;
 /// Pixels from a border at which the regions are to its sides.
@@ -87,7 +94,7 @@ fn away(line: &Line, end: usize) -> DVec2 {
 /// Makes one of regions that go over into each other: of one material in a light that falls off.
 fn gradual(texture: &Texture, means: &[[f32; 3]], of: &mut [u8]) {
     // `[pair]` sums of the colours just beside their border, and number.
-    let mut beside = std::collections::BTreeMap::<[u8; 2], ([[f32; 3]; 2], f32)>::new();
+    let mut beside = BTreeMap::<[u8; 2], ([[f32; 3]; 2], f32)>::new();
     for i in (0..of.len()).filter(|i| texture.source[*i]) {
         for [dx, dy] in [[1, 0], [0, 1]] {
             let at = |steps: isize| texture.shifted(i, [dx * steps, dy * steps]).filter(|j| texture.source[*j]);
@@ -184,10 +191,10 @@ impl Regions {
         arcs <= ARCS && counts.iter().all(|[wanted, there]| *there >= ENOUGH * wanted)
     }
 
-    /// The straight borders that go into a part of the hole and come out of it.
-    pub fn edges(&self, texture: &Texture, part: &[usize]) -> Vec<Edge> {
+    /// `[pair]` where two regions meet beside the hole.
+    fn borders(&self, texture: &Texture) -> BTreeMap<[u8; 2], Vec<DVec2>> {
         let w = texture.size[0];
-        let mut places = std::collections::BTreeMap::<[u8; 2], Vec<DVec2>>::new();
+        let mut places = BTreeMap::<[u8; 2], Vec<DVec2>>::new();
         for i in (0..self.of.len()).filter(|i| texture.source[*i]) {
             for j in [[1, 0], [0, 1]].into_iter().filter_map(|shift| texture.shifted(i, shift)) {
                 let pair = [self.of[i].min(self.of[j]), self.of[i].max(self.of[j])];
@@ -196,46 +203,39 @@ impl Regions {
                 }
             }
         }
-        places.into_iter().filter_map(|(pair, places)| self.edge(texture, part, pair, &places)).collect()
+        places
     }
 
-    /// The straight border between two regions through a part of the hole, of which these are places.
-    fn edge(&self, texture: &Texture, part: &[usize], pair: [u8; 2], places: &[DVec2]) -> Option<Edge> {
-        let middles: Vec<DVec2> = part.iter().map(|i| middle_of(*i, texture.size[0])).collect();
-        let (low, high) =
-            middles.iter().fold((DVec2::MAX, DVec2::MIN), |(low, high), at| (low.min(*at), high.max(*at)));
-        let reach = DVec2::splat((high - low).max_element().max(LEAST_END));
-        let is_near = |at: &&DVec2| at.cmpge(low - reach).all() && at.cmple(high + reach).all();
-        let near: Vec<DVec2> = places.iter().filter(is_near).copied().collect();
-        let some: Vec<DVec2> = near.iter().copied().step_by(near.len().div_ceil(PLACES).max(1)).collect();
-        let pairs = (0..some.len()).flat_map(|a| (0..a).map(move |b| [b, a])).map(|pair| pair.map(|k| some[k]));
-        let [one, other] = pair.map(|k| self.means[usize::from(k)]);
-        let strength = (0..3).map(|c| f64::from((one[c] - other[c]).abs())).sum();
-        let lines = pairs.filter(|[a, b]| a.distance(*b) >= LEAST_END).filter_map(|ends| {
-            let line = Line { ends, beside: 1.0, known: 0.0, strength };
-            let inside = middles.iter().map(|at| line.place(*at)).filter(|[_, aside]| aside.abs() <= 0.75);
-            let (from, to) = inside.fold((f64::MAX, f64::MIN), |(from, to), [at, _]| (from.min(at), to.max(at)));
-            (to - from >= LEAST_GAP).then_some(())?;
-            let (from, to) = (from - 1.0, to + 1.0);
-            let known = (END * (to - from)).max(LEAST_END);
-            let mut on = [0, 1].map(|_| vec![false; known as usize]);
-            // Of lines that lie on it the one that is nearest to all of it.
-            let mut sum = 0.0;
-            for [along, aside] in near.iter().map(|at| line.place(*at)) {
-                let (end, off) = if 2.0 * along < from + to { (0, from - along) } else { (1, along - to) };
-                if (0.0..known).contains(&off) && aside.abs() <= 2.0 * STRAIGHT {
-                    sum += 1.0 - (aside / (2.0 * STRAIGHT)).powi(2);
-                    let place = on[end].get_mut(off as usize).filter(|_| aside.abs() <= STRAIGHT);
-                    place.into_iter().for_each(|place| *place = true);
+    /// The straight borders that go into a part of the hole and come out of it.
+    pub fn edges(&self, texture: &Texture, part: &[usize]) -> Vec<Edge> {
+        let one = |(pair, places): ([u8; 2], Vec<DVec2>)| {
+            let ways =
+                Ways::new(texture, part, &places).all().into_iter().filter(|way| way.ends.iter().all(|end| *end));
+            let best = ways.reduce(|best, next| if next.fit() > best.fit() { next } else { best })?;
+            let lengths = [0, 1].map(|end| self.length(texture, &best.line, end, pair));
+            Some(Edge { line: best.line, between: pair.map(|k| self.means[usize::from(k)]), lengths })
+        };
+        self.borders(texture).into_iter().filter_map(one).collect()
+    }
+
+    /// Straight borders that go into a part of the hole, come out of it or not, as they are in a picture so many times as large: from
+    /// where they go in to where they would come out.
+    pub fn ends(&self, texture: &Texture, part: &[usize], large: &Texture, by: f64) -> Vec<Line> {
+        let mut found: Vec<Line> = vec![];
+        for (pair, places) in self.borders(texture) {
+            let between = pair.map(|k| self.means[usize::from(k)]);
+            let of = |way: Way| [0, 1].map(|end| way.ends[end].then(|| (way.fits[end], way.from(end))));
+            let mut all: Vec<(f64, Line)> =
+                Ways::new(texture, part, &places).all().into_iter().flat_map(of).flatten().collect();
+            all.sort_by(|a, b| b.0.total_cmp(&a.0));
+            for (_, line) in all {
+                let known = |other: &Line| other.ends[0].distance(line.ends[0] * by) < APART * by;
+                if !found.iter().any(known) {
+                    found.extend(Edge { line, between, lengths: [0.0; 2] }.going_in(large, by));
                 }
             }
-            let whole = |on: &Vec<bool>| on.iter().filter(|on| **on).count() as f64 >= WHOLE * on.len() as f64;
-            let ends = [from, to].map(|at| line.ends[0] + line.along() * at);
-            on.iter().all(whole).then_some((sum, Line { ends, known, ..line }))
-        });
-        let (_, line) = lines.reduce(|best, next| if next.0 > best.0 { next } else { best })?;
-        let lengths = [0, 1].map(|end| self.length(texture, &line, end, pair));
-        Some(Edge { line, between: [one, other], lengths })
+        }
+        found
     }
 
     /// How far a border's end has the two regions to its sides.
@@ -253,9 +253,80 @@ impl Regions {
     }
 }
 
+/// Places of a border around a part of a hole.
+struct Ways {
+    /// Middles of the part's pixels.
+    part: Vec<DVec2>,
+    /// Places near it.
+    near: Vec<DVec2>,
+}
+
+/// A straight way through a hole.
+struct Way {
+    line: Line,
+    /// Whether the border is there along each end.
+    ends: [bool; 2],
+    /// How much of the border is how near to each end.
+    fits: [f64; 2],
+}
+
+impl Way {
+    fn fit(&self) -> f64 {
+        self.fits[0] + self.fits[1]
+    }
+
+    /// The line, going into the hole at this end.
+    fn from(&self, end: usize) -> Line {
+        Line { ends: [self.line.ends[end], self.line.ends[1 - end]], ..self.line }
+    }
+}
+
+impl Ways {
+    fn new(texture: &Texture, part: &[usize], places: &[DVec2]) -> Self {
+        let part: Vec<DVec2> = part.iter().map(|i| middle_of(*i, texture.size[0])).collect();
+        let (low, high) = part.iter().fold((DVec2::MAX, DVec2::MIN), |(low, high), at| (low.min(*at), high.max(*at)));
+        let reach = DVec2::splat((high - low).max_element().max(LEAST_END));
+        let is_near = |at: &&DVec2| at.cmpge(low - reach).all() && at.cmple(high + reach).all();
+        Self { near: places.iter().filter(is_near).copied().collect(), part }
+    }
+
+    /// The ways between two places, along one of whose ends the border is.
+    fn all(&self) -> Vec<Way> {
+        let some: Vec<DVec2> = self.near.iter().copied().step_by(self.near.len().div_ceil(PLACES).max(1)).collect();
+        let pairs = (0..some.len()).flat_map(|a| (0..a).map(move |b| [b, a]));
+        pairs.filter_map(|pair| self.through(pair.map(|k| some[k]))).collect()
+    }
+
+    fn through(&self, ends: [DVec2; 2]) -> Option<Way> {
+        if ends[0].distance(ends[1]) < 0.5 * LEAST_END {
+            return None;
+        }
+        let line = Line { ends, beside: 1.0, known: 0.0, strength: 0.0 };
+        let inside = self.part.iter().map(|at| line.place(*at)).filter(|[_, aside]| aside.abs() <= 0.75);
+        let (from, to) = inside.fold((f64::MAX, f64::MIN), |(from, to), [at, _]| (from.min(at), to.max(at)));
+        (to - from >= LEAST_GAP).then_some(())?;
+        let (from, to) = (from - 1.0, to + 1.0);
+        let known = (END * (to - from)).max(LEAST_END);
+        let mut on = [0, 1].map(|_| vec![false; known as usize]);
+        let mut fits = [0.0; 2];
+        for [along, aside] in self.near.iter().map(|at| line.place(*at)) {
+            let (end, off) = if 2.0 * along < from + to { (0, from - along) } else { (1, along - to) };
+            if (0.0..known).contains(&off) && aside.abs() <= 2.0 * STRAIGHT {
+                fits[end] += 1.0 - (aside / (2.0 * STRAIGHT)).powi(2);
+                let place = on[end].get_mut(off as usize).filter(|_| aside.abs() <= STRAIGHT);
+                place.into_iter().for_each(|place| *place = true);
+            }
+        }
+        let ends = on.map(|on| on.iter().filter(|on| **on).count() as f64 >= WHOLE * on.len() as f64);
+        let line = Line { ends: [from, to].map(|at| line.ends[0] + line.along() * at), known, ..line };
+        ends.contains(&true).then_some(Way { line, ends, fits })
+    }
+}
+
 impl Edge {
-    /// The line in a picture so many times as large, where the colours to both sides differ most.
-    pub fn refined(&self, texture: &Texture, by: f64) -> Line {
+    /// How far to the side the border is seen along a way of this length from a place on: where the colours to both sides differ most, at
+    /// most so far; nothing where they do not.
+    fn step(&self, texture: &Texture, at: DVec2, away: DVec2, length: f64, most: i64) -> Option<f64> {
         let [one, other] = self.between.map(|color| color.map(f64::from));
         let off: [f64; 3] = std::array::from_fn(|c| one[c] - other[c]);
         let square: f64 = off.iter().map(|v| v * v).sum();
@@ -264,33 +335,63 @@ impl Edge {
             let i = source(texture, at)?;
             Some((0..3).map(|c| (f64::from(texture.rgb[i][c]) - other[c]) * off[c]).sum::<f64>() / square)
         };
-        let half = (ASIDE * by).ceil() as i64;
+        let across = |aside: i64| -> Option<f64> {
+            let places = (0..length as usize).map(|i| at + away.perp() * aside as f64 + away * (i as f64 + 0.5));
+            let known: Vec<f64> = places.filter_map(value).collect();
+            (2 * known.len() > length as usize).then(|| known.iter().sum::<f64>() / known.len() as f64)
+        };
+        let profile: Vec<(i64, f64)> = (-most..=most).filter_map(|aside| Some((aside, across(aside)?))).collect();
+        // The step of least squares.
+        let split = |k: usize| {
+            let mean = |part: &[(i64, f64)]| part.iter().map(|(_, v)| v).sum::<f64>() / part.len() as f64;
+            let apart = (mean(&profile[..k]) - mean(&profile[k..])).abs();
+            let weight = (k as f64 * (profile.len() - k) as f64).sqrt();
+            (apart * weight, apart, 0.5 * (profile[k - 1].0 + profile[k].0) as f64)
+        };
+        let best = (1..profile.len()).map(split).max_by(|a, b| a.0.total_cmp(&b.0));
+        best.filter(|(_, apart, _)| *apart >= SEEN).map(|(.., aside)| aside)
+    }
+
+    /// The line in a picture so many times as large, through where both its ends are seen.
+    pub fn refined(&self, texture: &Texture, by: f64) -> Line {
+        let most = (ASIDE * by).ceil() as i64;
         let middle = |line: &Line, end: usize| {
             let (at, away) = (line.ends[end], away(line, end));
-            let across = |aside: i64| -> Option<f64> {
-                let places =
-                    (0..line.known as usize).map(|i| at + away.perp() * aside as f64 + away * (i as f64 + 0.5));
-                let known: Vec<f64> = places.filter_map(value).collect();
-                (2 * known.len() > line.known as usize).then(|| known.iter().sum::<f64>() / known.len() as f64)
-            };
-            let profile: Vec<(i64, f64)> = (-half..=half).filter_map(|aside| Some((aside, across(aside)?))).collect();
-            // The step of least squares.
-            let split = |k: usize| {
-                let mean = |part: &[(i64, f64)]| part.iter().map(|(_, v)| v).sum::<f64>() / part.len() as f64;
-                let apart = (mean(&profile[..k]) - mean(&profile[k..])).abs();
-                let weight = (k as f64 * (profile.len() - k) as f64).sqrt();
-                (apart * weight, apart, 0.5 * (profile[k - 1].0 + profile[k].0) as f64)
-            };
-            let best = (1..profile.len()).map(split).max_by(|a, b| a.0.total_cmp(&b.0));
-            let aside = best.filter(|(_, apart, _)| *apart >= SEEN).map_or(0.0, |(.., aside)| aside);
+            let aside = self.step(texture, at, away, line.known, most).unwrap_or(0.0);
             at + away.perp() * aside + away * 0.5 * line.known
         };
         // Again from there: of a line that was far to the side a part was beyond what is looked at.
-        (0..3).fold(self.line.scaled(by), |line, _| {
+        (0..AGAIN).fold(self.line.scaled(by), |line, _| {
             let [a, b] = [0, 1].map(|end| middle(&line, end));
             let back = (b - a).normalize() * 0.5 * line.known;
             Line { ends: [a + back, b - back], ..line }
         })
+    }
+
+    /// The line in a picture so many times as large, as its first end goes in: through where both halves of that are seen; nothing where it
+    /// is not straight all along.
+    fn going_in(&self, texture: &Texture, by: f64) -> Option<Line> {
+        let most = (ASIDE * by).ceil() as i64;
+        let mut line = self.line.scaled(by);
+        let half = 0.5 * line.known;
+        for _ in 0..AGAIN {
+            let away = -line.along();
+            let seen = |from: f64| -> Option<DVec2> {
+                let at = line.ends[0] + away * from;
+                let aside = self.step(texture, at, away, half, most)?;
+                Some(at + away * 0.5 * half + away.perp() * aside)
+            };
+            let (near, far) = (seen(0.0)?, seen(half)?);
+            let along = (near - far).normalize();
+            let start = near + along * 0.5 * half;
+            line = Line { ends: [start, start + along * line.length()], ..line };
+        }
+        let away = -line.along();
+        let straight = |quarter: usize| {
+            let at = line.ends[0] + away * 0.5 * half * quarter as f64;
+            self.step(texture, at, away, 0.5 * half, most).is_some_and(|aside| aside.abs() <= BENT * by)
+        };
+        (0..4).all(straight).then_some(line)
     }
 
     /// What is copied along the line in a picture so many times as large.
@@ -353,6 +454,33 @@ mod tests {
         let (above, below) = (30 * 120 + 60, 60 * 120 + 60);
         assert!(regions.may(35 * 120 + 60, above) && !regions.may(35 * 120 + 60, below));
         assert!(regions.may(46 * 120 + 60, above) && regions.may(46 * 120 + 60, below));
+    }
+
+    /// A border that goes in on the left alone goes straight on.
+    #[test]
+    fn a_border_that_ends_goes_on() {
+        let line = |x: f64| 44.0 - 0.4 * (x - 60.0);
+        let color = |by: f64| {
+            move |x: usize, y: usize| {
+                let (x, y) = ((x as f64 + 0.5) / by, (y as f64 + 0.5) / by);
+                let n = noise(x as usize, y as usize);
+                if y > line(x) && x < 66.0 {
+                    [0.55 + 0.05 * n, 0.6, 0.7]
+                } else {
+                    [0.15 + 0.1 * n, 0.3 + 0.1 * n, 0.15]
+                }
+            }
+        };
+        let small = holed([120, 90], 18.0, color(1.0));
+        let hole = part(&small);
+        let regions = Regions::around(&small, &hole).expect("two");
+        let found = regions.ends(&small, &hole, &holed([480, 360], 72.0, color(4.0)), 4.0);
+        let edge = found.iter().find(|line| line.ends[0].x < 200.0).expect("the edge");
+        // Each half of what is seen of it is found to a pixel; what is farther away is off by as much more as it is farther from them.
+        let off = edge.ends.map(|end| (end.y - 4.0 * line(end.x / 4.0)).abs());
+        let most = 1.0 + 2.0 * (edge.length() + 0.25 * edge.known) / (0.5 * edge.known);
+        assert!(off[0] < 2.0 && off[1] < most, "{off:?}, {most}");
+        assert!(edge.ends[1].x > 280.0, "{:?}", edge.ends);
     }
 
     /// Tiles of two colours have many borders, and one that bends in the hole is no line.

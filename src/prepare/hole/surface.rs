@@ -5,7 +5,7 @@
 //! them look through. What nobody shows continues the surfaces around it ([`planes`]). A view that is solved counts for
 //! all that follow, so that all views end with the same surface.
 
-use glam::{DMat3, DVec3};
+use glam::{DMat3, DVec2, DVec3};
 use image::GrayImage;
 use rayon::prelude::*;
 
@@ -45,6 +45,8 @@ const UNSHOWN: f64 = 1.0;
 const UNSHOWN_BEHIND: f64 = 2.0;
 /// Part of the depth that a site was carried to before which no plane takes it: a bare surface is measured wrong, not so wrong.
 const NEARER: f64 = 0.5;
+/// Sites from a straight border in a hole from which on the surface on that side is known.
+const ASIDE: f64 = 1.5;
 /// Sites of a hole that are filled from their neighbours where no more than these are unknown.
 const FEW: usize = 12;
 
@@ -69,6 +71,9 @@ pub struct Sight {
     /// Surfaces of one material around the holes, where the views are too near each other to tell planes apart by what they look like on
     /// them.
     pub(super) covered: Vec<Covered>,
+    /// Straight borders between what looks different that go into the hole, places in sites: from where they do to where they come out of
+    /// it, or would.
+    pub borders: Vec<[DVec2; 2]>,
     /// Whether every site has its depth.
     pub solved: bool,
     /// How many views were solved before it.
@@ -184,6 +189,7 @@ impl Sight {
             planes: vec![],
             around: vec![],
             covered: vec![],
+            borders: vec![],
             solved: false,
             rank: 0,
         }
@@ -224,6 +230,9 @@ impl Sight {
     /// Depth z at a place in sites, of surfaces that end in smooth lines: the surface is that of most of the nine sites around the
     /// place, the nearer ones counting more. [`Sight::depth_at`] has the nearest site's, so that an end is a staircase of sites.
     pub fn smooth_depth_at(&self, place: [f64; 2]) -> f64 {
+        if let Some(beside) = self.beside_border(place) {
+            return self.depth_from(beside.map(|v| v.floor() as i64), place);
+        }
         let own = place.map(|v| v.floor() as i64);
         let Some(surface) = self.surface_from(own) else { return f64::NAN };
         let near: Vec<([i64; 2], f64, f64)> = (-1..=1)
@@ -304,6 +313,7 @@ impl Sight {
 
     /// The surface at a place in sites: that of most of the nine sites around it, the nearer ones counting more.
     pub fn surface_at(&self, place: [f64; 2]) -> u8 {
+        let place = self.beside_border(place).unwrap_or(place);
         let own = place.map(|v| v.floor() as i64);
         let mut votes: Vec<(u8, f64)> = vec![];
         for at in (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| [own[0] + dx, own[1] + dy])) {
@@ -315,6 +325,20 @@ impl Sight {
             }
         }
         votes.into_iter().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(0, |(surface, _)| surface)
+    }
+
+    /// Beside a straight border that goes on in the hole the place on the same side of it that is so far from it that its site is of what is
+    /// there; nothing elsewhere, and where there is the same on both sides.
+    fn beside_border(&self, place: [f64; 2]) -> Option<[f64; 2]> {
+        let at = DVec2::from(place);
+        let label = |at: DVec2| self.grid.site(at.x.floor() as i64, at.y.floor() as i64).map(|site| self.surface[site]);
+        self.borders.iter().find_map(|[from, to]| {
+            let (way, length) = ((to - from).normalize(), from.distance(*to));
+            let (along, aside) = (way.dot(at - from), way.perp_dot(at - from));
+            ((-1.0..=length).contains(&along) && aside.abs() < ASIDE).then_some(())?;
+            let [own, other] = [ASIDE, -ASIDE].map(|off| at + way.perp() * (off.copysign(off * aside) - aside));
+            (label(own)? != label(other)?).then_some(own.to_array())
+        })
     }
 
     /// The view's planes as another sees them: inverse depth by x/z, y/z and 1 of its camera.
@@ -665,8 +689,12 @@ impl Sights {
             (false, false) => own.material_costs(&sites, &known, &against),
             (false, true) => vec![],
         };
+        let corner = [sites[0] % own.grid.columns as usize, sites[0] / own.grid.columns as usize];
+        let corner = DVec2::from(corner.map(|v| v as f64));
+        let borders: Vec<[DVec2; 2]> = own.borders.iter().map(|ends| ends.map(|end| end - corner)).collect();
         let hole = planes::Hole {
             told,
+            borders: &borders,
             costs: &costs,
             size,
             disparity: &known,

@@ -453,18 +453,26 @@ fn go_on(texture: &mut Texture, cell: usize) -> Vec<Line> {
     found.into_iter().map(|(line, ..)| line).collect()
 }
 
+/// The parts of a reduced picture's hole, with the regions around them.
+fn parts(small: &Texture) -> Vec<(Vec<usize>, Regions)> {
+    let mut left = small.hole.clone();
+    let parts = (0..left.len()).map(|first| planes::connected(first, &mut left, small.size));
+    let large = parts.filter(|part| part.len() >= LEAST_PART);
+    large.filter_map(|part| Regions::around(small, &part).map(|regions| (part, regions))).collect()
+}
+
+/// Straight borders of regions that go into the hole, from where they do to where they come out of it, or would.
+pub fn ends(texture: &Texture) -> Vec<Line> {
+    let by = texture.size[0].max(texture.size[1]).div_ceil(SIDE).max(1);
+    let small = texture.reduced(by);
+    parts(&small).iter().flat_map(|(part, regions)| regions.ends(&small, part, texture, by as f64)).collect()
+}
+
 /// Fills the straight borders of regions that cross the hole, each along itself, so many pixels to each side.
 pub fn borders(texture: &mut Texture, half: f64) {
     let by = texture.size[0].max(texture.size[1]).div_ceil(SIDE).max(1);
     let small = texture.reduced(by);
-    let mut left = small.hole.clone();
-    let mut edges: Vec<Edge> = vec![];
-    for first in 0..left.len() {
-        let part = planes::connected(first, &mut left, small.size);
-        if part.len() >= LEAST_PART {
-            edges.extend(Regions::around(&small, &part).iter().flat_map(|regions| regions.edges(&small, &part)));
-        }
-    }
+    let edges: Vec<Edge> = parts(&small).iter().flat_map(|(part, regions)| regions.edges(&small, part)).collect();
     let full = |edge: &Edge| {
         let line = edge.refined(texture, by as f64);
         (line, half, edge.pieces(&line, by as f64))

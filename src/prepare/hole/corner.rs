@@ -1,0 +1,127 @@
+//! Where a surface ends along whose side a straight border goes on in the hole.
+//!
+//! People build with right angles: a bench whose back edge goes into the hole ends there as far along as its front does, which other
+//! views show. A border that comes out of the hole again needs no end.
+
+use glam::{DVec2, DVec3};
+
+use super::surface::Sight;
+use crate::prepare::planes;
+use crate::statistics::quantile;
+
+/// Sites from a border at which the surface to its side is looked at, how far before the hole, and how far in it.
+const ASIDE: f64 = 1.5;
+const BEFORE: [f64; 3] = [2.0, 4.0, 6.0];
+const BEHIND: [f64; 2] = [1.0, 3.0];
+/// Sites up to which another border begins where this one comes out, and the cosine from which on it is the same one.
+const NEAR: f64 = 6.0;
+const SAME_WAY: f64 = 0.9;
+/// Parts of a surface's width that are its far side, and its side along the border.
+const FAR: [f64; 2] = [0.6, 1.1];
+const ALONG: [f64; 2] = [0.0, 0.3];
+/// Quantiles of its sites that are its width, and its end.
+const WIDE: f64 = 0.95;
+const END: f64 = 0.98;
+/// Shortest way into the hole, as a part of that through it, after which a surface ends.
+const LEAST: f64 = 0.05;
+
+impl Sight {
+    /// The straight borders that go into the hole of a view that is solved. One along which a surface lies that ends on its far side ends
+    /// there, too, and a border at right angles to it is added.
+    pub fn cut_off(&self) -> Vec<[DVec2; 2]> {
+        let mut borders = self.borders.clone();
+        for k in 0..borders.len() {
+            let [from, to] = borders[k];
+            let way = (to - from).normalize();
+            let is_one = |[a, b]: &[DVec2; 2]| a.distance(to) < NEAR && (b - a).normalize().dot(way) < -SAME_WAY;
+            if self.borders.iter().any(is_one) {
+                continue;
+            }
+            if let Some([foot, corner]) = [ASIDE, -ASIDE].iter().find_map(|side| self.end([from, to], *side)) {
+                borders[k][1] = foot;
+                borders.push([corner, foot]);
+            }
+        }
+        borders
+    }
+
+    /// Where the surface ends that lies to a side of a border, at the border and on its far side.
+    fn end(&self, [from, to]: [DVec2; 2], side: f64) -> Option<[DVec2; 2]> {
+        let way = (to - from).normalize();
+        let beside = from + way.perp() * side;
+        let label = |at: DVec2| {
+            let site = self.grid.site(at.x.floor() as i64, at.y.floor() as i64);
+            site.map(|site| self.surface[site])
+        };
+        let own = label(beside - way * BEFORE[0])?;
+        let goes_in = BEFORE.iter().map(|far| -far).chain(BEHIND).all(|far| label(beside + way * far) == Some(own));
+        let plane = self.planes.get(usize::from(own)).filter(|_| goes_in)?;
+        let point = |at: DVec2| {
+            let ray = self.ray_at(at);
+            DVec3::new(ray[0], ray[1], 1.0) / planes::on(plane, ray)
+        };
+        let origin = point(from);
+        let length = origin.distance(point(to));
+        let along = (point(to) - origin) / length;
+        let across = DVec3::from(*plane).cross(along).normalize();
+        let across = across * across.dot(point(beside) - origin).signum();
+        let columns = self.grid.columns as usize;
+        // How far along the border each of its sites is, and how far from it; and whether that is in the hole.
+        let sites = (0..self.surface.len()).filter(|site| self.surface[*site] == own);
+        let places: Vec<(bool, f64, f64)> = sites
+            .map(|site| {
+                let off = point(DVec2::new((site % columns) as f64, (site / columns) as f64) + 0.5) - origin;
+                (self.hole[site], off.dot(along), off.dot(across))
+            })
+            .collect();
+        let before = places.iter().filter(|(hole, far, aside)| !hole && (-length..0.0).contains(far) && *aside > 0.0);
+        let wide = quantile(before.map(|(.., aside)| *aside), WIDE)?;
+        let end = |[from, to]: [f64; 2]| {
+            let within = places.iter().filter(|(.., aside)| (from * wide..to * wide).contains(aside));
+            quantile(within.map(|(_, far, _)| *far), END)
+        };
+        let (far, near) = (end(FAR)?, end(ALONG)?);
+        let foot = origin + along * far;
+        let seen = |point: DVec3| DVec2::from(self.grid.place([point.x / point.z, point.y / point.z]));
+        let ends = far > LEAST * length && far < near.min(length);
+        ends.then(|| [seen(foot), seen(foot + across * wide)])
+    }
+
+    /// Normalised coordinates of a place in sites.
+    fn ray_at(&self, at: DVec2) -> [f64; 2] {
+        let [here, next] = [0, 1].map(|k| DVec2::from(self.grid.ray([k, k])));
+        (here + (at - 0.5) * (next - here)).to_array()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::surface::Sights;
+    use super::super::surface::tests::{SIZE, views};
+    use super::*;
+
+    /// A bench whose back edge goes into the hole from the left ends as far along as its front does; one that comes out on the right stays.
+    #[test]
+    fn a_bench_ends_at_a_right_angle() {
+        let (grids, cameras, masks) = views(0.3);
+        let mut sights = Sights::new(grids, &cameras, &masks, &masks);
+        let sight = &mut sights.0[2];
+        sight.planes = vec![[0.0, 0.0, 0.25], [0.0, 0.0, 0.24]];
+        for site in 0..sight.surface.len() {
+            let [x, y] = [site as u32 % SIZE[0], site as u32 / SIZE[0]];
+            // Near its back it was found to go on farther than its front.
+            let bench = (10..24).contains(&y) && x < if y < 14 { 38 } else { 30 };
+            (sight.surface[site], sight.hole[site]) = (u8::from(!bench), (20..40).contains(&x));
+        }
+        let edge = [DVec2::new(20.0, 10.0), DVec2::new(40.0, 10.0)];
+        sight.borders = vec![edge];
+        let found = sight.cut_off();
+        assert_eq!(found.len(), 2, "{found:?}");
+        let [foot, corner] = [found[0][1], found[1][0]];
+        assert!(foot.distance(DVec2::new(30.0, 10.0)) < 1.0 && found[1][1] == foot, "{foot}");
+        assert!(corner.distance(DVec2::new(30.0, 24.0)) < 2.0, "{corner}");
+        // It comes out again.
+        sight.borders = vec![edge, [edge[1], edge[0]]];
+        assert_eq!(sight.cut_off(), sight.borders);
+    }
+}
