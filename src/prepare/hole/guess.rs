@@ -9,9 +9,10 @@ use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
 use super::color::{Filling, Photograph, between};
+use super::holed::Texture;
 use super::material::{MATERIAL, of_another};
 use super::surface::{APART, SAME, Sight, Sights};
-use super::texture::{self, Texture};
+use super::texture;
 use crate::prepare::planes::{self, Plane, membrane};
 use crate::scene::resample;
 use crate::statistics::quantile;

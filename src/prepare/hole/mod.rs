@@ -23,6 +23,7 @@ mod front;
 mod gradient;
 pub mod ground;
 mod guess;
+mod holed;
 mod lines;
 mod material;
 mod regions;

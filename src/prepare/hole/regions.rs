@@ -8,9 +8,9 @@ use std::collections::BTreeMap;
 
 use glam::DVec2;
 
+use super::holed::Texture;
 use super::lines::{Line, Piece, middle_of};
-use super::material::{MATERIAL, materials, of_another};
-use super::texture::{ENOUGH, Texture};
+use super::material::{ENOUGH, MATERIAL, materials, of_another};
 use crate::prepare::planes;
 
 /// Pixels to each side whose mean says what a pixel is of.

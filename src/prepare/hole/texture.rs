@@ -13,26 +13,14 @@ use image::GrayImage;
 use rayon::prelude::*;
 
 use super::gradient::{self, Equation};
+use super::holed::Texture;
 use super::lines::{self, Grey, Line, Piece};
-use super::material::{MATERIAL, of_another};
+use super::material::{ENOUGH, MATERIAL, of_another};
 use super::regions::{Edge, Regions};
-use super::similar::{DIFFERENT, Picture, RADIUS, Shift, most_alike};
+use super::similar::{DIFFERENT, RADIUS, Shift, most_alike};
 use crate::prepare::planes;
 use crate::scene::resample;
 use crate::statistics::quantile;
-
-/// A picture with a hole.
-#[derive(Clone, Debug)]
-pub struct Texture {
-    /// Width and height in pixels.
-    pub size: [usize; 2],
-    /// `[pixel]` RGB, 0 to 1; in the hole anything.
-    pub rgb: Vec<[f32; 3]>,
-    /// `[pixel]` whether it is to be filled; no more once it is.
-    pub hole: Vec<bool>,
-    /// `[pixel]` whether it may be copied; never in the hole.
-    pub source: Vec<bool>,
-}
 
 /// Longer side of the picture that lines are looked for in, pixels.
 const LINES: usize = 384;
@@ -65,8 +53,6 @@ const TINT: f32 = 0.03;
 /// from those that go on into the hole; it falls by a factor e every `FADES` of the hole's half width.
 const UNLIKE: f64 = 6.0;
 const FADES: f64 = 0.6;
-/// What there must be of the materials beside a hole for each pixel of it.
-pub(super) const ENOUGH: f64 = 0.25;
 /// How many times the contrast of a hole's rim may be copied into it, contrast that may always be, and half the width of what
 /// belongs to a line on the rim, pixels.
 const BUSIER: f32 = 1.5;
@@ -82,40 +68,6 @@ const SEAM: f64 = 10.0;
 const LEAST_SEAM: f64 = 0.05;
 
 impl Texture {
-    fn picture(&self) -> Picture<'_> {
-        Picture { rgb: &self.rgb, known: &self.source, size: self.size }
-    }
-
-    /// The pixel at a shift from another, if it is in the picture.
-    pub(super) fn shifted(&self, pixel: usize, [dx, dy]: Shift) -> Option<usize> {
-        let [w, h] = self.size.map(|n| n as isize);
-        let (x, y) = (pixel as isize % w + dx, pixel as isize / w + dy);
-        (x >= 0 && y >= 0 && x < w && y < h).then(|| (y * w + x) as usize)
-    }
-
-    /// The pixel at a shift, if it may be copied.
-    fn source(&self, pixel: usize, shift: Shift) -> Option<usize> {
-        self.shifted(pixel, shift).filter(|at| self.source[*at])
-    }
-
-    /// Reduced by a whole factor: means of what is known, hole where any of its pixels is.
-    fn reduced(&self, by: usize) -> Self {
-        let size @ [w, h] = self.size.map(|n| n.div_ceil(by));
-        let mut small = Self { size, rgb: vec![[0.0; 3]; w * h], hole: vec![false; w * h], source: vec![false; w * h] };
-        for (at, rgb) in small.rgb.iter_mut().enumerate() {
-            let (x0, y0) = (at % w * by, at / w * by);
-            let rows = y0..(y0 + by).min(self.size[1]);
-            let pixels: Vec<usize> =
-                rows.flat_map(|y| (x0..(x0 + by).min(self.size[0])).map(move |x| y * self.size[0] + x)).collect();
-            small.hole[at] = pixels.iter().any(|i| self.hole[*i]);
-            small.source[at] = pixels.iter().all(|i| self.source[*i]);
-            let known: Vec<usize> = pixels.iter().copied().filter(|i| !self.hole[*i]).collect();
-            let count = known.len().max(1) as f32;
-            *rgb = std::array::from_fn(|c| known.iter().map(|i| self.rgb[*i][c]).sum::<f32>() / count);
-        }
-        small
-    }
-
     fn apart(&self, a: usize, b: usize) -> f32 {
         apart(self.rgb[a], self.rgb[b])
     }
@@ -310,17 +262,6 @@ impl Texture {
     /// The mean of what is known around a pixel; NaN where nothing is.
     fn mean_around(&self, pixel: usize) -> [f32; 3] {
         self.mean_within(pixel, SURROUNDINGS)
-    }
-
-    /// The same of what is known so near.
-    pub(super) fn mean_within(&self, pixel: usize, reach: usize) -> [f32; 3] {
-        let [w, h] = self.size;
-        let (x, y) = (pixel % w, pixel / w);
-        let rows = y.saturating_sub(reach)..(y + reach + 1).min(h);
-        let near = rows.flat_map(|v| (x.saturating_sub(reach)..(x + reach + 1).min(w)).map(move |u| v * w + u));
-        let known: Vec<usize> = near.filter(|j| self.source[*j]).collect();
-        let n = known.len() as f32;
-        std::array::from_fn(|c| known.iter().map(|j| self.rgb[*j][c]).sum::<f32>() / n)
     }
 
     /// The contrast up to which something may be copied into a part of the hole with this rim: what stands out more than all that is
