@@ -17,7 +17,7 @@ const BEHIND: [f64; 2] = [1.0, 3.0];
 const NEAR: f64 = 6.0;
 const SAME_WAY: f64 = 0.9;
 /// Parts of a surface's width that are its far side, and its side along the border.
-const FAR: [f64; 2] = [0.6, 1.1];
+const FAR: [f64; 2] = [0.85, 1.05];
 const ALONG: [f64; 2] = [0.0, 0.3];
 /// Quantiles of its sites that are its width, and its end.
 const WIDE: f64 = 0.95;
