@@ -32,7 +32,7 @@ pub struct Covered {
 }
 
 impl Covered {
-    /// As a view sees a plane of this colour; nothing where its camera stands in it.
+    /// A plane of this colour as a view sees it; nothing where its camera stands in it.
     pub(super) fn seen_by(plane: &Common, color: [f32; 3], sight: &Sight) -> Option<Self> {
         plane.seen_by(sight).map(|plane| Self { plane, color })
     }
