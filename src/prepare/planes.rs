@@ -38,7 +38,7 @@ pub const IMPOSSIBLE: f64 = 40.0;
 const BORDER: f64 = 6.0;
 /// How many times more it costs along the object's outline: a surface that ends just there would be a coincidence.
 const COINCIDENCE: f64 = 4.0;
-/// What part of it it costs where a straight border of what looks different goes on, and how far before that begins, pixels.
+/// The part of that that a border costs where a straight one of what looks different goes on, and how far before it begins, pixels.
 const GOES_ON: f64 = 0.25;
 const BEFORE: f64 = 3.0;
 /// Costs are whole numbers of this fraction.

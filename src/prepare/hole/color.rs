@@ -713,7 +713,7 @@ mod tests {
         assert!((found[0] - 1.5).abs() < 1e-5 && (found[1] - 3.25).abs() < 1e-5, "{found:?}");
     }
 
-    /// Of the variance of single pixels cubic weights leave 0.58 in the mean over all places, linear ones 0.44.
+    /// Cubic weights leave 0.58 of the variance of single pixels, in the mean over all places, linear ones 0.44.
     #[test]
     fn grain_is_kept() {
         let grain = |x: i64, y: i64| 0.5 + 0.2 * ((x * 7919 + y * 104_729).rem_euclid(97) as f32 / 97.0 - 0.5);

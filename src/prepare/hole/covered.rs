@@ -46,7 +46,7 @@ impl Sight {
         std::array::from_fn(|c| sum(c) / (255.0 * near.len() as f32))
     }
 
-    /// What the surface of this number is covered with, where that is known.
+    /// The material of the surface of this number, where that is known.
     pub fn material(&self, surface: usize) -> Option<[f32; 3]> {
         self.covered.get(surface).filter(|_| surface < self.planes.len()).map(|covered| covered.color)
     }

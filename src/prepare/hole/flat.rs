@@ -173,7 +173,7 @@ impl Sights {
             .collect()
     }
 
-    /// What a view measures at a site.
+    /// The point that a view measures at a site.
     pub(super) fn measured(&self, view: usize, site: usize) -> Measured {
         let sight = &self.0[view];
         Measured { point: sight.point(site, sight.depth[site]), eye: sight.eye() }
@@ -184,7 +184,7 @@ impl Sights {
         self.flatten_from(PARALLAX, seed);
     }
 
-    /// The same for views with at least this parallax; others get the surfaces of one material around the holes.
+    /// Flattens views with at least this parallax; others get the surfaces of one material around the holes.
     fn flatten_from(&mut self, parallax: f64, seed: u64) {
         let common = self.common(seed);
         let of = |view: usize| self.flat(view, &common, parallax, seed + view as u64);

@@ -223,7 +223,7 @@ fn texel(texture: &Texture, wanted: &[bool], place: [f64; 2]) -> Option<[f32; 3]
 struct Its<'a> {
     /// How far what lies on a surface may be off the plane, if it is one of these.
     off: &'a (dyn Fn(u8) -> Option<f64> + Sync),
-    /// What they are covered with; nothing where that is not known.
+    /// Materials that they are covered with; nothing where that is not known.
     materials: Vec<[f32; 3]>,
 }
 

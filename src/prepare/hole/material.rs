@@ -5,7 +5,7 @@ pub const MATERIAL: f32 = 0.25;
 /// Mean difference of the channels up to which surroundings are of one material in another light, which costs nothing: copies
 /// take the light of their place.
 const LIGHT: f32 = 0.05;
-/// What there must be of the materials beside a hole for each pixel of it.
+/// Pixels of the materials beside a hole that there must be for each pixel of it.
 pub const ENOUGH: f64 = 0.25;
 /// Colours among which materials are looked for at most, and the least part of them that makes one.
 const SAMPLES: usize = 300;

@@ -394,7 +394,7 @@ impl Edge {
         (0..4).all(straight).then_some(line)
     }
 
-    /// What is copied along the line in a picture so many times as large.
+    /// The pieces that are copied along the line in a picture so many times as large.
     pub fn pieces(&self, line: &Line, by: f64) -> [Piece; 2] {
         [0, 1].map(|end| Piece::new(away(line, end), self.lengths[end] * by))
     }
