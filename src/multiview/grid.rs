@@ -52,7 +52,12 @@ impl DepthGrid {
 
     /// Normalised coordinates of a site's centre.
     pub fn ray(&self, [column, row]: [u32; 2]) -> [f64; 2] {
-        let at = [column, row].map(|n| (f64::from(n) + 0.5) * f64::from(self.stride));
+        self.ray_at([column, row].map(|n| f64::from(n) + 0.5))
+    }
+
+    /// Normalised coordinates of a place in sites.
+    pub fn ray_at(&self, place: [f64; 2]) -> [f64; 2] {
+        let at = place.map(|v| v * f64::from(self.stride));
         std::array::from_fn(|a| (at[a] - f64::from(self.camera.principal[a])) / f64::from(self.camera.focal[a]))
     }
 

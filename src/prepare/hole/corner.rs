@@ -9,7 +9,7 @@ use super::surface::Sight;
 use crate::prepare::planes;
 use crate::statistics::quantile;
 
-/// Sites from a border at which the surface to its side is looked at, how far before the hole, and how far in it.
+/// Sites from a border at which the surface to its side is known, how far before the hole, and how far in it.
 const ASIDE: f64 = 1.5;
 const BEFORE: [f64; 3] = [2.0, 4.0, 6.0];
 const BEHIND: [f64; 2] = [1.0, 3.0];
@@ -49,15 +49,12 @@ impl Sight {
     fn end(&self, [from, to]: [DVec2; 2], side: f64) -> Option<[DVec2; 2]> {
         let way = (to - from).normalize();
         let beside = from + way.perp() * side;
-        let label = |at: DVec2| {
-            let site = self.grid.site(at.x.floor() as i64, at.y.floor() as i64);
-            site.map(|site| self.surface[site])
-        };
+        let label = |at: DVec2| self.label(at);
         let own = label(beside - way * BEFORE[0])?;
         let goes_in = BEFORE.iter().map(|far| -far).chain(BEHIND).all(|far| label(beside + way * far) == Some(own));
         let plane = self.planes.get(usize::from(own)).filter(|_| goes_in)?;
         let point = |at: DVec2| {
-            let ray = self.ray_at(at);
+            let ray = self.grid.ray_at(at.to_array());
             DVec3::new(ray[0], ray[1], 1.0) / planes::on(plane, ray)
         };
         let origin = point(from);
@@ -87,10 +84,22 @@ impl Sight {
         ends.then(|| [seen(foot), seen(foot + across * wide)])
     }
 
-    /// Normalised coordinates of a place in sites.
-    fn ray_at(&self, at: DVec2) -> [f64; 2] {
-        let [here, next] = [0, 1].map(|k| DVec2::from(self.grid.ray([k, k])));
-        (here + (at - 0.5) * (next - here)).to_array()
+    /// Beside a straight border that goes on in the hole the place on the same side of it that is so far from it that its site is of what is
+    /// there; nothing elsewhere, and where there is the same on both sides.
+    pub(super) fn beside_border(&self, place: [f64; 2]) -> Option<[f64; 2]> {
+        let at = DVec2::from(place);
+        self.borders.iter().find_map(|[from, to]| {
+            let (way, length) = ((to - from).normalize(), from.distance(*to));
+            let (along, aside) = (way.dot(at - from), way.perp_dot(at - from));
+            ((-1.0..=length).contains(&along) && aside.abs() < ASIDE).then_some(())?;
+            let [own, other] = [ASIDE, -ASIDE].map(|off| at + way.perp() * (off.copysign(off * aside) - aside));
+            (self.label(own)? != self.label(other)?).then_some(own.to_array())
+        })
+    }
+
+    /// The surface of the site at a place.
+    fn label(&self, at: DVec2) -> Option<u8> {
+        self.grid.site(at.x.floor() as i64, at.y.floor() as i64).map(|site| self.surface[site])
     }
 }
 

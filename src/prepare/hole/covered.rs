@@ -8,7 +8,7 @@ use rand_pcg::Pcg64;
 use rayon::prelude::*;
 
 use super::flat::{self, Common};
-use super::material::{MATERIAL, materials, of_another};
+use super::material::{MATERIAL, materials, nearest, of_another};
 use super::surface::{Sight, Sights};
 use crate::prepare::planes::{self, Plane};
 
@@ -85,11 +85,8 @@ impl Sights {
         let colors = materials(&all.iter().map(|(_, color)| *color).collect::<Vec<_>>());
         let least = (LEAST * all.len() as f64).ceil() as usize;
         let mut rng = Pcg64::new(seed.into(), 44);
-        let nearest = |color: [f32; 3]| {
-            let apart = |k: &usize| of_another(color, colors[*k]);
-            (0..colors.len()).min_by(|a, b| apart(a).total_cmp(&apart(b)))
-        };
-        let of = |k: usize| all.iter().filter(move |(_, color)| nearest(*color) == Some(k)).map(|(at, _)| *at);
+        let colors = &colors;
+        let of = |k: usize| all.iter().filter(move |(_, color)| nearest(*color, colors) == Some(k)).map(|(at, _)| *at);
         let mut found = vec![];
         for (k, color) in colors.iter().enumerate() {
             let points = of(k).map(|(view, site)| self.measured(view, site)).collect();

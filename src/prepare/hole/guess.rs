@@ -328,14 +328,8 @@ pub fn ends(sight: &Sight, own: &Photograph<'_>) -> Vec<[DVec2; 2]> {
     let hole: Vec<usize> = (0..w * h).filter(|i| inside(*i)).collect();
     let large = parts(&hole, [w, h]).into_iter().filter(|part| part.len() as f64 >= LARGE * (w * h) as f64);
     let of = |part: Vec<usize>| {
-        let (cells, size) = surroundings(&part, [w, h]);
-        let color = |i: &usize| own.picture.get_pixel((i % w) as u32, (i / w) as u32).0.map(|v| f32::from(v) / 255.0);
-        let texture = Texture {
-            size,
-            rgb: cells.iter().map(color).collect(),
-            hole: cells.iter().map(|i| inside(*i)).collect(),
-            source: cells.iter().map(|i| !inside(*i)).collect(),
-        };
+        let color = |i: usize| own.picture.get_pixel((i % w) as u32, (i / w) as u32).0.map(|v| f32::from(v) / 255.0);
+        let (cells, texture) = around(&part, [w, h], color, inside, |i| !inside(i));
         let corner = DVec2::new((cells[0] % w) as f64, (cells[0] / w) as f64);
         let place = |at: DVec2| Some(DVec2::from(sight.grid.place(own.camera.unproject((at + corner).to_array())?)));
         let found = texture::ends(&texture);
@@ -350,13 +344,8 @@ fn borders(filling: &mut Filling, size: [usize; 2], wanted: &[bool], half: f64) 
     let of: Vec<usize> = (0..wanted.len()).filter(|i| wanted[*i]).collect();
     let large = parts(&of, size).into_iter().filter(|part| part.len() as f64 >= LARGE * wanted.len() as f64);
     for part in large {
-        let (cells, size) = surroundings(&part, size);
-        let mut texture = Texture {
-            size,
-            rgb: cells.iter().map(|i| filling.rgb[*i]).collect(),
-            hole: cells.iter().map(|i| filling.guessed[*i]).collect(),
-            source: cells.iter().map(|i| !filling.guessed[*i]).collect(),
-        };
+        let guessed = |i: usize| filling.guessed[i];
+        let (cells, mut texture) = around(&part, size, |i| filling.rgb[i], guessed, |i| !guessed(i));
         texture::borders(&mut texture, half);
         for (cell, i) in cells.iter().enumerate().filter(|(cell, _)| !texture.hole[*cell]) {
             if std::mem::take(&mut filling.guessed[*i]) {
@@ -376,16 +365,10 @@ fn in_picture(filling: &mut Filling, size: [usize; 2], wanted: &[bool], surface:
         for label in labels {
             let of: Vec<usize> = left.iter().copied().filter(|i| !same || surface(*i) == label).collect();
             for part in parts(&of, size) {
-                let (cells, [cw, ch]) = surroundings(&part, size);
                 let mut wanted = vec![false; filling.guessed.len()];
                 part.iter().for_each(|i| wanted[*i] = true);
-                let source = |i: &usize| !filling.guessed[*i] && (!same || surface(*i) == label);
-                let mut texture = Texture {
-                    size: [cw, ch],
-                    rgb: cells.iter().map(|i| filling.rgb[*i]).collect(),
-                    hole: cells.iter().map(|i| wanted[*i]).collect(),
-                    source: cells.par_iter().map(source).collect(),
-                };
+                let source = |i: usize| !filling.guessed[i] && (!same || surface(i) == label);
+                let (cells, mut texture) = around(&part, size, |i| filling.rgb[i], |i| wanted[i], source);
                 if texture::fill(&mut texture) {
                     for (cell, i) in cells.iter().enumerate().filter(|(cell, i)| wanted[**i] && !texture.hole[*cell]) {
                         filling.rgb[*i] = texture.rgb[cell];
@@ -395,6 +378,21 @@ fn in_picture(filling: &mut Filling, size: [usize; 2], wanted: &[bool], surface:
             }
         }
     }
+}
+
+/// The pixels of the surroundings of some, and their texture: each one's colour, whether it is to be filled, and whether it may be copied.
+fn around(
+    of: &[usize],
+    size: [usize; 2],
+    color: impl Fn(usize) -> [f32; 3],
+    hole: impl Fn(usize) -> bool,
+    source: impl Fn(usize) -> bool + Sync,
+) -> (Vec<usize>, Texture) {
+    let (cells, size) = surroundings(of, size);
+    let rgb = cells.iter().map(|i| color(*i)).collect();
+    let hole = cells.iter().map(|i| hole(*i)).collect();
+    let source = cells.par_iter().map(|i| source(*i)).collect();
+    (cells, Texture { size, rgb, hole, source })
 }
 
 /// The box of some pixels and as much again on each side: its pixels, width and height.

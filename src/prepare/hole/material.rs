@@ -20,6 +20,12 @@ pub fn of_another(one: [f32; 3], other: [f32; 3]) -> f32 {
     color + 3.0 * (light.abs() - LIGHT).max(0.0)
 }
 
+/// The number of the material that a colour is nearest to, of these mean colours.
+pub fn nearest(color: [f32; 3], materials: &[[f32; 3]]) -> Option<usize> {
+    let apart = |k: &usize| of_another(color, materials[*k]);
+    (0..materials.len()).min_by(|a, b| apart(a).total_cmp(&apart(b)))
+}
+
 /// The mean colours of the materials among the colours of surroundings, the most frequent first: the two that are least apart become one
 /// until all are of different materials.
 pub fn materials(colors: &[[f32; 3]]) -> Vec<[f32; 3]> {

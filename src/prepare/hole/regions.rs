@@ -10,7 +10,7 @@ use glam::DVec2;
 
 use super::holed::Texture;
 use super::lines::{Line, Piece, middle_of};
-use super::material::{ENOUGH, MATERIAL, materials, of_another};
+use super::material::{ENOUGH, MATERIAL, materials, nearest, of_another};
 use crate::prepare::planes;
 
 /// Pixels to each side whose mean says what a pixel is of.
@@ -147,12 +147,9 @@ impl Regions {
         let costs: Vec<Vec<f64>> =
             means.iter().map(|mean| colors.iter().map(|color| cost(mean, color)).collect()).collect();
         let found = planes::cheapest(&costs, &planes::Border { between: |_| BORDER, at: |_, _| 0.0 }, size);
-        let nearest = |color: [f32; 3]| {
-            let apart = |k: &usize| of_another(color, means[*k]);
-            (0..means.len()).min_by(|a, b| apart(a).total_cmp(&apart(b))).unwrap_or(0)
-        };
         // Beyond by its own colour.
-        let mut of: Vec<u8> = (0..w * h).map(|i| color(i).map_or(0, nearest) as u8).collect();
+        let mut of: Vec<u8> =
+            (0..w * h).map(|i| color(i).and_then(|color| nearest(color, &means)).unwrap_or(0) as u8).collect();
         pixels.iter().zip(found).for_each(|(i, label)| of[*i] = label as u8);
         gradual(texture, &means, &mut of);
         let near = |i: usize| {

@@ -5,9 +5,12 @@
 
 use glam::{DVec2, DVec3};
 
+use super::surface::Sight;
 use crate::prepare::planes::{self, Plane};
 use crate::statistics::{median, quantile};
 
+/// Least part of what is known around a hole that lies on a plane, and on none before it, for the object to stand on that.
+const SHOWN: f64 = 0.05;
 /// Fewest points of the object that tell what it stands on.
 const FEWEST: usize = 30;
 /// Points higher than this part of the object's height are clear of the plane; lower ones touch it.
@@ -100,6 +103,43 @@ fn hull(mut points: Vec<DVec2>) -> Vec<DVec2> {
     let mut corners = half(&mut points.iter().copied());
     corners.extend(half(&mut points.iter().rev().copied()));
     corners
+}
+
+impl Sight {
+    /// The planes, of these of the view, that the object stands on.
+    pub(super) fn supports(&self, planes: &[Plane]) -> Vec<Support> {
+        // The margin around the object shows what is behind it.
+        let deep = |site: usize| self.around(site).all(|near| self.hole[near]);
+        let sites = (0..self.hole.len()).filter(|site| self.grid.confirmed[*site] && deep(*site));
+        let object: Vec<DVec3> = sites
+            .map(|site| {
+                let [x, y] = self.ray(site);
+                DVec3::new(x, y, 1.0) * self.grid.depth[site]
+            })
+            .collect();
+        let supports: Vec<Support> =
+            self.shown(planes).iter().filter_map(|plane| Support::new(*plane, &object)).collect();
+        log::debug!("surface: {} planes, the object stands on {}", planes.len(), supports.len());
+        supports
+    }
+
+    /// The planes, of these of the view, that it shows around its hole: not only where they cross one before them.
+    fn shown(&self, planes: &[Plane]) -> Vec<Plane> {
+        let near = self.surroundings();
+        let known = (0..near.len()).filter(|site| near[*site] && !self.hole[*site] && self.depth[*site].is_finite());
+        let on = |site: usize, plane: &Plane| {
+            (planes::on(plane, self.ray(site)) * self.depth[site] - 1.0).abs() <= planes::THICKNESS
+        };
+        let (mut counts, mut all) = (vec![0usize; planes.len()], 0usize);
+        for site in known {
+            all += 1;
+            if let Some(first) = planes.iter().position(|plane| on(site, plane)) {
+                counts[first] += 1;
+            }
+        }
+        let enough = |count: usize| count as f64 >= SHOWN * all as f64;
+        planes.iter().zip(counts).filter(|(_, count)| enough(*count)).map(|(plane, _)| *plane).collect()
+    }
 }
 
 #[cfg(test)]

@@ -11,7 +11,6 @@ use rayon::prelude::*;
 
 use super::covered::Covered;
 use super::flat;
-use super::support::Support;
 use super::window::Window;
 use crate::multiview::DepthGrid;
 use crate::prepare::planes;
@@ -31,8 +30,6 @@ const HULL: f64 = 0.8;
 pub(super) const HULL_VIEWS: usize = 3;
 /// Part that speaks against a surface behind what the object stands on: it is likely hidden, which is no proof.
 const BELOW: f64 = 0.5;
-/// Least part of what is known around a hole that lies on a plane, and on none before it, for the object to stand on that.
-const SHOWN: f64 = 0.05;
 /// Relative difference to a plane up to which a measured inverse depth is taken to lie on it.
 const FLAT: f32 = 0.015;
 /// Least width of a hole's surroundings, sites.
@@ -45,8 +42,6 @@ const UNSHOWN: f64 = 1.0;
 const UNSHOWN_BEHIND: f64 = 2.0;
 /// Part of the depth that a site was carried to before which no plane takes it: a bare surface is measured wrong, not so wrong.
 const NEARER: f64 = 0.5;
-/// Sites from a straight border in a hole from which on the surface on that side is known.
-const ASIDE: f64 = 1.5;
 /// Sites of a hole that are filled from their neighbours where no more than these are unknown.
 const FEW: usize = 12;
 
@@ -327,20 +322,6 @@ impl Sight {
         votes.into_iter().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(0, |(surface, _)| surface)
     }
 
-    /// Beside a straight border that goes on in the hole the place on the same side of it that is so far from it that its site is of what is
-    /// there; nothing elsewhere, and where there is the same on both sides.
-    fn beside_border(&self, place: [f64; 2]) -> Option<[f64; 2]> {
-        let at = DVec2::from(place);
-        let label = |at: DVec2| self.grid.site(at.x.floor() as i64, at.y.floor() as i64).map(|site| self.surface[site]);
-        self.borders.iter().find_map(|[from, to]| {
-            let (way, length) = ((to - from).normalize(), from.distance(*to));
-            let (along, aside) = (way.dot(at - from), way.perp_dot(at - from));
-            ((-1.0..=length).contains(&along) && aside.abs() < ASIDE).then_some(())?;
-            let [own, other] = [ASIDE, -ASIDE].map(|off| at + way.perp() * (off.copysign(off * aside) - aside));
-            (label(own)? != label(other)?).then_some(own.to_array())
-        })
-    }
-
     /// The view's planes as another sees them: inverse depth by x/z, y/z and 1 of its camera.
     fn planes_for(&self, other: &Self) -> Vec<planes::Plane> {
         // A plane p is p . x = 1 in camera coordinates.
@@ -352,41 +333,6 @@ impl Sight {
             (turn.transpose() * plane / (1.0 - plane.dot(shift))).to_array()
         };
         self.planes.iter().map(plane).collect()
-    }
-
-    /// The planes, of these of the view, that the object stands on.
-    pub(super) fn supports(&self, planes: &[planes::Plane]) -> Vec<Support> {
-        // The margin around the object shows what is behind it.
-        let deep = |site: usize| self.around(site).all(|near| self.hole[near]);
-        let sites = (0..self.hole.len()).filter(|site| self.grid.confirmed[*site] && deep(*site));
-        let object: Vec<DVec3> = sites
-            .map(|site| {
-                let [x, y] = self.ray(site);
-                DVec3::new(x, y, 1.0) * self.grid.depth[site]
-            })
-            .collect();
-        let supports: Vec<Support> =
-            self.shown(planes).iter().filter_map(|plane| Support::new(*plane, &object)).collect();
-        log::debug!("surface: {} planes, the object stands on {}", planes.len(), supports.len());
-        supports
-    }
-
-    /// The planes, of these of the view, that it shows around its hole: not only where they cross one before them.
-    fn shown(&self, planes: &[planes::Plane]) -> Vec<planes::Plane> {
-        let near = self.surroundings();
-        let known = (0..near.len()).filter(|site| near[*site] && !self.hole[*site] && self.depth[*site].is_finite());
-        let on = |site: usize, plane: &planes::Plane| {
-            (planes::on(plane, self.ray(site)) * self.depth[site] - 1.0).abs() <= planes::THICKNESS
-        };
-        let (mut counts, mut all) = (vec![0usize; planes.len()], 0usize);
-        for site in known {
-            all += 1;
-            if let Some(first) = planes.iter().position(|plane| on(site, plane)) {
-                counts[first] += 1;
-            }
-        }
-        let enough = |count: usize| count as f64 >= SHOWN * all as f64;
-        planes.iter().zip(counts).filter(|(_, count)| enough(*count)).map(|(plane, _)| *plane).collect()
     }
 
     /// Normalised coordinates of a site's centre.
@@ -420,7 +366,7 @@ impl Sight {
     }
 
     /// The sites within one of this one, itself included.
-    fn around(&self, site: usize) -> impl Iterator<Item = usize> + '_ {
+    pub(super) fn around(&self, site: usize) -> impl Iterator<Item = usize> + '_ {
         self.grid.around(site, 1)
     }
 }
