@@ -32,6 +32,8 @@ const LEAST: usize = 40;
 /// of which little is seen, come to less than 2.
 const FITS: f32 = 2.0;
 const BETTER: f32 = 1.5;
+/// The mean of the logarithms from which on a mask lies on the object, whatever is beside it: two thirds of a mask where colours are sure.
+const THERE: f32 = 1.0;
 
 /// The colours of the object, and of what is around it where its masks are given.
 pub struct Looks {
@@ -118,6 +120,10 @@ impl Looks {
             };
             of.iter().map(at).sum::<f32>() / of.len() as f32
         };
+        // What looks like the object may be behind it.
+        if mean(&inside, [0, 0]) >= THERE {
+            return None;
+        }
         let fits = |shift: [i32; 2]| mean(&inside, shift) - mean(&outside, shift);
         let shifts = (-farthest..=farthest).flat_map(|dy| (-farthest..=farthest).map(move |dx| [dx, dy]));
         let (best, shift) =
@@ -187,6 +193,17 @@ mod tests {
         assert_eq!(masks::threshold(&back, [160, 120], [160, 120], 0.5), truth);
         // By a pixel or two is what the outline is refined by.
         assert_eq!(looks.shift(&picture(62).0, &mask), None);
+    }
+
+    /// Before a wall of the object's colours a mask on the object stays, though the end of the wall stands out more.
+    #[test]
+    fn what_looks_like_the_object_behind_it_does_not_move_it() {
+        let (learnt, mask) = picture(60);
+        let looks = Looks::of(std::iter::once((&learnt, &mask))).expect("an object");
+        let wall = |x: u32, y: u32| (45..105).contains(&x) && (28..92).contains(&y);
+        let other =
+            RgbImage::from_fn(160, 120, |x, y| if wall(x, y) { Rgb([190, 70, 60]) } else { *learnt.get_pixel(x, y) });
+        assert_eq!(looks.shift(&other, &mask), None);
     }
 
     /// Where the object's colours are those of its surroundings, and where it is out of the picture, its mask stays.
