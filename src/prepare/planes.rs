@@ -41,6 +41,10 @@ const COINCIDENCE: f64 = 4.0;
 /// The part of that that a border costs where a straight one of what looks different goes on, and how far before it begins, pixels.
 const GOES_ON: f64 = 0.25;
 const BEFORE: f64 = 3.0;
+/// Where photographs tell surfaces apart, the part of that that a border costs along which two planes meet; it costs all of it where they
+/// are apart by this part of the inverse depth.
+const MEETING: f64 = 0.25;
+const GAP: f64 = 2.0 * THICKNESS;
 /// Costs are whole numbers of this fraction.
 const UNIT: f64 = 64.0;
 /// Largest cost of a pair of nodes, in these fractions.
@@ -196,9 +200,18 @@ fn labels<F: Fn(usize, f64) -> f64 + Sync>(hole: &Hole<'_, F>, planes: &[Plane])
             true => COINCIDENCE,
             false => 1.0,
         };
-        BORDER * times
+        BORDER * times * if hole.told { MEETING } else { 1.0 }
     };
-    let current = cheapest(&costs, &Border { between, at: |_, _| 0.0 }, size);
+    // Two planes meet in one line, and a border elsewhere is one of a surface that ends.
+    let at = |node: usize, [a, b]: [usize; 2]| -> f64 {
+        if !hole.told || a == b {
+            return 0.0;
+        }
+        let inverse = |label: usize| Some(on(planes.get(label)?, hole.rays[middle(node)]?)).filter(|d| *d > 0.0);
+        let gap = inverse(a).zip(inverse(b)).map_or(1.0, |(a, b)| ((a - b).abs() / (GAP * a.max(b))).min(1.0));
+        0.5 * (1.0 - MEETING) * BORDER * gap * if outline[node] { COINCIDENCE } else { 1.0 }
+    };
+    let current = cheapest(&costs, &Border { between, at }, size);
     (0..w * h).map(|i| current[(i / w / stride) * gw + (i % w) / stride] as u8).collect()
 }
 

@@ -7,9 +7,9 @@
 use rand_pcg::Pcg64;
 use rayon::prelude::*;
 
-use super::flat::{self, Common};
+use super::flat::{self, Common, Measured};
 use super::material::{MATERIAL, materials, nearest, of_another};
-use super::surface::{Sight, Sights};
+use super::surface::{SAME, Sight, Sights};
 use crate::prepare::planes::{self, Plane};
 
 /// Least part of the points around all holes that makes a surface.
@@ -21,6 +21,17 @@ const COST: f64 = 2.0;
 const MOST: f64 = 4.0;
 /// Cost of a site beside the surfaces, of whatever colour.
 const BESIDE: f64 = 3.0;
+/// Most that a site costs on a plane that is not covered with its material, where others are.
+const BARE: f64 = 2.0;
+/// Part of a plane's points that is of any material by chance, and from which on it is covered with that.
+const STRAY: f64 = 0.02;
+const COVERS: f64 = 0.25;
+/// Cost of a plane behind one that it ends at. It does if of at least so many of its points this part at most lies behind that, and this
+/// part at least before it.
+const BEHIND: f64 = 3.0;
+const ENOUGH: usize = 40;
+const BEYOND: f64 = 0.02;
+const BEFORE: f64 = 0.3;
 
 /// A plane covered with one material.
 #[derive(Clone, Copy, Debug)]
@@ -38,7 +49,99 @@ impl Covered {
     }
 }
 
+/// Points around the holes, and what their photographs show of them.
+pub(super) struct Points {
+    /// All that are known, and those that others confirm.
+    all: [Vec<(Measured, [f32; 3])>; 2],
+    materials: Vec<[f32; 3]>,
+}
+
+/// The materials that planes are covered with, and where they end.
+#[derive(Clone, Default)]
+pub(super) struct Cover {
+    materials: Vec<[f32; 3]>,
+    /// `[plane][material]` what a site of it costs there.
+    costs: Vec<Vec<f64>>,
+    /// `[plane]` those that it ends at: a floor at its walls.
+    ends: Vec<Vec<usize>>,
+}
+
+impl Points {
+    /// What these planes are covered with. A material costs on a plane the logarithm of how much less of that it covers than of others.
+    /// What others confirm is mostly where something ends, with what is beside it; what nobody confirms has the depth of what is beside
+    /// it. So a plane is covered with what both say.
+    pub fn cover(&self, planes: &[Common]) -> Cover {
+        let parts = self.all.each_ref().map(|points| self.parts(points, planes));
+        let part = |plane: usize, k: usize| parts[0][plane][k].min(parts[1][plane][k]);
+        let most = |k: usize| (0..planes.len()).map(|plane| part(plane, k)).fold(0.0, f64::max).min(COVERS);
+        let cost = |plane: usize, k: usize| (most(k) / part(plane, k)).ln().clamp(0.0, BARE);
+        let of = |plane: usize| (0..self.materials.len()).map(|k| cost(plane, k)).collect();
+        Cover { costs: (0..planes.len()).map(of).collect(), ends: self.ends(planes), materials: self.materials.clone() }
+    }
+
+    /// The nearest plane that a point lies on.
+    fn on(at: &Measured, planes: &[Common]) -> Option<usize> {
+        let near = (0..planes.len()).filter(|k| planes[*k].has(at));
+        near.min_by(|a, b| planes[*a].off(at).abs().total_cmp(&planes[*b].off(at).abs()))
+    }
+
+    /// `[plane]` the planes behind which none of it is seen.
+    fn ends(&self, planes: &[Common]) -> Vec<Vec<usize>> {
+        let mut on: Vec<Vec<&Measured>> = vec![vec![]; planes.len()];
+        for (at, _) in &self.all[1] {
+            if let Some(plane) = Self::on(at, planes) {
+                on[plane].push(at);
+            }
+        }
+        let ends = |its: &[&Measured], wall: &Common| {
+            let part =
+                |is: &dyn Fn(f64) -> bool| its.iter().filter(|at| is(wall.off(at))).count() as f64 / its.len() as f64;
+            let apart = 3.0 * flat::THICKNESS;
+            its.len() >= ENOUGH && part(&|off| off > apart) <= BEYOND && part(&|off| off < -apart) >= BEFORE
+        };
+        let of = |k: usize| (0..planes.len()).filter(|wall| *wall != k && ends(&on[k], &planes[*wall])).collect();
+        (0..planes.len()).map(of).collect()
+    }
+
+    /// `[plane][material]` the part of a plane's points, of these, that are of a material.
+    fn parts(&self, points: &[(Measured, [f32; 3])], planes: &[Common]) -> Vec<Vec<f64>> {
+        let mut counts = vec![vec![1.0; self.materials.len()]; planes.len()];
+        for (at, color) in points {
+            if let (Some(plane), Some(material)) = (Self::on(at, planes), nearest(*color, &self.materials)) {
+                counts[plane][material] += 1.0;
+            }
+        }
+        let part = |of: &Vec<f64>| of.iter().map(|count| STRAY + count / of.iter().sum::<f64>()).collect();
+        counts.iter().map(part).collect()
+    }
+}
+
+impl Cover {
+    /// What a site of this colour costs on a plane; nothing off all planes, and where the colour is of no material.
+    fn cost(&self, plane: usize, color: [f32; 3]) -> f64 {
+        let material = nearest(color, &self.materials).filter(|k| of_another(color, self.materials[*k]) <= MATERIAL);
+        material.and_then(|k| Some(self.costs.get(plane)?[k])).unwrap_or(0.0)
+    }
+
+    /// Whether a plane, of these, has ended where a ray (x/z, y/z) meets it.
+    pub fn has_ended(&self, plane: usize, planes: &[Plane], ray: [f64; 2]) -> bool {
+        let inverse = planes::on(&planes[plane], ray);
+        let walls = self.ends.get(plane).into_iter().flatten();
+        walls.filter_map(|wall| planes.get(*wall)).any(|wall| planes::on(wall, ray) > (1.0 + SAME) * inverse)
+    }
+
+    /// What a site costs on a plane, of these, by its colour and where it is.
+    pub fn cost_at(&self, plane: usize, planes: &[Plane], ray: [f64; 2], color: [f32; 3]) -> f64 {
+        self.cost(plane, color) + if self.has_ended(plane, planes, ray) { BEHIND } else { 0.0 }
+    }
+}
+
 impl Sight {
+    /// The colour of a site, 0 to 1.
+    pub(super) fn color(&self, site: usize) -> [f32; 3] {
+        self.grid.colors[site].map(|v| f32::from(v) / 255.0)
+    }
+
     /// The mean colour around a site, 0 to 1, without the object; NaN in the middle of it.
     pub fn color_around(&self, site: usize) -> [f32; 3] {
         let near: Vec<usize> = self.grid.around(site, REACH).filter(|at| !self.hole[*at]).collect();
@@ -81,7 +184,8 @@ impl Sights {
     /// seed finds the same.
     pub(super) fn covered(&self, seed: u64) -> Vec<(Common, [f32; 3])> {
         let color = |(view, site): (usize, usize)| self.0[view].color_around(site);
-        let all: Vec<((usize, usize), [f32; 3])> = self.around_holes().into_iter().map(|at| (at, color(at))).collect();
+        let all: Vec<((usize, usize), [f32; 3])> =
+            self.around_holes(true).into_iter().map(|at| (at, color(at))).collect();
         let colors = materials(&all.iter().map(|(_, color)| *color).collect::<Vec<_>>());
         let least = (LEAST * all.len() as f64).ceil() as usize;
         let mut rng = Pcg64::new(seed.into(), 44);
@@ -94,6 +198,15 @@ impl Sights {
         }
         log::debug!("covered: {} materials on {} surfaces", colors.len(), found.len());
         found
+    }
+
+    /// Points around the holes, and what their photographs show of them.
+    pub(super) fn points(&self) -> Points {
+        let point = |(view, site)| (self.measured(view, site), self.0[view].color(site));
+        let all =
+            [false, true].map(|confirmed| self.around_holes(confirmed).into_iter().map(point).collect::<Vec<_>>());
+        let materials = materials(&all[0].iter().map(|(_, color)| *color).collect::<Vec<_>>());
+        Points { all, materials }
     }
 }
 

@@ -9,7 +9,7 @@ use rand::RngExt;
 use rand_pcg::Pcg64;
 use rayon::prelude::*;
 
-use super::covered::Covered;
+use super::covered::{Cover, Covered, Points};
 use super::surface::{SAME, Sight, Sights};
 use super::window::Window;
 use crate::prepare::planes::{self, Plane, neighbours};
@@ -52,7 +52,7 @@ const LEAST: f64 = 0.06;
 /// Triples of points that are tried for each.
 const TRIES: usize = 1500;
 /// A point lies on a plane if it is off by at most this part of its camera's distance from the plane.
-const THICKNESS: f64 = 0.01;
+pub(super) const THICKNESS: f64 = 0.01;
 /// Part of a view's own plane's points that lie within twice [`planes::THICKNESS`] of a common one for it to be the same.
 const COMMON: f64 = 0.5;
 
@@ -63,10 +63,11 @@ pub(super) struct Common {
     offset: f64,
 }
 
-/// The planes around a view's hole, the sites that lie on one, and their depth there.
+/// The planes around a view's hole, what they are covered with, the sites that lie on one, and their depth there.
 #[derive(Default)]
 struct Flat {
     planes: Vec<Plane>,
+    cover: Cover,
     sites: Vec<(usize, f64)>,
 }
 
@@ -79,8 +80,13 @@ pub(super) struct Measured {
 
 impl Common {
     /// How far the plane is from the point along the camera's ray, as a part of the distance: nearer is positive.
-    fn off(&self, at: &Measured) -> f64 {
+    pub(super) fn off(&self, at: &Measured) -> f64 {
         (self.normal.dot(at.point) - self.offset) / (self.offset - self.normal.dot(at.eye))
+    }
+
+    /// Whether the point lies on the plane.
+    pub(super) fn has(&self, at: &Measured) -> bool {
+        self.off(at).abs() <= THICKNESS
     }
 
     fn through([a, b, c]: [DVec3; 3]) -> Option<Self> {
@@ -107,6 +113,15 @@ impl Common {
         Self { normal, offset: 1.0 / length + normal.dot(origin) }
     }
 
+    /// A plane as a view sees it.
+    fn of(plane: &Plane, sight: &Sight) -> Self {
+        let rotation = sight.grid.camera.rotation.map(|row| DVec3::from(row.map(f64::from)));
+        let plane = DVec3::from(*plane);
+        let turned = rotation[0] * plane.x + rotation[1] * plane.y + rotation[2] * plane.z;
+        let (normal, distance) = (turned.normalize(), 1.0 / plane.length());
+        Self { normal, offset: distance + normal.dot(sight.eye()) }
+    }
+
     /// As a view sees it; nothing where its camera stands in it.
     pub(super) fn seen_by(&self, sight: &Sight) -> Option<Plane> {
         let camera = &sight.grid.camera;
@@ -127,7 +142,7 @@ pub(super) fn largest(mut points: Vec<Measured>, least: usize, rng: &mut Pcg64) 
                 Common::through(std::array::from_fn(|_| points[rng.random_range(0..points.len())].point))
             })
             .collect();
-        let count = |plane: &Common| points.iter().filter(|at| plane.off(at).abs() <= THICKNESS).count();
+        let count = |plane: &Common| points.iter().filter(|at| plane.has(at)).count();
         let Some((_, mut plane)) = (tried.par_iter().enumerate())
             .map(|(i, plane)| ((count(plane), std::cmp::Reverse(i)), *plane))
             .max_by_key(|(count, _)| *count)
@@ -135,12 +150,12 @@ pub(super) fn largest(mut points: Vec<Measured>, least: usize, rng: &mut Pcg64) 
             break;
         };
         for _ in 0..4 {
-            let inliers: Vec<Measured> = points.iter().filter(|at| plane.off(at).abs() <= THICKNESS).copied().collect();
+            let inliers: Vec<Measured> = points.iter().filter(|at| plane.has(at)).copied().collect();
             if inliers.len() >= 3 {
                 plane = plane.fitted(&inliers);
             }
         }
-        let on_it = points.iter().filter(|at| plane.off(at).abs() <= THICKNESS).count();
+        let on_it = points.iter().filter(|at| plane.has(at)).count();
         points.retain(|at| plane.off(at).abs() > 3.0 * THICKNESS);
         if on_it < least {
             break;
@@ -154,18 +169,23 @@ impl Sights {
     /// The largest planes of what all views together show around their holes.
     fn common(&self, seed: u64) -> Vec<Common> {
         let points: Vec<Measured> =
-            self.around_holes().into_iter().map(|(view, site)| self.measured(view, site)).collect();
+            self.around_holes(true).into_iter().map(|(view, site)| self.measured(view, site)).collect();
         let least = (LEAST * points.len() as f64).ceil() as usize;
         largest(points, least, &mut Pcg64::new(seed.into(), 43))
     }
 
-    /// Views and sites, some of each, whose depth others confirm around their holes.
-    pub(super) fn around_holes(&self) -> Vec<(usize, usize)> {
+    /// Views and sites, some of each, whose depth is known around their holes, confirmed by others or not.
+    pub(super) fn around_holes(&self, confirmed: bool) -> Vec<(usize, usize)> {
         let views = self.0.par_iter().enumerate().filter(|(_, sight)| sight.grid.trusted);
         views
             .flat_map_iter(|(view, sight)| {
                 let near = sight.surroundings();
-                let known = |site: &usize| near[*site] && sight.grid.confirmed[*site] && sight.depth[*site].is_finite();
+                let known = |site: &usize| {
+                    near[*site]
+                        && !sight.hole[*site]
+                        && sight.depth[*site].is_finite()
+                        && (sight.grid.confirmed[*site] || !confirmed)
+                };
                 let sites: Vec<usize> = (0..near.len()).filter(known).collect();
                 let every = sites.len().div_ceil(POINTS).max(1);
                 sites.into_iter().step_by(every).map(move |site| (view, site)).collect::<Vec<_>>()
@@ -186,23 +206,23 @@ impl Sights {
 
     /// Flattens views with at least this parallax; others get the surfaces of one material around the holes.
     fn flatten_from(&mut self, parallax: f64, seed: u64) {
-        let common = self.common(seed);
-        let of = |view: usize| self.flat(view, &common, parallax, seed + view as u64);
+        let (common, points) = (self.common(seed), self.points());
+        let of = |view: usize| self.flat(view, &common, &points, parallax, seed + view as u64);
         let flat: Vec<Flat> = (0..self.0.len()).into_par_iter().map(of).collect();
         let untold = flat.iter().any(|flat| flat.planes.is_empty());
         let covered = if untold { self.covered(seed) } else { vec![] };
-        for (sight, Flat { planes, sites }) in self.0.iter_mut().zip(flat) {
+        for (sight, Flat { planes, cover, sites }) in self.0.iter_mut().zip(flat) {
             if planes.is_empty() {
                 sight.covered =
                     covered.iter().filter_map(|(plane, color)| Covered::seen_by(plane, *color, sight)).collect();
             }
-            sight.around = planes;
+            (sight.around, sight.cover) = (planes, cover);
             sites.into_iter().for_each(|(site, depth)| sight.depth[site] = depth);
         }
     }
 
     /// Planes around a view's hole, and the sites on them; nothing where the view's neighbours are too near to tell.
-    fn flat(&self, of: usize, common: &[Common], parallax: f64, seed: u64) -> Flat {
+    fn flat(&self, of: usize, common: &[Common], points: &Points, parallax: f64, seed: u64) -> Flat {
         let own = &self.0[of];
         let near = own.surroundings();
         let Some(window) = Window::around(&own.grid, |site| near[site]) else { return Flat::default() };
@@ -216,27 +236,34 @@ impl Sights {
         let hole: Vec<bool> = sites.iter().map(|site| own.hole[*site]).collect();
         let planes = own.planes_among(common, &sites, planes::around(&disparity, &rays, &hole, seed));
         if planes.is_empty() || !own.grid.trusted {
-            return Flat { planes, sites: vec![] };
+            return Flat { planes, ..Flat::default() };
         }
+        let cover = points.cover(&planes.iter().map(|plane| Common::of(plane, own)).collect::<Vec<_>>());
         let depth_on = |plane: &Plane, site: usize| 1.0 / planes::on(plane, own.ray(site));
-        let possible = |site: usize, z: f64| {
+        // What the object stands on is before it, too.
+        let supports = own.supports(&planes);
+        let carries: Vec<bool> = planes.iter().map(|plane| supports.iter().any(|support| support.is(plane))).collect();
+        let possible = |site: usize, z: f64, carries: bool| {
             let measured = own.depth[site];
             let apart = match measured.is_nan() {
                 // It has the depth of something nearer than what is there.
-                true => z < (1.0 - SAME) * own.grid.depth[site],
-                false => (z / measured - 1.0).abs() > FARTHEST,
+                true => !carries && z < (1.0 - SAME) * own.grid.depth[site],
+                // What nobody confirms often has the depth of something before it.
+                false => (z / measured - 1.0).abs() > FARTHEST && (own.grid.confirmed[site] || z < measured),
             };
             z > 0.0 && !own.hole[site] && !apart
         };
-        let unlike = |depth: &(dyn Fn(usize) -> f64 + Sync)| -> Vec<f64> {
-            let one = |site: &usize| Some(depth(*site)).filter(|z| possible(*site, *z));
+        let unlike = |depth: &(dyn Fn(usize) -> f64 + Sync), carries: bool| -> Vec<f64> {
+            let one = |site: &usize| Some(depth(*site)).filter(|z| possible(*site, *z, carries));
             let raw: Vec<f64> = (sites.par_iter())
                 .map(|site| one(site).and_then(|z| self.unlike(own, &others, *site, z)).unwrap_or(f64::NAN))
                 .collect();
             (0..raw.len()).into_par_iter().map(|cell| around(&raw, cell, window.size)).collect()
         };
-        let measured = unlike(&|site| own.depth[site]);
-        let on_planes: Vec<Vec<f64>> = planes.iter().map(|plane| unlike(&|site| depth_on(plane, site))).collect();
+        let measured = unlike(&|site| own.depth[site], false);
+        let on_planes: Vec<Vec<f64>> = (planes.iter().zip(&carries))
+            .map(|(plane, carries)| unlike(&|site| depth_on(plane, site), *carries))
+            .collect();
         let cost = |levels: f64| if levels.is_nan() { MOST } else { (levels / LEVELS).min(MOST) };
         let cost = |label: usize, cell: usize| -> f64 {
             let site = sites[cell];
@@ -251,10 +278,13 @@ impl Sights {
             };
             let refuted =
                 || (apart.is_nan() || apart > 1.0) && self.looked_through(others.iter().copied(), own.point(site, z));
-            match (hole[cell], possible(site, z) && !refuted()) {
+            match (hole[cell], possible(site, z, carries[label]) && !refuted()) {
                 (true, _) => 0.0,
                 (false, false) => 10.0 * MOST,
-                (false, true) => cost(on_planes[label][cell]) + off + LATER * label as f64,
+                (false, true) => {
+                    let covered = cover.cost_at(label, &planes, own.ray(site), own.color(site));
+                    cost(on_planes[label][cell]) + off + covered + LATER * label as f64
+                }
             }
         };
         let costs: Vec<Vec<f64>> =
@@ -263,9 +293,9 @@ impl Sights {
         let on_plane = |cell: usize| {
             let site = sites[cell];
             let z = depth_on(planes.get(labels[cell])?, site);
-            (!hole[cell] && possible(site, z)).then_some((site, z))
+            (!hole[cell] && possible(site, z, carries[labels[cell]])).then_some((site, z))
         };
-        Flat { sites: (0..sites.len()).filter_map(on_plane).collect(), planes }
+        Flat { sites: (0..sites.len()).filter_map(on_plane).collect(), planes, cover }
     }
 
     /// By how many sites what a view shows moves in other views, a quarter of which shows more, where it is farther by `APART`:
@@ -295,21 +325,28 @@ impl Sights {
         found.into_iter().step_by(every).collect()
     }
 
-    /// `[cell]` by how many levels the views differ that show what sites of a view's hole have at these depths.
-    pub fn unlike_in_hole(&self, of: usize, sites: &[usize], depth: impl Fn(usize) -> f64 + Sync) -> Vec<f64> {
+    /// `[cell]` by how many levels the views differ that show what sites of a view's hole have at these depths, and the colour, 0 to 1,
+    /// that they show; NaN where too few do.
+    pub fn shown_in_hole(
+        &self,
+        of: usize,
+        sites: &[usize],
+        depth: impl Fn(usize) -> f64 + Sync,
+    ) -> Vec<(f64, [f32; 3])> {
         let own = &self.0[of];
         let others = self.beside(of);
-        let one = |cell: usize| -> Option<f64> {
+        let one = |cell: usize| -> Option<(f64, [f32; 3])> {
             let z = Some(depth(cell)).filter(|z| own.hole[sites[cell]] && *z > 0.0)?;
             let point = own.point(sites[cell], z);
-            let colors: Vec<[f64; 3]> = others.iter().filter_map(|view| self.0[*view].color(point)).collect();
+            let colors: Vec<[f64; 3]> = others.iter().filter_map(|view| self.0[*view].color_of(point)).collect();
             let middle: [f64; 3] =
                 std::array::from_fn(|c| quantile(colors.iter().map(|color| color[c]), 0.5).unwrap_or(0.0));
-            most_alike(
+            let unlike = most_alike(
                 colors.iter().map(|color| (0..3).map(|c| (color[c] - middle[c]).abs()).sum::<f64>() / 3.0).collect(),
-            )
+            )?;
+            Some((unlike, middle.map(|v| v as f32 / 255.0)))
         };
-        (0..sites.len()).into_par_iter().map(|cell| one(cell).unwrap_or(f64::NAN)).collect()
+        (0..sites.len()).into_par_iter().map(|cell| one(cell).unwrap_or((f64::NAN, [f32::NAN; 3]))).collect()
     }
 
     /// By how many levels other views, those that show a site's point at this depth, differ from what the site shows.
@@ -318,7 +355,7 @@ impl Sights {
         let color = own.grid.colors[site];
         let apart: Vec<f64> = (others.iter())
             .filter_map(|view| {
-                let shown = self.0[*view].color(point)?;
+                let shown = self.0[*view].color_of(point)?;
                 Some((0..3).map(|c| (shown[c] - f64::from(color[c])).abs()).sum::<f64>() / 3.0)
             })
             .collect();
@@ -348,7 +385,7 @@ impl Sight {
 
     /// The colour, 8-bit levels, that the photograph shows of a point; nothing where the object hides it, or what is known to
     /// stand before it.
-    fn color(&self, point: DVec3) -> Option<[f64; 3]> {
+    fn color_of(&self, point: DVec3) -> Option<[f64; 3]> {
         let (at, place, z) = self.seen(point)?;
         let hidden = self.grid.confirmed[at] && z > (1.0 + 2.0 * SAME) * self.grid.depth[at];
         let size = [self.grid.columns, self.grid.rows];
@@ -417,6 +454,30 @@ mod tests {
         }
     }
 
+    /// A bare floor and a bare wall of one colour: each ends where they meet.
+    #[test]
+    fn a_floor_ends_at_its_wall() {
+        let (mut grids, cameras, masks) = views(0.2);
+        let floor = |[_, y]: [f64; 2]| if y > 0.2 { 0.8 / y } else { 4.0 };
+        for grid in &mut grids {
+            for site in (0..grid.depth.len()).filter(|site| grid.depth[*site] == 4.0).collect::<Vec<_>>() {
+                grid.depth[site] = floor(grid.ray([site as u32 % SIZE[0], site as u32 / SIZE[0]]));
+            }
+        }
+        let mut sights = Sights::new(grids, &cameras, &masks, &masks);
+        sights.flatten_from(0.1, 1);
+        for sight in &sights.0 {
+            let at = |ray: [f64; 2], inverse: f64| {
+                sight.around.iter().position(|plane| (planes::on(plane, ray) / inverse - 1.0).abs() < 0.01)
+            };
+            let (below, above) = ([0.0, 0.3], [0.0, 0.1]);
+            let [floor, wall] = [at(below, 0.3 / 0.8), at(above, 0.25)].map(|plane| plane.expect("a plane"));
+            let has_ended = |plane, ray| sight.cover.has_ended(plane, &sight.around, ray);
+            assert!(has_ended(floor, above) && has_ended(wall, below));
+            assert!(!has_ended(floor, below) && !has_ended(wall, above));
+        }
+    }
+
     /// Views that are too near each other to tell two planes apart by their colours tell nothing.
     #[test]
     fn where_views_are_too_near_nothing_is_moved() {
@@ -437,7 +498,7 @@ mod tests {
             (sights.0[2].depth[*site], sights.0[2].grid.depth[*site]) = (f64::NAN, 2.0);
         }
         let before = Common { normal: DVec3::Z, offset: 1.0 };
-        let flat = sights.flat(2, &[before], 0.1, 1);
+        let flat = sights.flat(2, &[before], &sights.points(), 0.1, 1);
         let near = sights.0[2].surroundings();
         let bled: Vec<usize> = bled.into_iter().filter(|site| near[*site]).collect();
         let found: Vec<f64> = flat.sites.iter().filter(|(site, _)| bled.contains(site)).map(|(_, z)| *z).collect();

@@ -68,7 +68,8 @@ pub const METHOD: &str = "one surface with smooth ends, nothing where others loo
      lights joined, doubts left to training, nothing stands on what only crosses the floor, lines go on through holes, a foot is all that is unseen around it, \
      what is nearly one plane is one, copies nearly keep their hue, ends are where the first view has them, \
      nothing from views with the object elsewhere, nothing stands where the first view looks through, surfaces by what they are covered with, \
-     straight borders go on, those that end in a hole too, surfaces end at right angles, and grain is kept";
+     straight borders go on, those that end in a hole too, surfaces end at right angles, grain is kept, floors end at their walls, and planes \
+     have their materials";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 

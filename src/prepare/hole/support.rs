@@ -68,6 +68,11 @@ impl Support {
         (1.0 - p.dot(point)).abs() / p.length() <= ON_IT * self.tall
     }
 
+    /// Whether this is its plane.
+    pub fn is(&self, plane: &Plane) -> bool {
+        self.plane == *plane
+    }
+
     /// Depth z at which a ray (x/z, y/z) meets the plane under the object; nothing beside it.
     pub fn under(&self, ray: [f64; 2]) -> Option<f64> {
         let z = 1.0 / planes::on(&self.plane, ray);

@@ -9,7 +9,7 @@ use glam::{DMat3, DVec2, DVec3};
 use image::GrayImage;
 use rayon::prelude::*;
 
-use super::covered::Covered;
+use super::covered::{Cover, Covered};
 use super::flat;
 use super::window::Window;
 use crate::multiview::DepthGrid;
@@ -63,6 +63,8 @@ pub struct Sight {
     /// Planes around the hole that were found before it is solved; none where the views are too near each
     /// other to tell.
     pub(super) around: Vec<planes::Plane>,
+    /// What these are covered with.
+    pub(super) cover: Cover,
     /// Surfaces of one material around the holes, where the views are too near each other to tell planes apart by what they look like on
     /// them.
     pub(super) covered: Vec<Covered>,
@@ -183,6 +185,7 @@ impl Sight {
             surface: vec![0; sites],
             planes: vec![],
             around: vec![],
+            cover: Cover::default(),
             covered: vec![],
             borders: vec![],
             solved: false,
@@ -548,20 +551,18 @@ impl Sights {
         planes: &[planes::Plane],
     ) -> Vec<Option<Vec<f64>>> {
         let own = &self.0[of];
-        let unlike =
-            |depth: &(dyn Fn(usize) -> f64 + Sync)| -> Vec<f64> {
-                let raw = self.unlike_in_hole(of, sites, |cell| {
-                    if disparity[sites[cell]].is_finite() { depth(cell) } else { f64::NAN }
-                });
-                (0..raw.len()).map(|cell| flat::around(&raw, cell, size)).collect()
-            };
-        let mut all: Vec<Vec<f64>> =
-            planes.iter().map(|plane| unlike(&|cell| 1.0 / planes::on(plane, own.ray(sites[cell])))).collect();
-        all.push(unlike(&|cell| 1.0 / f64::from(disparity[sites[cell]])));
+        let shown = |depth: &(dyn Fn(usize) -> f64 + Sync)| -> (Vec<f64>, Vec<[f32; 3]>) {
+            let told = |cell: usize| if disparity[sites[cell]].is_finite() { depth(cell) } else { f64::NAN };
+            let (raw, colors): (Vec<f64>, Vec<[f32; 3]>) = self.shown_in_hole(of, sites, told).into_iter().unzip();
+            ((0..raw.len()).map(|cell| flat::around(&raw, cell, size)).collect(), colors)
+        };
+        let mut all: Vec<(Vec<f64>, Vec<[f32; 3]>)> =
+            planes.iter().map(|plane| shown(&|cell| 1.0 / planes::on(plane, own.ray(sites[cell])))).collect();
+        all.push(shown(&|cell| 1.0 / f64::from(disparity[sites[cell]])));
         let one = |cell: usize| -> Option<Vec<f64>> {
             let site = sites[cell];
             (own.hole[site] && disparity[site].is_finite()).then_some(())?;
-            let levels = |label: usize| all[label][cell];
+            let levels = |label: usize| all[label].0[cell];
             let least = (0..all.len()).map(levels).filter(|v| v.is_finite()).fold(f64::INFINITY, f64::min);
             let impossible = |plane: &planes::Plane| {
                 let z = 1.0 / planes::on(plane, own.ray(site));
@@ -580,7 +581,13 @@ impl Sights {
                     false if planes.get(label).is_some_and(behind) => UNSHOWN_BEHIND,
                     false => UNSHOWN,
                 };
-                apart + if label == planes.len() { planes::REST } else { flat::LATER * label as f64 }
+                let covered = match label == planes.len() {
+                    true => planes::REST,
+                    false => {
+                        flat::LATER * label as f64 + own.cover.cost_at(label, planes, own.ray(site), all[label].1[cell])
+                    }
+                };
+                apart + covered
             };
             Some((0..all.len()).map(cost).collect())
         };
@@ -626,7 +633,9 @@ impl Sights {
             if d.is_nan() || d <= 0.0 || object && 1.0 / d < (1.0 - APART) * own.grid.depth[site] {
                 return 1.0;
             }
-            let hidden = under[cell].is_some_and(|z| 1.0 / d > (1.0 + SAME) * z);
+            let is = planes.iter().position(|plane| planes::on(plane, own.ray(site)) == d);
+            let hidden = under[cell].is_some_and(|z| 1.0 / d > (1.0 + SAME) * z)
+                || is.is_some_and(|plane| own.cover.has_ended(plane, &planes, own.ray(site)));
             self.against(of, own.point(site, 1.0 / d)).max(if hidden { BELOW } else { 0.0 })
         };
         let told = !own.around.is_empty();
@@ -649,7 +658,7 @@ impl Sights {
             outline: &outline,
             against,
         };
-        let found = planes::surfaces(&hole, planes);
+        let found = planes::surfaces(&hole, planes.clone());
         surface.fill(found.planes.len() as u8);
         // What is thin, before or behind a plane, is on none, though its surroundings are.
         let better = |cell: usize| {
