@@ -49,10 +49,10 @@ impl Covered {
     }
 }
 
-/// Points around the holes, and what their photographs show of them.
+/// Points around the holes, and the numbers of their materials.
 pub(super) struct Points {
     /// All that are known, and those that others confirm.
-    all: [Vec<(Measured, [f32; 3])>; 2],
+    all: [Vec<(Measured, Option<usize>)>; 2],
     materials: Vec<[f32; 3]>,
 }
 
@@ -104,10 +104,10 @@ impl Points {
     }
 
     /// `[plane][material]` the part of a plane's points, of these, that are of a material.
-    fn parts(&self, points: &[(Measured, [f32; 3])], planes: &[Common]) -> Vec<Vec<f64>> {
+    fn parts(&self, points: &[(Measured, Option<usize>)], planes: &[Common]) -> Vec<Vec<f64>> {
         let mut counts = vec![vec![1.0; self.materials.len()]; planes.len()];
-        for (at, color) in points {
-            if let (Some(plane), Some(material)) = (Self::on(at, planes), nearest(*color, &self.materials)) {
+        for (at, material) in points {
+            if let (Some(plane), Some(material)) = (Self::on(at, planes), *material) {
                 counts[plane][material] += 1.0;
             }
         }
@@ -206,6 +206,7 @@ impl Sights {
         let all =
             [false, true].map(|confirmed| self.around_holes(confirmed).into_iter().map(point).collect::<Vec<_>>());
         let materials = materials(&all[0].iter().map(|(_, color)| *color).collect::<Vec<_>>());
+        let all = all.map(|points| points.into_iter().map(|(at, color)| (at, nearest(color, &materials))).collect());
         Points { all, materials }
     }
 }
