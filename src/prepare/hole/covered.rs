@@ -67,9 +67,9 @@ pub(super) struct Cover {
 }
 
 impl Points {
-    /// What these planes are covered with. A material costs on a plane the logarithm of how much less of that it covers than of others.
-    /// What others confirm is mostly where something ends, with what is beside it; what nobody confirms has the depth of what is beside
-    /// it. So a plane is covered with what both say.
+    /// The materials of these planes, and their ends. A material costs on a plane the logarithm of how much less of that it covers than
+    /// of others. Confirmed points are mostly where something ends, with what is beside it; all other points often have the depth of
+    /// what is beside them. So a plane is covered with what both say.
     pub fn cover(&self, planes: &[Common]) -> Cover {
         let parts = self.all.each_ref().map(|points| self.parts(points, planes));
         let part = |plane: usize, k: usize| parts[0][plane][k].min(parts[1][plane][k]);
@@ -117,7 +117,7 @@ impl Points {
 }
 
 impl Cover {
-    /// What a site of this colour costs on a plane; nothing off all planes, and where the colour is of no material.
+    /// The cost of a colour on a plane; nothing off all planes, and where the colour is of no material.
     fn cost(&self, plane: usize, color: [f32; 3]) -> f64 {
         let material = nearest(color, &self.materials).filter(|k| of_another(color, self.materials[*k]) <= MATERIAL);
         material.and_then(|k| Some(self.costs.get(plane)?[k])).unwrap_or(0.0)
@@ -130,7 +130,7 @@ impl Cover {
         walls.filter_map(|wall| planes.get(*wall)).any(|wall| planes::on(wall, ray) > (1.0 + SAME) * inverse)
     }
 
-    /// What a site costs on a plane, of these, by its colour and where it is.
+    /// The cost of a site on a plane, of these, by its colour and where it is.
     pub fn cost_at(&self, plane: usize, planes: &[Plane], ray: [f64; 2], color: [f32; 3]) -> f64 {
         self.cost(plane, color) + if self.has_ended(plane, planes, ray) { BEHIND } else { 0.0 }
     }

@@ -63,7 +63,7 @@ pub struct Sight {
     /// Planes around the hole that were found before it is solved; none where the views are too near each
     /// other to tell.
     pub(super) around: Vec<planes::Plane>,
-    /// What these are covered with.
+    /// Their materials, and where they end.
     pub(super) cover: Cover,
     /// Surfaces of one material around the holes, where the views are too near each other to tell planes apart by what they look like on
     /// them.
