@@ -49,15 +49,11 @@ pub struct Cues<'a> {
 }
 
 impl Cues<'_> {
-    /// Without a depth that does not change across a mask's outline: of something flat on a wall, or a fit that does
-    /// not know it.
-    fn trusted(&self, picture: &RgbImage, mask: &GrayImage) -> Self {
+    /// Whether depth changes across a mask's outline: not that of something flat on a wall, or of a fit that does not know it.
+    fn knows(&self, picture: &RgbImage, mask: &GrayImage) -> bool {
         let window = Window::whole(picture);
-        let knows = || {
-            let pixels = Pixels::of(picture, window, SIDES[0], &[], self);
-            pixels.jump(&labels(mask, window, pixels.size.map(|n| n as u32))) >= FLAT
-        };
-        Self { depth: self.depth.filter(|_| knows()), ..*self }
+        let pixels = Pixels::of(picture, window, SIDES[0], &[], self);
+        pixels.jump(&labels(mask, window, pixels.size.map(|n| n as u32))) >= FLAT
     }
 }
 
@@ -79,6 +75,12 @@ const ALONG: [f64; 2] = [0.5, 0.05];
 const NEARER: f64 = 0.33;
 /// A place so far from where the background is, squared and in its deviations, is as likely to be the object as not.
 const OFF: f64 = 9.0;
+/// A cut by colours of which this share of the inside lies behind has taken in what is behind the object.
+const BEHIND: f64 = 0.1;
+/// Pixels along a mask's border that tell nothing of what is behind.
+const SKIN: u32 = 3;
+/// So many pixels beside something near may have its depth, and so many of its own that of what is behind.
+const BLEEDS: [u32; 2] = [6, 3];
 /// Depth that changes by less than this part of a jump across an object's outline does not know the object.
 const FLAT: f64 = 0.2;
 /// The border of a changed mask is drawn anew within so many pixels of where it was found.
@@ -183,7 +185,7 @@ pub fn next(picture: &RgbImage, marks: &[Mark], before: &GrayImage, cues: &Cues<
 /// What the last of these marks, a click, makes of a mask, where it may change all of it.
 fn further(picture: &RgbImage, marks: &[Mark], before: &GrayImage, cues: &Cues<'_>) -> GrayImage {
     let Some((at, adds)) = marks.last().and_then(Mark::click) else { return before.clone() };
-    let cues = &cues.trusted(picture, before);
+    let cues = &Cues { depth: cues.depth.filter(|_| cues.knows(picture, before)), ..*cues };
     let afar = cues.depth.is_none() || is_afar(before, at, adds);
     let anew = (cues.carried.is_none() && marks.len() <= TOGETHER && afar).then(|| found(picture, marks, cues));
     let agrees = |mask: &GrayImage| holds(mask, at) == adds;
@@ -276,9 +278,9 @@ fn found(picture: &RgbImage, marks: &[Mark], cues: &Cues<'_>) -> GrayImage {
     if !marks.iter().any(speaks) {
         return empty;
     }
-    let boxed = marks.iter().any(|mark| mark.bounds().is_some());
+    let outlined = marks.iter().any(|mark| mark.bounds().is_some());
     let of = |mark: &Mark| match mark {
-        Mark::Object { at: [x, y], .. } if boxed => Some([*x, *y, *x, *y]),
+        Mark::Object { at: [x, y], .. } if outlined => Some([*x, *y, *x, *y]),
         _ => mark.bounds(),
     };
     let joined = |a: [f64; 4], b: [f64; 4]| [a[0].min(b[0]), a[1].min(b[1]), a[2].max(b[2]), a[3].max(b[3])];
@@ -286,10 +288,18 @@ fn found(picture: &RgbImage, marks: &[Mark], cues: &Cues<'_>) -> GrayImage {
         Some(bounds) => Window::around(std::array::from_fn(|k| bounds[k] * f64::from(full[k % 2])), 0.5, full),
         None => Window::whole(picture),
     };
-    let by_places = cut(picture, first, marks, cues, None);
-    let trusted = by_places.as_ref().map_or(*cues, |mask| cues.trusted(picture, mask));
-    let again = cues.depth.is_some() && trusted.depth.is_none();
-    let (found, cues) = if again { (cut(picture, first, marks, &trusted, None), &trusted) } else { (by_places, cues) };
+    let alone = Cues { depth: None, ..*cues };
+    let by_colors = (outlined && cues.depth.is_some()).then(|| cut(picture, first, marks, &alone, None)).flatten();
+    let by_colors = by_colors.filter(|mask| behind_share(picture, first, marks, cues, mask) < BEHIND);
+    let (found, cues) = match by_colors {
+        Some(mask) => (Some(mask), &alone),
+        None => match cut(picture, first, marks, cues, None) {
+            Some(mask) if cues.depth.is_some() && !cues.knows(picture, &mask) => {
+                (cut(picture, first, marks, &alone, None), &alone)
+            }
+            by_places => (by_places, cues),
+        },
+    };
     let Some(found) = found else { return empty };
     let Some(bounds) = bounds_of(&found) else { return empty };
     let second = Window::around(bounds, AROUND, full);
@@ -298,6 +308,22 @@ fn found(picture: &RgbImage, marks: &[Mark], cues: &Cues<'_>) -> GrayImage {
         return found;
     }
     cut(picture, second, marks, cues, Some(&found)).unwrap_or(found)
+}
+
+/// The share of a mask's inside that lies where the surfaces that are outside all outlines go on, by places in space. What is
+/// within [`SKIN`] of its border is not looked at, since no depth is sharp.
+fn behind_share(picture: &RgbImage, window: Window, marks: &[Mark], cues: &Cues<'_>, mask: &GrayImage) -> f64 {
+    let pixels = Pixels::of(picture, window, SIDES[0], marks, cues);
+    let object = labels(mask, window, pixels.size.map(|n| n as u32));
+    let beside = pixels.picture(|i| !object[i]);
+    let outside = pixels.outside.iter().zip(&pixels.places).filter(|(outside, _)| **outside);
+    let Some(behind) = behind(&outside.filter_map(|(_, place)| Some(place.as_ref()?.0)).collect::<Vec<_>>()) else {
+        return 0.0;
+    };
+    let deep = resample::distances(&beside, SKIN + 1).into_iter().zip(&pixels.places).filter(|(far, _)| *far > SKIN);
+    let goes_on = deep.map(|(_, place)| place.is_some_and(|(place, _)| behind.distance(place) < OFF));
+    let (all, on) = goes_on.fold((0u32, 0u32), |(all, on), goes_on| (all + 1, on + u32::from(goes_on)));
+    f64::from(on) / f64::from(all.max(1))
 }
 
 /// x0, y0 and one past x1, y1 of what is not 0.
@@ -460,6 +486,12 @@ impl Pixels {
         distance
     }
 
+    /// Those of which something is true, as a mask of the small picture.
+    fn picture(&self, of: impl Fn(usize) -> bool) -> GrayImage {
+        let [w, h] = self.size.map(|n| n as u32);
+        GrayImage::from_fn(w, h, |x, y| image::Luma([if of((y * w + x) as usize) { 255 } else { 0 }]))
+    }
+
     /// The pixels within [`RIM`] of one.
     fn around(&self, i: usize) -> impl Iterator<Item = usize> {
         let [w, h] = self.size;
@@ -527,7 +559,16 @@ fn solve(
             (Some(behind), Some((place, _))) => (0.5 * (behind.distance(place) - OFF)).clamp(-MOST[1], MOST[1]),
             _ => 0.0,
         };
-        let off: Vec<f64> = (0..count).map(off).collect();
+        let mut off: Vec<f64> = (0..count).map(off).collect();
+        if pixels.outside.contains(&true) {
+            // Depth is not sharp at the border of what is near, whose colours tell where it ends.
+            let beyond = |side: bool, reach: u32| {
+                let there = |i: usize| pixels.places[i].is_some() && (off[i] > 0.0) == side;
+                resample::distances(&pixels.picture(there), reach).into_iter().map(move |far| far > reach)
+            };
+            let sure: Vec<bool> = beyond(false, BLEEDS[0]).zip(beyond(true, BLEEDS[1])).map(|(a, b)| a || b).collect();
+            off.iter_mut().zip(sure).filter(|(_, sure)| !sure).for_each(|(off, _)| *off = 0.0);
+        }
         let colors = |pixels_of: &[usize]| -> Vec<[f64; 3]> { pixels_of.iter().map(|i| pixels.colors[*i]).collect() };
         // Colours are not learnt from what lies where the background is.
         let inside = of(true);

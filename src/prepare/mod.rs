@@ -35,11 +35,12 @@ use crate::sentence::one_line;
 use crate::signal::Signal;
 use crate::train::checkpoint::Fingerprint;
 
+use depth::DepthMap;
 use fit::Fit;
 use misplaced::Looks;
 use network::Inpainting;
 pub use object::Evidence;
-use object::{Given, USERS, corrected, given, no_such_view};
+use object::{Drawn, Given, USERS, corrected, given, no_such_view};
 use poses::Capture;
 use record::{Batch, Folder, Inputs};
 use splats::Splats;
@@ -518,7 +519,7 @@ impl Preparation<'_> {
         given: &BTreeMap<String, Given>,
     ) -> Result<(), Error> {
         let mut inputs = Inputs::default().with(self.fit_hash()).with(outline::METHOD);
-        for (name, Given { mask, from }) in given {
+        for (name, Given { mask, from, .. }) in given {
             inputs = inputs.with(name).with(mask.as_raw()).with(from);
         }
         let inputs = inputs.finish();
@@ -536,6 +537,7 @@ impl Preparation<'_> {
         }
         let files = scene::pictures(&self.folder.root().join(poses::IMAGES))?;
         self.watch.begin(Step::Masks, (given.len() + scene.train.len()) as u64);
+        let given = &self.placed(scene, splats, given, &files)?;
         let mut votes = masks::Votes::new(splats);
         let mut unit = 0;
         for view in &scene.train {
@@ -601,7 +603,7 @@ impl Preparation<'_> {
         let outlines: Vec<(GrayImage, bool)> =
             (0..others.len()).into_par_iter().map(|at| refine(&carried[at], at)).collect();
         let mut shown = 0;
-        for (name, Given { mask, from }) in given {
+        for (name, Given { mask, from, .. }) in given {
             if from != USERS {
                 batch.gray(format!("masks/{name}.png"), mask, from.clone());
             }
@@ -645,6 +647,31 @@ impl Preparation<'_> {
         self.write(Step::Masks, inputs, batch)?;
         self.watch.end();
         Ok(())
+    }
+
+    /// Masks that were cut by colours alone, cut again by where in space pixels are.
+    fn placed(
+        &mut self,
+        scene: &Scene,
+        splats: &mut Splats,
+        given: &BTreeMap<String, Given>,
+        files: &BTreeMap<String, PathBuf>,
+    ) -> Result<BTreeMap<String, Given>, Error> {
+        let mut all = given.clone();
+        if given.values().all(|given| given.drawn.is_empty()) {
+            return Ok(all);
+        }
+        let grids = self.matched(scene)?.depths(scene);
+        for (view, grid) in scene.train.iter().zip(&grids) {
+            let Some(given) = all.get_mut(&view.name).filter(|given| !given.drawn.is_empty()) else { continue };
+            // Around clicks the fit's depth, which has fewer jumps, finds more of the object.
+            let depth = match given.drawn.iter().all(Drawn::is_outline) {
+                true => DepthMap::measured(grid, &view.camera),
+                false => DepthMap::of(splats, &view.camera)?,
+            };
+            *given = given.placed(&files[&view.name], &depth)?;
+        }
+        Ok(all)
     }
 
     /// Matches the photographs, once.

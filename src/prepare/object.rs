@@ -3,9 +3,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use image::GrayImage;
+use image::{GrayImage, RgbImage};
 
 use super::click::{self, Cues, Mark};
+use super::depth::DepthMap;
 use super::poses::Capture;
 use super::record::{self, Folder};
 use super::{Error, Request, graph_cut, masks, picture_size};
@@ -65,9 +66,72 @@ impl Evidence {
 pub(super) const USERS: &str = "the user's own";
 
 /// A mask that was given or derived from a box, as large as the photograph, and what it was made from.
+#[derive(Clone)]
 pub(super) struct Given {
     pub mask: GrayImage,
     pub from: String,
+    /// All that was drawn, if the mask was cut from it alone: it can be cut again once more is known of the view.
+    pub drawn: Vec<Drawn>,
+}
+
+/// A drawing that a minimum cut makes a mask of.
+#[derive(Clone)]
+pub(super) enum Drawn {
+    /// A box alone, in pixels of the photograph.
+    Box([u32; 4]),
+    /// Marks that are taken together.
+    Marks(Vec<Mark>),
+}
+
+impl Drawn {
+    /// Whether it goes around the object.
+    pub fn is_outline(&self) -> bool {
+        match self {
+            Self::Box(_) => true,
+            Self::Marks(marks) => marks.iter().any(|mark| matches!(mark, Mark::Box { .. } | Mark::Lasso { .. })),
+        }
+    }
+
+    /// Its mask, as large as the photograph; nothing if nothing there differs from what is around it.
+    fn cut(&self, picture: &RgbImage, cues: &Cues<'_>) -> Option<GrayImage> {
+        let mask = match self {
+            Self::Box(bounds) => click::from_box(picture, *bounds, cues)?,
+            Self::Marks(marks) => {
+                let size = [picture.width(), picture.height()];
+                let mask = click::mask(&resample::photograph(picture, click::working(size)), marks, cues);
+                let own = [mask.width(), mask.height()];
+                masks::threshold(&masks::parts(&mask, own), own, size, 0.5)
+            }
+        };
+        mask.as_raw().iter().any(|v| *v != 0).then_some(mask)
+    }
+}
+
+impl Given {
+    /// A mask that counts as it is.
+    fn fixed(mask: GrayImage, from: String) -> Self {
+        Self { mask, from, drawn: vec![] }
+    }
+
+    /// The mask cut again from what was drawn in its photograph, by places in space as well; the same where nothing was drawn
+    /// or nothing would be left.
+    ///
+    /// # Errors
+    /// A photograph that cannot be read.
+    pub fn placed(&self, photograph: &Path, depth: &DepthMap) -> Result<Self, Error> {
+        let picture = scene::photograph(photograph, 1)?;
+        let cues = Cues { depth: Some(depth), carried: None };
+        let cuts = self.drawn.iter().map(|drawn| drawn.cut(&picture, &cues));
+        let cuts: Option<Vec<GrayImage>> = cuts.collect();
+        let Some(mask) = cuts.and_then(|cuts| cuts.into_iter().reduce(joined)) else { return Ok(self.clone()) };
+        Ok(Self { mask, from: format!("{}, by places in space", self.from), drawn: self.drawn.clone() })
+    }
+}
+
+/// What either of two masks of one size covers.
+fn joined(mut one: GrayImage, other: GrayImage) -> GrayImage {
+    one.iter_mut().zip(other.as_raw()).for_each(|(one, other)| *one = (*one).max(*other));
+    one
 }
 
 pub(super) fn no_such_view<'a>(name: &str, option: &str, views: impl Iterator<Item = &'a str>) -> Error {
@@ -95,7 +159,7 @@ pub(super) fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<Str
         }
         // Of those that came with the photographs an empty one is a view without the object.
         let mask = capture.mask(name, checked(path, mask, size, true)?);
-        all.insert(name.clone(), Given { mask, from: format!("{}", path.display()) });
+        all.insert(name.clone(), Given::fixed(mask, format!("{}", path.display())));
     }
     let on = |stem: &str, kind: &dyn Fn(&Evidence) -> bool| {
         request
@@ -124,7 +188,7 @@ pub(super) fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<Str
             Evidence::Box(_) if marked => of_marks(request, &stem, photograph, size)?,
             Evidence::Mask(path) => {
                 let mask = checked(path, read_mask(path, size)?, size, false)?;
-                Given { mask, from: format!("--mask {}", path.display()) }
+                Given::fixed(mask, format!("--mask {}", path.display()))
             }
             Evidence::Box(bounds) => {
                 let [x0, y0, x1, y1] = *bounds;
@@ -140,13 +204,14 @@ pub(super) fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<Str
                     continue;
                 }
                 let picture = scene::photograph(photograph, 1)?;
-                let mask = click::from_box(&picture, *bounds).ok_or_else(|| {
+                let drawn = Drawn::Box(*bounds);
+                let mask = drawn.cut(&picture, &Cues::default()).ok_or_else(|| {
                     Error::Request(format!(
                         "--box {name}={x0},{y0},{x1},{y1}: nothing in the box differs from what is around it; draw it closer, \
                          or give a mask"
                     ))
                 })?;
-                Given { mask, from: format!("--box {x0},{y0},{x1},{y1} and a graph cut") }
+                Given { mask, from: format!("--box {x0},{y0},{x1},{y1} and a graph cut"), drawn: vec![drawn] }
             }
             Evidence::Strokes(path) => {
                 let picture = scene::photograph(photograph, 1)?;
@@ -165,7 +230,7 @@ pub(super) fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<Str
                         "--strokes {name}: no stroke on the object lies within the box; draw one there"
                     )));
                 }
-                Given { mask, from: format!("--strokes {}{within}", path.display()) }
+                Given::fixed(mask, format!("--strokes {}{within}", path.display()))
             }
         };
         let mask = capture.mask(&stem, given.mask);
@@ -177,10 +242,13 @@ pub(super) fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<Str
         }
         let joins = matches!(evidence, Evidence::Mask(_) | Evidence::Box(_)) && !marked;
         let given = match all.remove(&stem) {
-            Some(mut before) if joins && named.contains(&stem) => {
-                before.mask.iter_mut().zip(mask.as_raw()).for_each(|(one, other)| *one = (*one).max(*other));
-                Given { mask: before.mask, from: format!("{}, {}", before.from, given.from) }
+            Some(before) if joins && named.contains(&stem) => {
+                let all_drawn = !before.drawn.is_empty() && !given.drawn.is_empty();
+                let drawn = if all_drawn { [before.drawn, given.drawn].concat() } else { vec![] };
+                Given { mask: joined(before.mask, mask), from: format!("{}, {}", before.from, given.from), drawn }
             }
+            // Of a photograph that the scene has resampled the drawing is elsewhere.
+            _ if capture.is_resampled(&stem) => Given::fixed(mask, given.from),
             _ => Given { mask, ..given },
         };
         if joins {
@@ -219,10 +287,10 @@ fn of_marks(request: &Request, stem: &str, photograph: &Path, size: [u32; 2]) ->
         }
         marks.push(mark);
     }
-    let picture = resample::photograph(&scene::photograph(photograph, 1)?, click::working(size));
-    let mask = click::mask(&picture, &marks, &Cues::default());
-    if mask.as_raw().iter().all(|v| *v == 0) {
-        let says_where = marks.iter().any(|mark| !matches!(mark, Mark::Background { .. }));
+    let says_where = marks.iter().any(|mark| !matches!(mark, Mark::Background { .. }));
+    let from = format!("{} marks", marks.len());
+    let drawn = Drawn::Marks(marks);
+    let Some(mask) = drawn.cut(&scene::photograph(photograph, 1)?, &Cues::default()) else {
         return Err(Error::Request(if says_where {
             format!(
                 "{stem}: nothing at its marks differs from what is around them; draw the --lasso or --box closer, or give a mask"
@@ -232,10 +300,8 @@ fn of_marks(request: &Request, stem: &str, photograph: &Path, size: [u32; 2]) ->
                 "--not {stem}: says nothing without a --click, --lasso or --box in the same view; say where the object is"
             )
         }));
-    }
-    let own = [mask.width(), mask.height()];
-    let mask = masks::threshold(&masks::parts(&mask, own), own, size, 0.5);
-    Ok(Given { mask, from: format!("{} marks", marks.len()) })
+    };
+    Ok(Given { mask, from, drawn: vec![drawn] })
 }
 
 /// Masks in the scene's folder that are not the program's own: the user has put or corrected them there.
@@ -256,7 +322,7 @@ pub(super) fn corrected(
         if !given.contains_key(&name) && folder.is_users(&relative)? {
             let size = picture_size(photograph)?;
             let mask = checked(&path, read_mask(&path, size)?, size, true)?;
-            all.insert(name, Given { mask, from: USERS.into() });
+            all.insert(name, Given::fixed(mask, USERS.into()));
         }
     }
     Ok(all)

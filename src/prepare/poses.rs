@@ -228,6 +228,11 @@ impl Capture {
         self.pinholes.get(name).map_or_else(|| mask.clone(), |pinhole| pinhole.mask(&mask))
     }
 
+    /// Whether the scene has a photograph as another lens would have taken it.
+    pub fn is_resampled(&self, name: &str) -> bool {
+        self.pinholes.contains_key(name)
+    }
+
     /// Whether the scene is to be made in the capture's own folder.
     fn in_place(&self, out: &Path) -> bool {
         let canonical = |path: &Path| path.canonicalize().ok();

@@ -9,6 +9,7 @@ use rand::RngExt as _;
 
 use super::{Cues, Mark, mask, next};
 use crate::gpu::testing;
+use crate::multiview;
 use crate::prepare::depth::DepthMap;
 use crate::prepare::masks::{self, Votes};
 use crate::prepare::splats::Splats;
@@ -94,7 +95,7 @@ fn row(picture: &RgbImage, truth: &GrayImage, cues: &Cues<'_>) -> (Row, f64) {
     let Mark::Box { bounds } = boxed(truth) else { unreachable!("a box") };
     let size = [truth.width(), truth.height()];
     let corners = std::array::from_fn(|k| (bounds[k] * f64::from(size[k % 2])).round() as u32);
-    let cut = super::from_box(picture, corners);
+    let cut = super::from_box(picture, corners, cues);
     let alone = cut.map_or(0.0, |mask| iou(&mask, truth));
     ([clicks, boxes, lassos, [alone; 4]], slowest)
 }
@@ -148,6 +149,7 @@ fn small(path: &Path) -> RgbImage {
 struct Found {
     alone: Row,
     fitted: Row,
+    measured: Row,
     carried: [f64; 3],
     slowest: f64,
 }
@@ -157,6 +159,7 @@ fn measure(request: &Request, truth: &Path, every: usize) -> Found {
     let gpu = testing::gpu();
     let (scene, fit) = prepare::fitted(&gpu, request, &mut Silent).expect("a fit");
     let mut splats = Splats::new(&gpu, &fit.model, &fit.settings.render).expect("room");
+    let grids = multiview::depths(&gpu, &scene).expect("room");
     let files = scene::pictures(&request.out.join("images")).expect("photographs");
     let truths = scene::pictures(truth).expect("masks");
     let truth =
@@ -172,10 +175,16 @@ fn measure(request: &Request, truth: &Path, every: usize) -> Found {
         let picture = small(&files[&view.name]);
         let own = truth(&view.name, [picture.width(), picture.height()]);
         let depth = DepthMap::of(&mut splats, &view.camera).expect("a depth");
+        let measured = DepthMap::measured(&grids[i], &view.camera);
         let with = Cues { depth: Some(&depth), carried: None };
-        for (sums, cues) in [(&mut found.alone, Cues::default()), (&mut found.fitted, with)] {
+        let by_measure = Cues { depth: Some(&measured), carried: None };
+        for (sums, cues, what) in [
+            (&mut found.alone, Cues::default(), ""),
+            (&mut found.fitted, with, " with the fit"),
+            (&mut found.measured, by_measure, " as measured"),
+        ] {
             let (ious, slowest) = row(&picture, &own, &cues);
-            print(&format!("{}{}", view.name, if cues.depth.is_some() { " with the fit" } else { "" }), &ious);
+            print(&format!("{}{what}", view.name), &ious);
             let all = sums.iter_mut().flatten().zip(ious.iter().flatten());
             all.for_each(|(sum, iou)| *sum += share * iou);
             found.slowest = found.slowest.max(slowest);
@@ -198,6 +207,7 @@ fn measure(request: &Request, truth: &Path, every: usize) -> Found {
     println!("mean IoU of {} views after 1, 2, 3 and 5 marks", looked.len());
     print("colours alone", &found.alone);
     print("with the fit", &found.fitted);
+    print("as measured", &found.measured);
     println!("carried to the others after 1, 2, 3 clicks {:.3?}; slowest cut {:.2} s", found.carried, found.slowest);
     found
 }
