@@ -77,12 +77,16 @@ fn what_the_settings_leave_out_is_measured() {
     let scene = common::folder();
     let arguments = [
         &["scene", "--out", "report", "--kernels-only", "--warm-up", "1", "--views", "1", "--repetitions", "1"][..],
-        &["--only", "attention", "--set", "model.attention.enabled=false"],
+        &["--only", "attention", "--set", "model.attention.enabled=false", "--set", "model.attention.start=7"],
     ]
     .concat();
     succeeds(scene.path(), &arguments);
     let json: Value = serde_json::from_str(&read(&scene.path().join("report"), "report.json")).expect("JSON");
     assert_eq!(strings(&json["kernels"]["variants"], "name"), ["as set", "attention"]);
+    // The step that is measured is one in which it has begun.
+    let stages = |variant: usize| strings(&json["kernels"]["variants"][variant]["stages"], "stage");
+    let measured: Vec<bool> = (0..2).map(|variant| stages(variant).iter().any(|stage| stage == "attention")).collect();
+    assert_eq!(measured, [false, true], "{:?}", stages(1));
 }
 
 #[test]

@@ -23,11 +23,14 @@ pub const KERNELS: &[Choice] = &[
     ("no depth", &["losses.depth.enabled=false"]),
 ];
 
+/// However short a run is, two thirds of it have attention, as those of `lavapipe`.
+const ATTENTION_START: &str = "model.attention.start=33%";
+
 /// Choices of a whole training run.
 pub const TRAINING: &[Choice] = &[
     ("as set", &[]),
-    ("attention", &["model.attention.enabled=true"]),
-    ("a quarter of the tokens", &["model.attention.enabled=true", "model.attention.tokens*=0.25"]),
+    ("attention", &["model.attention.enabled=true", ATTENTION_START]),
+    ("a quarter of the tokens", &["model.attention.enabled=true", ATTENTION_START, "model.attention.tokens*=0.25"]),
     ("no attention", &["model.attention.enabled=false"]),
     ("no depth", &["losses.depth.enabled=false"]),
     ("half the resolution", &["scene.downscale*=2"]),

@@ -42,8 +42,10 @@ pub fn working(size: [u32; 2]) -> [u32; 2] {
 /// Knowledge of a photograph besides its colours.
 #[derive(Clone, Copy, Default)]
 pub struct Cues<'a> {
-    /// The fit's depth.
+    /// The fit's depth, known everywhere and nowhere sharp.
     pub depth: Option<&'a DepthMap>,
+    /// Depth as it is measured between photographs, which counts for what is drawn around something.
+    pub measured: Option<&'a DepthMap>,
     /// The votes of other views' masks: the object's part of each pixel, 0 to 1, and width and height.
     pub carried: Option<(&'a [f32], [u32; 2])>,
 }
@@ -288,6 +290,7 @@ fn found(picture: &RgbImage, marks: &[Mark], cues: &Cues<'_>) -> GrayImage {
         Some(bounds) => Window::around(std::array::from_fn(|k| bounds[k] * f64::from(full[k % 2])), 0.5, full),
         None => Window::whole(picture),
     };
+    let cues = &Cues { depth: cues.measured.filter(|_| outlined).or(cues.depth), ..*cues };
     let alone = Cues { depth: None, ..*cues };
     let by_colors = (outlined && cues.depth.is_some()).then(|| cut(picture, first, marks, &alone, None)).flatten();
     let by_colors = by_colors.filter(|mask| behind_share(picture, first, marks, cues, mask) < BEHIND);
@@ -684,7 +687,7 @@ fn edited(picture: &RgbImage, marks: &[Mark], before: &GrayImage, depth: Option<
     let bounds = bounds_of(before)?;
     let bounds = [bounds[0].min(x), bounds[1].min(y), bounds[2].max(x + 1.0), bounds[3].max(y + 1.0)];
     let window = Window::around(bounds, AROUND, full);
-    let pixels = Pixels::of(picture, window, SIDES[1], marks, &Cues { depth, carried: None });
+    let pixels = Pixels::of(picture, window, SIDES[1], marks, &Cues { depth, ..Cues::default() });
     let [w, h] = pixels.size;
     let [x0, y0, wide, _] = window.0;
     let small = [w as u32, h as u32];

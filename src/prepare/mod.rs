@@ -29,7 +29,7 @@ use image::GrayImage;
 use rayon::prelude::*;
 
 use crate::gpu::{self, Gpu};
-use crate::multiview::Matched;
+use crate::multiview::{DepthGrid, Matched};
 use crate::scene::{self, Camera, PriorKind, Scene};
 use crate::sentence::one_line;
 use crate::signal::Signal;
@@ -40,7 +40,7 @@ use fit::Fit;
 use misplaced::Looks;
 use network::Inpainting;
 pub use object::Evidence;
-use object::{Drawn, Given, USERS, corrected, given, no_such_view};
+use object::{Given, USERS, corrected, given, no_such_view};
 use poses::Capture;
 use record::{Batch, Folder, Inputs};
 use splats::Splats;
@@ -267,18 +267,29 @@ pub fn prepare(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<()
     steps(gpu, request, watch).map(drop)
 }
 
-/// The photographs at the size of the fit, and the fit: the first two steps of [`prepare`] alone, whatever the request
-/// wants, with what they leave in the scene's folder.
+/// A scene before anything in it is masked.
+pub struct Fitted {
+    /// The photographs at the size of the fit.
+    pub scene: Scene,
+    /// The fit to them.
+    pub fit: Fit,
+    /// `[view]` depth as it is measured between them.
+    pub grids: Vec<DepthGrid>,
+}
+
+/// The first two steps of [`prepare`] alone, whatever the request wants, with what they leave in the scene's folder.
 ///
 /// # Errors
 /// As [`prepare`].
-pub fn fitted(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<(Scene, Fit), Error> {
+pub fn fitted(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Fitted, Error> {
     let request = Request { only: vec![Step::Poses, Step::Fit], object: vec![], ..request.clone() };
-    Ok(steps(gpu, &request, watch)?.expect("a request for the fit makes one"))
+    let (scene, fit, matched) = steps(gpu, &request, watch)?.expect("a request for the fit makes one");
+    let matched = matched.map_or_else(|| Matched::new(gpu, &scene), Ok)?;
+    Ok(Fitted { grids: matched.depths(&scene), scene, fit })
 }
 
 /// The steps that are wanted; nothing comes back where those are the poses alone.
-fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(Scene, Fit)>, Error> {
+fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(Scene, Fit, Option<Matched>)>, Error> {
     let mut capture = poses::find(&request.photographs)?;
     capture.photographs.iter().try_for_each(|(name, path)| has_room(name, path))?;
     // In a scene that is made in its own capture's folder the masks may be the program's; `corrected` tells them apart.
@@ -350,7 +361,8 @@ fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(
         let masks = preparation.masks_on_disk(&scene)?;
         preparation.reference(&scene, &masks)?;
     }
-    Ok(Some((scene, fit)))
+    let matched = preparation.matched.take();
+    Ok(Some((scene, fit, matched)))
 }
 
 /// Refuses a photograph whose name leaves no room for that of its files, of which its prior as the reference has the longest.
@@ -664,12 +676,8 @@ impl Preparation<'_> {
         let grids = self.matched(scene)?.depths(scene);
         for (view, grid) in scene.train.iter().zip(&grids) {
             let Some(given) = all.get_mut(&view.name).filter(|given| !given.drawn.is_empty()) else { continue };
-            // Around clicks the fit's depth, which has fewer jumps, finds more of the object.
-            let depth = match given.drawn.iter().all(Drawn::is_outline) {
-                true => DepthMap::measured(grid, &view.camera),
-                false => DepthMap::of(splats, &view.camera)?,
-            };
-            *given = given.placed(&files[&view.name], &depth)?;
+            let depths = [DepthMap::of(splats, &view.camera)?, DepthMap::measured(grid, &view.camera)];
+            *given = given.placed(&files[&view.name], depths.each_ref())?;
         }
         Ok(all)
     }

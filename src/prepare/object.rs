@@ -84,14 +84,6 @@ pub(super) enum Drawn {
 }
 
 impl Drawn {
-    /// Whether it goes around the object.
-    pub fn is_outline(&self) -> bool {
-        match self {
-            Self::Box(_) => true,
-            Self::Marks(marks) => marks.iter().any(|mark| matches!(mark, Mark::Box { .. } | Mark::Lasso { .. })),
-        }
-    }
-
     /// Its mask, as large as the photograph; nothing if nothing there differs from what is around it.
     fn cut(&self, picture: &RgbImage, cues: &Cues<'_>) -> Option<GrayImage> {
         let mask = match self {
@@ -118,9 +110,9 @@ impl Given {
     ///
     /// # Errors
     /// A photograph that cannot be read.
-    pub fn placed(&self, photograph: &Path, depth: &DepthMap) -> Result<Self, Error> {
+    pub fn placed(&self, photograph: &Path, [fit, measured]: [&DepthMap; 2]) -> Result<Self, Error> {
         let picture = scene::photograph(photograph, 1)?;
-        let cues = Cues { depth: Some(depth), carried: None };
+        let cues = Cues { depth: Some(fit), measured: Some(measured), carried: None };
         let cuts = self.drawn.iter().map(|drawn| drawn.cut(&picture, &cues));
         let cuts: Option<Vec<GrayImage>> = cuts.collect();
         let Some(mask) = cuts.and_then(|cuts| cuts.into_iter().reduce(joined)) else { return Ok(self.clone()) };

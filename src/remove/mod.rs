@@ -176,7 +176,7 @@ pub struct Session {
     numbers: BTreeMap<String, usize>,
     state: Mutex<State>,
     changed: Condvar,
-    depths: RwLock<BTreeMap<usize, Arc<DepthMap>>>,
+    depths: RwLock<BTreeMap<usize, Arc<[DepthMap; 2]>>>,
     /// One mask is cut at a time, and its files are written.
     cutting: Mutex<()>,
     /// One photograph is decoded at a time.
@@ -373,14 +373,15 @@ impl Session {
         number: usize,
         view: &View,
         marks: &[Mark],
-        depth: Option<&DepthMap>,
+        depth: Option<&[DepthMap; 2]>,
     ) -> Result<Option<Arc<GrayImage>>, Refused> {
         let mask = if marks.is_empty() {
             None
         } else {
             let picture = self.picture(number).map_err(|error| (Refusal::Busy, error.to_string()))?;
             let carried = view.carried.as_ref().map(|shown| (shown.parts.as_slice(), shown.size));
-            let cues = Cues { depth, carried };
+            let [fit, measured] = [0, 1].map(|which| depth.map(|depths| &depths[which]));
+            let cues = Cues { depth: fit, measured, carried };
             // From the longest beginning of the marks that was made already.
             let fits = |with: &Option<bool>| with.is_none_or(|with| with == depth.is_some());
             let begun = view.made.iter().filter(|(own, with, _)| fits(with) && marks.starts_with(own));
@@ -533,9 +534,9 @@ impl Session {
         self.lock().ready = true;
     }
 
-    /// The fit's depth of a view.
-    pub fn knows(&self, number: usize, depth: DepthMap) {
-        write(&self.depths).insert(number, Arc::new(depth));
+    /// The depth of a view: the fit's, and as it is measured.
+    pub fn knows(&self, number: usize, depths: [DepthMap; 2]) {
+        write(&self.depths).insert(number, Arc::new(depths));
     }
 
     /// Keeps what the masks of this revision make of a view; nothing of it is kept where they have changed since.

@@ -18,6 +18,7 @@ use crate::cli::train::{self, Stop};
 use crate::cli::{shared, view};
 use crate::gpu::Gpu;
 use crate::model::stored::Stored;
+use crate::prepare::Fitted;
 use crate::prepare::depth::DepthMap;
 use crate::prepare::fit::Fit;
 use crate::prepare::masks::{self, Shares, Votes};
@@ -224,15 +225,16 @@ struct Carrier {
 impl Carrier {
     fn new(job: &Job<'_>, gpu: &Gpu, session: &Session) -> anyhow::Result<Self> {
         session.begin("poses", 0);
-        let (scene, fit) = job.fitted(gpu, &Visitors(session))?;
+        let Fitted { scene, fit, grids } = job.fitted(gpu, &Visitors(session))?;
         let mut splats = Splats::new(gpu, &fit.model, &fit.settings.render)?;
         session.begin("shape", scene.train.len() as u64);
         let colors = masks::colors(&mut splats, &scene.train)?;
         let numbers: Vec<Option<usize>> = scene.train.iter().map(|view| session.number(&view.name)).collect();
-        for (i, (view, number)) in scene.train.iter().zip(&numbers).enumerate() {
+        for (i, ((view, grid), number)) in scene.train.iter().zip(&grids).zip(&numbers).enumerate() {
             check(job)?;
             if let Some(number) = number {
-                session.knows(*number, DepthMap::of(&mut splats, &view.camera)?);
+                let depths = [DepthMap::of(&mut splats, &view.camera)?, DepthMap::measured(grid, &view.camera)];
+                session.knows(*number, depths);
             }
             session.at(i as u64 + 1);
         }

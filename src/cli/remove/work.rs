@@ -225,11 +225,7 @@ impl Job<'_> {
     ///
     /// # Errors
     /// As [`prepare::fitted`].
-    pub fn fitted(
-        &self,
-        gpu: &Gpu,
-        audience: &dyn Audience,
-    ) -> Result<(crate::scene::Scene, prepare::fit::Fit), prepare::Error> {
+    pub fn fitted(&self, gpu: &Gpu, audience: &dyn Audience) -> Result<prepare::Fitted, prepare::Error> {
         prepare::fitted(gpu, &self.request(vec![]), &mut Watched::<Bars>::new(audience, self))
     }
 

@@ -31,7 +31,8 @@ use crate::train::step::{Rates, Step};
 pub struct Options {
     /// Steps trained before.
     pub warm_up: u32,
-    /// The number that the measured step counts as; nothing: the first one with attention, or the one behind the warm-up.
+    /// The number that the measured step counts as; nothing: the first one in which all choices that have
+    /// attention have begun with it, or the one behind the warm-up.
     pub step: Option<u32>,
     /// Views, the reference view among them if there is one.
     pub views: usize,
@@ -162,7 +163,8 @@ pub fn measure(
     let base = &variants[0].settings;
     say(&format!("kernels: {} steps of warm-up", options.warm_up));
     let warm = Warm::train(gpu, scene, base, options.warm_up)?;
-    let attention = Plan::new(scene, base).attention.then_some(base.model.attention.start);
+    let has_attention = |variant: &&Variant| Plan::new(scene, &variant.settings).attention;
+    let attention = variants.iter().filter(has_attention).map(|variant| variant.settings.model.attention.start).max();
     let step = options.step.unwrap_or(attention.unwrap_or(0).max(options.warm_up + 1)).max(1);
     let subset = choose_views(scene, options.views);
     let mut photographs: BTreeMap<bool, Rc<Vec<Photograph>>> = BTreeMap::new();

@@ -164,7 +164,7 @@ mod tests {
         let known = map(&|x, y| if vase(x / 4 * 4 + 2, y / 4 * 4 + 2) { 3.0 } else { 4.0 });
         let fog = map(&|x, y| 3.5 + 0.001 * f32::from(speck(x / 9, y / 9)));
         let wrong = |depth: Option<&DepthMap>| {
-            let cues = Cues { depth, carried: None };
+            let cues = Cues { depth, ..Cues::default() };
             let mask = from_box(&picture, [48, 33, 122, 103], &cues).expect("there is something in it");
             mask.enumerate_pixels().filter(|(x, y, v)| (v.0[0] != 0) != vase(*x, *y)).count()
         };

@@ -9,11 +9,10 @@ use rand::RngExt as _;
 
 use super::{Cues, Mark, mask, next};
 use crate::gpu::testing;
-use crate::multiview;
 use crate::prepare::depth::DepthMap;
 use crate::prepare::masks::{self, Votes};
 use crate::prepare::splats::Splats;
-use crate::prepare::{self, Request, Silent};
+use crate::prepare::{self, Fitted, Request, Silent};
 use crate::scene::doctor::iou;
 use crate::scene::{self, resample, synthetic};
 
@@ -157,9 +156,8 @@ struct Found {
 /// Measures on every so many-th view. `photographs` is what `prepare` takes, `out` where its fit is or goes.
 fn measure(request: &Request, truth: &Path, every: usize) -> Found {
     let gpu = testing::gpu();
-    let (scene, fit) = prepare::fitted(&gpu, request, &mut Silent).expect("a fit");
+    let Fitted { scene, fit, grids } = prepare::fitted(&gpu, request, &mut Silent).expect("a fit");
     let mut splats = Splats::new(&gpu, &fit.model, &fit.settings.render).expect("room");
-    let grids = multiview::depths(&gpu, &scene).expect("room");
     let files = scene::pictures(&request.out.join("images")).expect("photographs");
     let truths = scene::pictures(truth).expect("masks");
     let truth =
@@ -176,12 +174,12 @@ fn measure(request: &Request, truth: &Path, every: usize) -> Found {
         let own = truth(&view.name, [picture.width(), picture.height()]);
         let depth = DepthMap::of(&mut splats, &view.camera).expect("a depth");
         let measured = DepthMap::measured(&grids[i], &view.camera);
-        let with = Cues { depth: Some(&depth), carried: None };
-        let by_measure = Cues { depth: Some(&measured), carried: None };
+        let with = Cues { depth: Some(&depth), ..Cues::default() };
+        let by_measure = Cues { measured: Some(&measured), ..with };
         for (sums, cues, what) in [
             (&mut found.alone, Cues::default(), ""),
             (&mut found.fitted, with, " with the fit"),
-            (&mut found.measured, by_measure, " as measured"),
+            (&mut found.measured, by_measure, " with both"),
         ] {
             let (ious, slowest) = row(&picture, &own, &cues);
             print(&format!("{}{what}", view.name), &ious);
@@ -207,7 +205,7 @@ fn measure(request: &Request, truth: &Path, every: usize) -> Found {
     println!("mean IoU of {} views after 1, 2, 3 and 5 marks", looked.len());
     print("colours alone", &found.alone);
     print("with the fit", &found.fitted);
-    print("as measured", &found.measured);
+    print("with the fit and measured depth", &found.measured);
     println!("carried to the others after 1, 2, 3 clicks {:.3?}; slowest cut {:.2} s", found.carried, found.slowest);
     found
 }
