@@ -11,6 +11,7 @@
 //! view to which other views' masks were carried. What it may not change is in [`next`]. Who wants a larger or smaller
 //! part than a click takes by itself goes along the segments of several scales about it (`tree`).
 
+use std::cell::LazyCell;
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
@@ -81,7 +82,7 @@ const OFF: f64 = 9.0;
 const BEHIND: f64 = 0.1;
 /// Pixels along a mask's border that tell nothing of what is behind.
 const SKIN: u32 = 3;
-/// So many pixels beside something near may have its depth, and so many of its own that of what is behind.
+/// Depth bleeds by so many pixels over what is beside something near, and over its own border by so many.
 const BLEEDS: [u32; 2] = [6, 3];
 /// Depth that changes by less than this part of a jump across an object's outline does not know the object.
 const FLAT: f64 = 0.2;
@@ -292,16 +293,13 @@ fn found(picture: &RgbImage, marks: &[Mark], cues: &Cues<'_>) -> GrayImage {
     };
     let cues = &Cues { depth: cues.measured.filter(|_| outlined).or(cues.depth), ..*cues };
     let alone = Cues { depth: None, ..*cues };
-    let by_colors = (outlined && cues.depth.is_some()).then(|| cut(picture, first, marks, &alone, None)).flatten();
-    let by_colors = by_colors.filter(|mask| behind_share(picture, first, marks, cues, mask) < BEHIND);
-    let (found, cues) = match by_colors {
-        Some(mask) => (Some(mask), &alone),
-        None => match cut(picture, first, marks, cues, None) {
-            Some(mask) if cues.depth.is_some() && !cues.knows(picture, &mask) => {
-                (cut(picture, first, marks, &alone, None), &alone)
-            }
-            by_places => (by_places, cues),
-        },
+    let by_colors = LazyCell::new(|| cut(picture, first, marks, &alone, None));
+    let keeps_to_itself = |mask: &GrayImage| behind_share(picture, first, marks, cues, mask) < BEHIND;
+    let places_decide = cues.depth.is_some() && !(outlined && by_colors.as_ref().is_some_and(keeps_to_itself));
+    let by_places = places_decide.then(|| cut(picture, first, marks, cues, None));
+    let (found, cues) = match by_places {
+        Some(found) if found.as_ref().is_none_or(|mask| cues.knows(picture, mask)) => (found, cues),
+        _ => ((*by_colors).clone(), &alone),
     };
     let Some(found) = found else { return empty };
     let Some(bounds) = bounds_of(&found) else { return empty };
@@ -489,7 +487,7 @@ impl Pixels {
         distance
     }
 
-    /// Those of which something is true, as a mask of the small picture.
+    /// A mask of the small picture: the pixels of which something is true.
     fn picture(&self, of: impl Fn(usize) -> bool) -> GrayImage {
         let [w, h] = self.size.map(|n| n as u32);
         GrayImage::from_fn(w, h, |x, y| image::Luma([if of((y * w + x) as usize) { 255 } else { 0 }]))

@@ -378,6 +378,32 @@ fn has_room(name: &str, path: &Path) -> Result<(), Error> {
     Err(Error::File { path: path.to_owned(), what })
 }
 
+/// Masks that were cut by colours alone, cut again by where in space pixels are.
+fn placed(
+    scene: &Scene,
+    grids: &[DepthGrid],
+    splats: &mut Splats,
+    given: &BTreeMap<String, Given>,
+    files: &BTreeMap<String, PathBuf>,
+) -> Result<BTreeMap<String, Given>, Error> {
+    let mut all = given.clone();
+    for (view, grid) in scene.train.iter().zip(grids) {
+        let Some(given) = all.get_mut(&view.name).filter(|given| !given.drawn.is_empty()) else { continue };
+        let depths = [DepthMap::of(splats, &view.camera)?, DepthMap::measured(grid, &view.camera)];
+        *given = given.placed(&files[&view.name], depths.each_ref())?;
+    }
+    Ok(all)
+}
+
+/// `[view][pixel]` of the fit's pictures: whether what is there is none of the object, by the given masks and the depth that is
+/// measured between the photographs.
+fn beside(scene: &Scene, grids: &[DepthGrid], given: &BTreeMap<String, Given>) -> Vec<Vec<bool>> {
+    let cameras: Vec<Camera> = scene.train.iter().map(|view| view.camera).collect();
+    let masks: Vec<Option<&GrayImage>> =
+        scene.train.iter().map(|view| given.get(&view.name).map(|given| &given.mask)).collect();
+    hole::ground::beside(grids, &cameras, &masks)
+}
+
 /// A preparation under way.
 struct Preparation<'a> {
     gpu: &'a Gpu,
@@ -549,7 +575,10 @@ impl Preparation<'_> {
         }
         let files = scene::pictures(&self.folder.root().join(poses::IMAGES))?;
         self.watch.begin(Step::Masks, (given.len() + scene.train.len()) as u64);
-        let given = &self.placed(scene, splats, given, &files)?;
+        let all_given = scene.train.iter().all(|view| given.contains_key(&view.name));
+        let needs_depth = !all_given || given.values().any(|given| !given.drawn.is_empty());
+        let grids = if needs_depth { self.matched(scene)?.depths(scene) } else { vec![] };
+        let given = &placed(scene, &grids, splats, given, &files)?;
         let mut votes = masks::Votes::new(splats);
         let mut unit = 0;
         for view in &scene.train {
@@ -565,7 +594,7 @@ impl Preparation<'_> {
         let names: Vec<&str> = given.keys().map(String::as_str).collect();
         let from = format!("carried from {}", abridged(&names));
         let others: Vec<&scene::View> = scene.train.iter().filter(|view| !given.contains_key(&view.name)).collect();
-        let beside = self.beside(scene, given)?;
+        let beside = if all_given { vec![] } else { beside(scene, &grids, given) };
         let carry = |shares: &masks::Shares, splats: &mut Splats| -> Result<Vec<masks::Carried>, Error> {
             let views = scene.train.iter().enumerate().filter(|(_, view)| !given.contains_key(&view.name));
             let carried = views.map(|(at, view)| {
@@ -661,27 +690,6 @@ impl Preparation<'_> {
         Ok(())
     }
 
-    /// Masks that were cut by colours alone, cut again by where in space pixels are.
-    fn placed(
-        &mut self,
-        scene: &Scene,
-        splats: &mut Splats,
-        given: &BTreeMap<String, Given>,
-        files: &BTreeMap<String, PathBuf>,
-    ) -> Result<BTreeMap<String, Given>, Error> {
-        let mut all = given.clone();
-        if given.values().all(|given| given.drawn.is_empty()) {
-            return Ok(all);
-        }
-        let grids = self.matched(scene)?.depths(scene);
-        for (view, grid) in scene.train.iter().zip(&grids) {
-            let Some(given) = all.get_mut(&view.name).filter(|given| !given.drawn.is_empty()) else { continue };
-            let depths = [DepthMap::of(splats, &view.camera)?, DepthMap::measured(grid, &view.camera)];
-            *given = given.placed(&files[&view.name], depths.each_ref())?;
-        }
-        Ok(all)
-    }
-
     /// Matches the photographs, once.
     fn matched(&mut self, scene: &Scene) -> Result<&Matched, Error> {
         let matched = match self.matched.take() {
@@ -689,19 +697,6 @@ impl Preparation<'_> {
             None => Matched::new(self.gpu, scene)?,
         };
         Ok(self.matched.insert(matched))
-    }
-
-    /// `[view][pixel]` of the fit's pictures: whether what is there is none of the object, by the given
-    /// masks and the depth that is measured between the photographs.
-    fn beside(&mut self, scene: &Scene, given: &BTreeMap<String, Given>) -> Result<Vec<Vec<bool>>, Error> {
-        if scene.train.iter().all(|view| given.contains_key(&view.name)) {
-            return Ok(vec![]);
-        }
-        let grids = self.matched(scene)?.depths(scene);
-        let cameras: Vec<Camera> = scene.train.iter().map(|view| view.camera).collect();
-        let masks: Vec<Option<&GrayImage>> =
-            scene.train.iter().map(|view| given.get(&view.name).map(|given| &given.mask)).collect();
-        Ok(hole::ground::beside(&grids, &cameras, &masks))
     }
 
     /// The masks that the scene has now, by view, as large as the photographs; an error unless all are there.

@@ -84,7 +84,7 @@ pub(super) enum Drawn {
 }
 
 impl Drawn {
-    /// Its mask, as large as the photograph; nothing if nothing there differs from what is around it.
+    /// The mask that the drawing means, as large as the photograph; nothing if nothing there differs from what is around it.
     fn cut(&self, picture: &RgbImage, cues: &Cues<'_>) -> Option<GrayImage> {
         let mask = match self {
             Self::Box(bounds) => click::from_box(picture, *bounds, cues)?,
@@ -120,7 +120,7 @@ impl Given {
     }
 }
 
-/// What either of two masks of one size covers.
+/// Two masks of one size as one, of all that either covers.
 fn joined(mut one: GrayImage, other: GrayImage) -> GrayImage {
     one.iter_mut().zip(other.as_raw()).for_each(|(one, other)| *one = (*one).max(*other));
     one
