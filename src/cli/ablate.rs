@@ -154,7 +154,6 @@ fn named(flag: &str, text: &str) -> anyhow::Result<(String, PathBuf)> {
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let variants = Variant::all(args)?;
-    let base = args.settings.resolve()?;
     let judge = args.judge.judge()?;
     let scenes: Vec<SceneArgs> =
         args.scenes.iter().map(|scene| SceneArgs { scene: scene.clone(), settings: args.settings.clone() }).collect();
@@ -165,7 +164,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         folder.push("-ablation");
         folder.into()
     });
-    let seeds = seeds(base.train.seed, args.seeds)?;
+    let seeds = seeds(args.settings.resolve()?.train.seed, args.seeds)?;
     let _lock = Lock::take(&out)?;
     folder::sweep(&out, |name| [RUNS, COMPARISON].contains(&name));
     let mut known = Known::new(&out.join(RUNS), scenes.len() * seeds.len() * variants.len())?;
@@ -185,6 +184,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let rows = with_gpu(&args.device.options(), |gpu| {
         let mut rows = vec![];
         for ((scene, name), label) in scenes.iter().zip(&names).zip(&labels) {
+            let base = scene.resolve()?;
             for seed in &seeds {
                 let place = (&*scene.scene, name.as_str(), label.as_str());
                 rows.extend(of_scene(gpu, args, &variants, &base, &judge, place, (*seed, &out, &mut known))?);

@@ -82,10 +82,10 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     }
     let old = args.against.as_deref().map(|path| Ok::<_, compare::Error>((path, compare::read(path)?))).transpose()?;
     let peaks = args.predict.as_deref().map(predict::read).transpose()?.unwrap_or_default();
-    let settings = args.settings.resolve()?;
-    only_anchors(&settings, "bench")?;
     let Some(scene) = args.scene.clone() else { bail!("SCENE: name the scene to measure a step of") };
     let args_of_scene = SceneArgs { scene, settings: args.settings.clone() };
+    let settings = args_of_scene.resolve()?;
+    only_anchors(&settings, "bench")?;
     let loaded = Loaded::read(&args_of_scene.scene, settings.clone())?;
     let facts = SceneFacts::new(last_part(&args_of_scene.name()), &loaded.scene);
     let json = serde_json::to_value(&settings).context("the settings as JSON")?;

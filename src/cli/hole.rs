@@ -161,7 +161,7 @@ impl Work<'_> {
     /// Hash of all settings but the seed.
     fn hash(&self) -> anyhow::Result<String> {
         let given = preset::chosen(&self.given(self.set.to_owned()), self.device)?;
-        let mut settings = self.fitted(&given.settings.resolve()?);
+        let mut settings = self.fitted(&given.resolve()?);
         settings.train.seed = 0;
         Ok(blake3::hash(settings.to_toml().as_bytes()).to_hex()[..16].to_owned())
     }
@@ -198,7 +198,7 @@ impl Work<'_> {
     fn train(&self, run: &Path) -> anyhow::Result<Ready> {
         let given = preset::chosen(&self.given(self.folder.join(SCENE)), self.device)?;
         let scene_name = given.name();
-        let settings = self.fitted(&given.settings.resolve()?);
+        let settings = self.fitted(&given.resolve()?);
         let _lock = Lock::take(run)?;
         let begun = is_begun(run, &scene_name, &settings)?;
         let mut loaded = Loaded::read(&given.scene, settings)?;

@@ -5,31 +5,25 @@ use std::path::Path;
 use super::shared::{DeviceArgs, SceneArgs};
 use crate::config::Settings;
 use crate::gpu::{self, DeviceInfo};
-use crate::scene;
 use crate::work::{Loaded, SYNTHETIC};
 
 /// Longer side of the pictures that a CPU trains on in minutes, pixels: a quarter of SPIn-NeRF's 1008.
 const SIDE: f64 = 252.0;
 
-/// A preset that was chosen.
-#[derive(Debug, PartialEq, Eq)]
-struct Choice {
-    preset: &'static str,
-    /// In place of the preset's own.
-    downscale: Option<u32>,
+/// A GPU takes the defaults. A CPU takes `demo` for the built-in scene and `gaussians` for others.
+fn choose(device: &DeviceInfo, scene: &Path) -> &'static str {
+    match device.kind {
+        "cpu" if scene == Path::new(SYNTHETIC) => "demo",
+        "cpu" => "gaussians",
+        _ => "gscream",
+    }
 }
 
-/// A GPU takes the defaults. A CPU takes `demo` for the built-in scene and `gaussians` for others, reduced to about
-/// [`SIDE`]; `longest` is the longer side of the scene's pictures, where it is known.
-fn choose(device: &DeviceInfo, scene: &Path, longest: Option<u32>) -> Choice {
-    match device.kind {
-        "cpu" if scene == Path::new(SYNTHETIC) => Choice { preset: "demo", downscale: None },
-        "cpu" => {
-            let downscale = longest.map(|side| (f64::from(side) / SIDE).round().max(1.0) as u32);
-            Choice { preset: "gaussians", downscale }
-        }
-        _ => Choice { preset: "gscream", downscale: None },
-    }
+/// How far a preset reduces pictures whose longer side is `longest` pixels: those for CPUs to about [`SIDE`]. Nothing
+/// where the preset's own setting holds.
+pub(super) fn downscale(preset: Option<&str>, longest: Option<u32>) -> Option<u32> {
+    let reduces = matches!(preset, Some("gaussians" | "lavapipe"));
+    longest.filter(|_| reduces).map(|side| (f64::from(side) / SIDE).round().max(1.0) as u32)
 }
 
 /// The scene and the settings of a training: those that the arguments ask for, over a preset for the device and the size
@@ -38,9 +32,9 @@ fn choose(device: &DeviceInfo, scene: &Path, longest: Option<u32>) -> Choice {
 /// # Errors
 /// As [`SceneArgs::load`]; without a usable device.
 pub(super) fn load(given: &SceneArgs, device: &DeviceArgs) -> anyhow::Result<Loaded> {
-    let Some((chosen, choice, device)) = choice(given, device)? else { return given.load() };
+    let Some((chosen, preset, device)) = choice(given, device)? else { return given.load() };
     let loaded = chosen.load()?;
-    eprintln!("{}", describe(&choice, &device, &loaded.settings));
+    eprintln!("{}", describe(preset, &device, &loaded.settings));
     Ok(loaded)
 }
 
@@ -53,7 +47,7 @@ pub(super) fn chosen(given: &SceneArgs, device: &DeviceArgs) -> anyhow::Result<S
 }
 
 /// Nothing where the arguments name a preset, or there is no scene.
-fn choice(given: &SceneArgs, device: &DeviceArgs) -> anyhow::Result<Option<(SceneArgs, Choice, DeviceInfo)>> {
+fn choice(given: &SceneArgs, device: &DeviceArgs) -> anyhow::Result<Option<(SceneArgs, &'static str, DeviceInfo)>> {
     let named = given.settings.preset.is_some() || given.settings.config.is_some();
     let synthetic = given.scene == Path::new(SYNTHETIC);
     if named || !(synthetic || given.scene.is_dir()) {
@@ -62,22 +56,20 @@ fn choice(given: &SceneArgs, device: &DeviceArgs) -> anyhow::Result<Option<(Scen
     // A mistake in the settings is one of theirs, and not of a preset that nobody asked for.
     given.settings.resolve()?;
     let device = gpu::device::chosen(device.device.as_deref())?;
-    let choice = choose(&device, &given.scene, scene::longest_side(&given.scene));
+    let preset = choose(&device, &given.scene);
     let mut chosen = given.clone();
-    chosen.settings.preset = Some(choice.preset.to_owned());
-    let own = choice.downscale.map(|n| format!("scene.downscale={n}"));
-    chosen.settings.set.splice(0..0, own);
-    Ok(Some((chosen, choice, device)))
+    chosen.settings.preset = Some(preset.to_owned());
+    Ok(Some((chosen, preset, device)))
 }
 
-fn describe(choice: &Choice, device: &DeviceInfo, settings: &Settings) -> String {
+fn describe(preset: &str, device: &DeviceInfo, settings: &Settings) -> String {
     let Settings { train, scene, .. } = settings;
     let size = match scene.downscale {
         1 => "the pictures' own size".to_owned(),
         n => format!("1/{n} of the pictures' size"),
     };
     let run = format!("{} steps at {size}", train.iterations);
-    match choice.preset {
+    match preset {
         "gscream" => {
             format!("preset: gscream, the defaults, for {} is no CPU: {run}; --preset names another", device.name)
         }
@@ -113,18 +105,24 @@ mod tests {
     }
 
     #[test]
-    fn the_preset_follows_the_device_and_the_size() {
-        let of = |kind, scene: &str, longest| {
-            let Choice { preset, downscale } = choose(&device(kind), Path::new(scene), longest);
-            (preset, downscale)
-        };
-        assert_eq!(of("cpu", SYNTHETIC, None), ("demo", None));
-        assert_eq!(of("cpu", "garden", Some(1008)), ("gaussians", Some(4)));
-        assert_eq!(of("cpu", "garden", Some(4032)), ("gaussians", Some(16)));
-        assert_eq!(of("cpu", "garden", Some(32)), ("gaussians", Some(1)));
-        assert_eq!(of("cpu", "garden", None), ("gaussians", None), "the preset's own");
-        assert_eq!(of("discrete", SYNTHETIC, None), ("gscream", None));
-        assert_eq!(of("integrated", "garden", Some(4032)), ("gscream", None));
+    fn the_preset_follows_the_device() {
+        let of = |kind, scene: &str| choose(&device(kind), Path::new(scene));
+        assert_eq!(of("cpu", SYNTHETIC), "demo");
+        assert_eq!(of("cpu", "garden"), "gaussians");
+        assert_eq!(of("discrete", SYNTHETIC), "gscream");
+        assert_eq!(of("integrated", "garden"), "gscream");
+    }
+
+    #[test]
+    fn presets_for_a_cpu_reduce_by_the_pictures_size() {
+        for (longest, n) in
+            [(Some(1008), Some(4)), (Some(4032), Some(16)), (Some(256), Some(1)), (Some(32), Some(1)), (None, None)]
+        {
+            assert_eq!(downscale(Some("gaussians"), longest), n, "{longest:?}");
+            assert_eq!(downscale(Some("lavapipe"), longest), n, "{longest:?}");
+            assert_eq!(downscale(Some("paper"), longest), None, "{longest:?}");
+            assert_eq!(downscale(None, longest), None, "{longest:?}");
+        }
     }
 
     #[derive(Debug, clap::Parser)]
@@ -138,12 +136,11 @@ mod tests {
         let mut args =
             Probe::try_parse_from(["probe", "s", "--set", "scene.downscale=2", "--seed", "3"]).expect("parses");
         args.scene.settings.preset = Some("lavapipe".into());
-        args.scene.settings.set.splice(0..0, Some("scene.downscale=7".to_owned()));
+        args.scene.settings.reduced = Some(7);
         let settings = args.scene.settings.resolve().expect("settings that make sense");
         assert_eq!((settings.scene.downscale, settings.train.iterations, settings.train.seed), (2, 4500, 3));
-        let choice = Choice { preset: "gaussians", downscale: Some(7) };
         assert_eq!(
-            describe(&choice, &device("cpu"), &settings),
+            describe("gaussians", &device("cpu"), &settings),
             "preset: gaussians, for Device is a CPU: 4500 steps at 1/2 of the pictures' size; --preset gscream has the \
              defaults, made for a GPU"
         );

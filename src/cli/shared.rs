@@ -4,10 +4,11 @@ use std::path::{Path, PathBuf};
 
 use anyhow::bail;
 
+use super::preset;
 use crate::config::{Settings, SettingsArgs};
 use crate::gpu::{Descriptors, Form, Gpu, Options};
 use crate::model::config;
-use crate::scene::Scene;
+use crate::scene::{self, Scene};
 use crate::work::{Loaded, SYNTHETIC, load_scene};
 
 /// Which device to compute on, and how closely to watch it.
@@ -100,7 +101,16 @@ impl SceneArgs {
     /// # Errors
     /// Settings that make no sense; a scene that cannot be read.
     pub fn load(&self) -> anyhow::Result<Loaded> {
-        Loaded::read(&self.scene, self.settings.resolve()?)
+        Loaded::read(&self.scene, self.resolve()?)
+    }
+
+    /// The settings for this scene: a preset for CPUs reduces its pictures to the size that such a device has time for.
+    ///
+    /// # Errors
+    /// Settings that make no sense.
+    pub fn resolve(&self) -> anyhow::Result<Settings> {
+        let reduced = preset::downscale(self.settings.preset.as_deref(), scene::longest_side(&self.scene));
+        Ok(SettingsArgs { reduced, ..self.settings.clone() }.resolve()?)
     }
 
     /// The scene as a run's record names it.

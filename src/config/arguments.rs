@@ -9,7 +9,7 @@ pub struct SettingsArgs {
     /// Start from a preset instead of the defaults
     ///
     /// gscream: the defaults, every setting written out. paper: 30,000 steps at full size, voxel 0.005 (SPIn-NeRF
-    /// scenes). lavapipe: a quarter of the size and 4,500 steps, for a CPU. gaussians: the same with plain Gaussians in
+    /// scenes). lavapipe: pictures of about 252 pixels and 4,500 steps, for a CPU. gaussians: the same with plain Gaussians in
     /// place of anchors. demo: the synthetic scene in minutes.
     #[arg(long, value_name = "NAME", value_parser = clap::builder::PossibleValuesParser::new(PRESETS.map(|(name, _)| name)))]
     pub preset: Option<String>,
@@ -46,6 +46,9 @@ pub struct SettingsArgs {
     /// photograph would say.
     #[arg(long, value_name = "FILE", requires = "truth_reference")]
     pub truth_prior: Option<PathBuf>,
+    /// `scene.downscale` in place of the preset's own, below a file and single settings
+    #[arg(skip)]
+    pub reduced: Option<u32>,
 }
 
 impl SettingsArgs {
@@ -64,6 +67,7 @@ impl SettingsArgs {
             path.to_string_lossy().into_owned()
         };
         let preset = self.preset.iter().cloned().map(Source::Preset);
+        let reduced = self.reduced.map(|n| Source::Set(format!("scene.downscale={n}")));
         let file = self.config.iter().cloned().map(Source::File);
         let set = self.set.iter().cloned().map(Source::Set);
         let flags = [
@@ -73,7 +77,7 @@ impl SettingsArgs {
             text("--truth-reference", "scene.truth_reference", self.truth_reference.clone()),
             text("--truth-prior", "scene.truth_prior", self.truth_prior.as_ref().map(place)),
         ];
-        preset.chain(file).chain(set).chain(flags.into_iter().flatten()).collect()
+        preset.chain(reduced).chain(file).chain(set).chain(flags.into_iter().flatten()).collect()
     }
 
     /// The settings these arguments ask for.

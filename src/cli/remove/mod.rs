@@ -98,7 +98,7 @@ impl Args {
     /// The work that so many photographs are, with what is made in the folder `root`.
     fn work(&self, views: usize, root: &Path) -> anyhow::Result<Work> {
         let given = SceneArgs { scene: root.to_owned(), settings: self.settings.clone() };
-        let settings = preset::chosen(&given, &self.device)?.settings.resolve()?;
+        let settings = preset::chosen(&given, &self.device)?.resolve()?;
         Ok(Work {
             form: settings.model.form,
             views,
