@@ -29,7 +29,6 @@ mod material;
 mod regions;
 mod relief;
 mod residue;
-mod shade;
 mod similar;
 mod support;
 mod surface;
@@ -65,7 +64,7 @@ const LEAST_HOLE: f64 = 0.4;
 const AT_ONCE: usize = 16;
 /// Name of the way in which holes are filled: a scene that was filled in another way is filled anew.
 pub const METHOD: &str = "one surface with smooth ends, nothing where others look through it, no colour from a rim that looks like nothing near it, \
-     lights joined, doubts left to training, nothing stands on what only crosses the floor, lines go on through holes, a foot is all that is unseen around it, \
+     lights joined, doubts left to training, nothing stands on what only crosses the floor, lines go on through holes, \
      what is nearly one plane is one, copies nearly keep their hue, ends are where the first view has them, \
      nothing from views with the object elsewhere, nothing stands where the first view looks through, surfaces by what they are covered with, \
      straight borders go on, those that end in a hole too, surfaces end at right angles, grain is kept, floors end at their walls, and planes \
@@ -161,27 +160,13 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
     let mut sights = Sights::new(grids, &cameras, &masks, &wide);
     sights.flatten(task.seed);
     log::debug!("hole: planes are found");
-    let mut shown = shown_by_others(&sights, &with_holes);
+    let shown = shown_by_others(&sights, &with_holes);
     let of = reference(task, &sights, &shown)?;
     let photographed = |masks: &[GrayImage]| -> Vec<Photograph<'_>> {
         let views = task.fine.train.iter().zip(masks);
         views.map(|(view, hole)| Photograph { camera: view.camera, picture: &view.image, hole: hole.clone() }).collect()
     };
-    let mut photographs = photographed(&masks);
-    if task.shade {
-        let mut solved = sights.clone();
-        solved.solve(of, task.seed);
-        if shade::add(&solved, &photographs, of, &mut masks) {
-            batch.notes.push(
-                "the soft shadow around the object's foot is taken away with it (--shadow keep: it stays)".into(),
-            );
-            photographs = photographed(&masks);
-            let grids = sights.0.into_iter().map(|sight| sight.grid).collect();
-            sights = Sights::new(grids, &cameras, &masks, &wide);
-            sights.flatten(task.seed);
-            shown = shown_by_others(&sights, &with_holes);
-        }
-    }
+    let photographs = photographed(&masks);
     let mut filled: Vec<(usize, Filled)> = vec![];
     let expected = part(&shown[&of]);
     if !sights.0[of].covered.is_empty() {

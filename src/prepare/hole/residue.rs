@@ -2,7 +2,7 @@
 //!
 //! A shadow is divided by one ratio ([`shadow`](crate::prepare::shadow)). Along its border, where light comes back over a
 //! pixel or two, a seam is left, and between shadow and object, where the map begins too late, a dark wedge. Both are of
-//! the hole: else they are copied into it.
+//! the hole: else they are copied into it. Of a soft shadow it is where too little of the light is left.
 
 use std::path::Path;
 
@@ -28,6 +28,13 @@ pub fn add(root: &Path, views: &[View], masks: &mut [GrayImage]) -> Result<(), E
     views.par_iter().zip(masks).try_for_each(|(View { name, image, .. }, mask)| {
         let path = root.join(relight::path(name));
         if !path.is_file() {
+            return Ok(());
+        }
+        // A soft shadow has no seam.
+        let contact = root.join(relight::contact_path(name));
+        if contact.is_file() {
+            let contact = resample::mask(&scene::mask(&contact, 1)?, [mask.width(), mask.height()]);
+            mask.iter_mut().zip(contact.as_raw()).for_each(|(mask, more)| *mask = (*mask).max(*more));
             return Ok(());
         }
         let map = resample::photograph(&scene::photograph(&path, 1)?, [mask.width(), mask.height()]);

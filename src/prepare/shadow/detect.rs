@@ -64,6 +64,9 @@ pub struct Shadow {
     pub expected: Vec<f32>,
     /// What the region and what the object would cast have in common, of both.
     pub alike: f64,
+    /// `[cell]` of a soft shadow, where too little of the light is left to be given back: it is filled as the place under the
+    /// object is. Empty of another one.
+    pub contact: Vec<bool>,
 }
 
 /// What was found.
@@ -311,7 +314,7 @@ fn closely(ground: &Ground<'_>, best: &Hypothesis) -> Verdict {
         return nothing("what is darker around it has another colour");
     }
     let lit: Cells = (0..seen.len()).map(|i| seen[i] && near[i] && !rim[i] && !band[i]).collect();
-    Verdict::Found(Box::new(Shadow { ratio, amount, region, lit, expected, alike }))
+    Verdict::Found(Box::new(Shadow { ratio, amount, region, lit, expected, alike, contact: vec![] }))
 }
 
 /// The drop that makes colours with so much shadow on them likeliest, by expectation and maximisation.

@@ -11,6 +11,7 @@ pub mod detect;
 pub mod mixture;
 pub mod plane;
 pub mod relight;
+mod soft;
 pub mod texture;
 
 use glam::DVec3;
@@ -23,6 +24,7 @@ use super::{Error, Watch};
 use crate::export::up;
 use crate::multiview::DepthGrid;
 use crate::scene::{Camera, Scene};
+use crate::statistics::{median, quantile};
 use detect::{Shadow, Verdict};
 use plane::Support;
 use texture::{Photograph, Texture};
@@ -42,7 +44,7 @@ pub struct Ground<'a> {
 /// The longer side of the photographs that a shadow is looked for in, pixels.
 pub const SIDE: u32 = 1024;
 /// Name of the way in which it is looked for: where that was another one it is looked for anew.
-pub const METHOD: &str = "on the plane of measured depth";
+pub const METHOD: &str = "on the plane of measured depth, soft ones too";
 /// A picture of what was found, below the scene's folder.
 pub const PICTURE: &str = "prepare/shadow.png";
 /// Places that are looked at, of the object and of what is around it.
@@ -136,6 +138,10 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
     for (i, (view, photograph)) in task.fine.train.iter().zip(&photographs).enumerate() {
         if let Some(map) = relight::map(&found, photograph) {
             batch.rgb_aside(relight::path(&view.name), &map, "the object's shadow, found on its surface")?;
+            if !found.shadow.contact.is_empty() {
+                let contact = relight::contact(&found, photograph);
+                batch.gray(relight::contact_path(&view.name), &contact, "where the soft shadow leaves too little");
+            }
             lit += 1;
         }
         watch.turn(2 + i as u64)?;
@@ -173,7 +179,7 @@ pub fn look(task: &Task<'_>, maps: &[DepthMap], photographs: &[Photograph<'_>]) 
         Ground { side: texture.side, log: &texture.log, object: &places, height: support.height / texture.cell };
     let shadow = match detect::find(&ground) {
         Verdict::Found(shadow) => *shadow,
-        Verdict::Nothing(why) => return Err(why),
+        Verdict::Nothing(why) => soft::find(&ground).map_err(|soft| format!("{why}, and {soft}"))?,
     };
     let views = alike(&texture, &support, &shadow, photographs);
     log::debug!("shadow: {views:?} views, ratio {:?}, alike {:.2}", shadow.ratio, shadow.alike);
@@ -185,14 +191,18 @@ pub fn look(task: &Task<'_>, maps: &[DepthMap], photographs: &[Photograph<'_>]) 
 
 /// Views that see the shadow as dark as it is on the whole, and all that see enough of it.
 fn alike(texture: &Texture, support: &Support, shadow: &Shadow, photographs: &[Photograph<'_>]) -> [usize; 2] {
-    let deep: Vec<usize> = (0..shadow.region.len()).filter(|i| shadow.amount[*i] > 0.8 && texture.seen(*i)).collect();
+    let shaded = (0..shadow.region.len()).filter(|i| shadow.amount[*i] > 0.0 && texture.seen(*i));
+    let nearly = 0.8 * quantile(shaded.map(|i| shadow.amount[i]), 0.9).unwrap_or(1.0);
+    let is_deep = |i: &usize| f64::from(shadow.amount[*i]) > nearly && texture.seen(*i);
+    let deep: Vec<usize> = (0..shadow.region.len()).filter(is_deep).collect();
     let lit: Vec<usize> = (0..shadow.region.len()).filter(|i| shadow.lit[*i]).collect();
     let some = |cells: Vec<usize>| -> Vec<usize> {
         let every = cells.len().div_ceil(2000).max(1);
         cells.into_iter().step_by(every).collect()
     };
     let (deep, lit) = (some(deep), some(lit));
-    let whole = (shadow.ratio.iter().map(|r| r.ln()).sum::<f64>() / 3.0).abs();
+    let full = (shadow.ratio.iter().map(|r| r.ln()).sum::<f64>() / 3.0).abs();
+    let whole = full * median(deep.iter().map(|i| shadow.amount[*i])).unwrap_or(1.0);
     let says: Vec<f64> = photographs
         .iter()
         .filter_map(|photograph| texture::left(photograph, texture, support, [&deep, &lit], &shadow.expected))

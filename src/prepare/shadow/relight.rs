@@ -1,7 +1,7 @@
 //! Photographs without the shadow: what is left of the light at each of their pixels, and pictures to look at.
 
 use glam::DVec3;
-use image::{Rgb, RgbImage};
+use image::{GrayImage, Rgb, RgbImage};
 use rayon::prelude::*;
 
 use super::Found;
@@ -69,49 +69,86 @@ fn is_near(photograph: &Photograph<'_>, pixel: [f64; 2]) -> bool {
 
 /// How much of the full shadow lies on what a pixel position shows.
 fn amount(found: &Found, photograph: &Photograph<'_>, pixel: [f64; 2]) -> f64 {
-    let (support, texture, shadow) = (&found.support, &found.texture, &found.shadow);
-    let camera = &photograph.camera;
-    let Some([x, y]) = camera.unproject(pixel) else { return 0.0 };
-    let rows = camera.rotation.map(|row| DVec3::from(row.map(f64::from)));
-    let eye = DVec3::from(camera.center());
-    let ray = rows[0] * x + rows[1] * y + rows[2];
-    let along = ray.dot(support.up);
-    let z = (support.foot - eye).dot(support.up) / along;
-    if !(z.is_finite() && z > 0.0) {
-        return 0.0;
-    }
-    let place = support.local(eye + ray * z) / texture.cell;
-    let middle = 0.5 * texture.side as f64;
-    let [u, v] = [place.x + middle - 0.5, place.y + middle - 0.5];
-    let last = (texture.side - 1) as f64;
-    if !(u >= 0.0 && v >= 0.0 && u < last && v < last) {
-        return 0.0;
-    }
+    let (texture, shadow) = (&found.texture, &found.shadow);
+    let Some(seen) = Seen::at(found, photograph, pixel) else { return 0.0 };
+    let [u, v] = seen.cell;
     let (column, row) = (u as usize, v as usize);
     let (fx, fy) = (u - column as f64, v - row as f64);
     let at = |i: usize, j: usize| f64::from(shadow.amount[(row + j) * texture.side + column + i]);
     let amount = (at(0, 0) * (1.0 - fx) + at(1, 0) * fx) * (1.0 - fy) + (at(0, 1) * (1.0 - fx) + at(1, 1) * fx) * fy;
-    if amount <= LEAST {
-        return 0.0;
+    if amount <= LEAST { 0.0 } else { amount * surface(found, photograph, pixel, &seen, row * texture.side + column) }
+}
+
+/// A place of the surface's plane behind a pixel position.
+struct Seen {
+    /// The camera's centre, and the viewing ray per unit of depth; world units.
+    eye: DVec3,
+    along: DVec3,
+    /// Cells along both sides of the texture, from the middle of the first one.
+    cell: [f64; 2],
+}
+
+impl Seen {
+    fn at(found: &Found, photograph: &Photograph<'_>, pixel: [f64; 2]) -> Option<Self> {
+        let (support, texture) = (&found.support, &found.texture);
+        let camera = &photograph.camera;
+        let [x, y] = camera.unproject(pixel)?;
+        let rows = camera.rotation.map(|row| DVec3::from(row.map(f64::from)));
+        let eye = DVec3::from(camera.center());
+        let along = rows[0] * x + rows[1] * y + rows[2];
+        let z = (support.foot - eye).dot(support.up) / along.dot(support.up);
+        if !(z.is_finite() && z > 0.0) {
+            return None;
+        }
+        let place = support.local(eye + along * z) / texture.cell;
+        let middle = 0.5 * texture.side as f64;
+        let cell = [place.x + middle - 0.5, place.y + middle - 0.5];
+        let last = (texture.side - 1) as f64;
+        cell.iter().all(|at| *at >= 0.0 && *at < last).then_some(Self { eye, along, cell })
     }
+}
+
+/// How certainly a pixel shows the surface there, and not what stands before it: 0 to 1. Within the object's mask it is taken to.
+fn surface(found: &Found, photograph: &Photograph<'_>, pixel: [f64; 2], seen: &Seen, cell: usize) -> f64 {
+    let (support, texture) = (&found.support, &found.texture);
+    let camera = &photograph.camera;
     // Near the object measured depth is the object's in part.
     if photograph.mask.get_pixel(pixel[0] as u32, pixel[1] as u32).0[0] != 0 {
-        return amount;
+        return 1.0;
     }
     let small = photograph.depth.camera.size;
     let scaled = std::array::from_fn(|i| pixel[i] * f64::from(small[i]) / f64::from(camera.size[i]));
     let depth = f64::from(photograph.depth.smooth(scaled));
     // On bare surfaces measured depth errs: what has the surface's colour is the surface.
-    let nearest = row * texture.side + column;
     let color = log(photograph.picture.get_pixel(pixel[0] as u32, pixel[1] as u32).0);
-    if is_alike(color, texture.log[nearest]) {
-        return amount;
+    if is_alike(color, texture.log[cell]) {
+        return 1.0;
     }
     if !depth.is_finite() {
-        return if is_near(photograph, pixel) { amount } else { 0.0 };
+        return if is_near(photograph, pixel) { 1.0 } else { 0.0 };
     }
-    let height = support.local(eye + ray * depth).z.abs() / support.height;
-    amount * (2.0 - height / OFF).clamp(0.0, 1.0)
+    let height = support.local(seen.eye + seen.along * depth).z.abs() / support.height;
+    (2.0 - height / OFF).clamp(0.0, 1.0)
+}
+
+/// Where the pixels of a photograph are kept that a soft shadow leaves too little of, below the scene's folder.
+pub fn contact_path(name: &str) -> String {
+    format!("prepare/contact/{name}.png")
+}
+
+/// The pixels of a photograph that show where a soft shadow leaves too little to be given back ([`super::Shadow::contact`]).
+pub fn contact(found: &Found, photograph: &Photograph<'_>) -> GrayImage {
+    let [w, h] = photograph.camera.size;
+    let is = |x: u32, y: u32| {
+        let pixel = [f64::from(x) + 0.5, f64::from(y) + 0.5];
+        let Some(seen) = Seen::at(found, photograph, pixel) else { return false };
+        let [u, v] = seen.cell.map(|at| at.round() as usize);
+        let cell = v * found.texture.side + u;
+        found.shadow.contact[cell] && surface(found, photograph, pixel, &seen, cell) > 0.5
+    };
+    let rows: Vec<Vec<u8>> =
+        (0..h).into_par_iter().map(|y| (0..w).map(|x| if is(x, y) { 255 } else { 0 }).collect()).collect();
+    GrayImage::from_raw(w, h, rows.into_iter().flatten().collect()).expect("a value per pixel")
 }
 
 /// The photograph without the shadow, by its map: as training sees it.
