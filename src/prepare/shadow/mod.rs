@@ -44,7 +44,7 @@ pub struct Ground<'a> {
 /// The longer side of the photographs that a shadow is looked for in, pixels.
 pub const SIDE: u32 = 1024;
 /// Name of the way in which it is looked for: where that was another one it is looked for anew.
-pub const METHOD: &str = "on the plane of measured depth, soft ones too";
+pub const METHOD: &str = "on the plane of measured depth, soft ones too, up to the next dip";
 /// A picture of what was found, below the scene's folder.
 pub const PICTURE: &str = "prepare/shadow.png";
 /// Places that are looked at, of the object and of what is around it.

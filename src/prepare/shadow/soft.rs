@@ -5,7 +5,8 @@
 //! polynomial of the brightness around is the light without the object; their difference is what the shadow takes, cell by
 //! cell. The surface keeps its texture when that is given back.
 
-use std::collections::VecDeque;
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BinaryHeap, VecDeque};
 
 use image::GrayImage;
 use rayon::prelude::*;
@@ -36,9 +37,8 @@ const HUE: f64 = 0.1;
 const DARK: f64 = -0.06;
 const BORDER: f64 = -0.035;
 const END: f64 = -0.008;
-/// From one cell to the next, away from the foot, it gets darker by this much at most: what begins with a larger step is
-/// something else.
-const STEP: f64 = 0.03;
+/// Away from the foot it gets darker again by this much at most.
+const REBOUND: f64 = 0.04;
 /// Largest deviation of the surface from smooth light (median of absolute values) for a shadow to be told on it.
 const ROUGH: f64 = 0.05;
 /// Of what is around the foot, half as far as the shadow reaches, at least this part is seen.
@@ -78,7 +78,7 @@ pub fn find(ground: &Ground<'_>) -> Result<Shadow, String> {
     let away = distances(&foot, side, far);
     let colors: Vec<Color> = ground.log.iter().map(|log| color(*log)).collect();
     let shown: Vec<bool> = (0..foot.len()).map(|i| ground.log[i][0].is_finite()).collect();
-    let same = surface(&colors, &shown, &away, [reach, (LINE * size).round() as u32], side)
+    let Surface { same, other } = Surface::of(&colors, &shown, &away, [reach, (LINE * size).round() as u32], side)
         .ok_or_else(|| no("too little of the surface around it is seen"))?;
     let fitted: Vec<usize> = (0..foot.len()).filter(|i| same[*i] && !foot[*i] && away[*i] <= far).collect();
     let light = Light::fit(&fitted, side, |i| colors[i][0]).ok_or_else(|| no("too little of the surface is seen"))?;
@@ -97,9 +97,9 @@ pub fn find(ground: &Ground<'_>) -> Result<Shadow, String> {
     let middle = median(fitted.iter().map(|i| off[*i])).unwrap_or(0.0);
     let off: Vec<f64> = off.into_iter().map(|v| v - middle).collect();
     // From the foot outwards, through what is darker; what nobody sees is passed.
-    let passed = |from: usize, i: usize| !foot[i] && away[i] <= reach && off[i] < BORDER && off[i] > off[from] - STEP;
-    let feet = || (0..foot.len()).filter(|i| foot[*i]);
-    let mut region = reached(feet(), side, passed);
+    let feet = (0..foot.len()).filter(|i| foot[*i]);
+    let mut region =
+        reached(feet.map(|i| (i, f64::NEG_INFINITY)), side, |i| !foot[i] && away[i] <= reach && off[i] < BORDER, &off);
     region.iter_mut().zip(&foot).for_each(|(region, foot)| *region &= !foot);
     let count = |wanted: &dyn Fn(usize) -> bool| (0..foot.len()).filter(|i| wanted(*i)).count() as f64;
     let area = count(&|i| region[i] && same[i]);
@@ -113,7 +113,8 @@ pub fn find(ground: &Ground<'_>) -> Result<Shadow, String> {
     if area > MOST * size * size || all < LEAST_RING * size * size || at_end > OPEN * all {
         return Err(no("what is darker around its foot does not end"));
     }
-    let amounts = faded(&off, &region, &foot, side, (FADE * size).ceil() as u32);
+    let mut amounts = faded(&off, &region, &foot, side, (FADE * size).ceil() as u32);
+    amounts.iter_mut().zip(&other).filter(|(_, other)| **other).for_each(|(amount, _)| *amount = 0.0);
     let most = amounts.iter().copied().fold(0.0, f64::max);
     if (-most).exp() < LEFT {
         return Err(no("what is darker around its foot is no shadow by its ratio"));
@@ -163,37 +164,49 @@ fn distances(mask: &[bool], side: usize, reach: u32) -> Vec<u32> {
     resample::distances(&picture, reach)
 }
 
-/// The cells of the surface that the object stands on: those of the hue that most around the foot have. Beside those of
-/// another hue, and beside what nobody sees, colours are mixed: within `rim` of them none counts.
-fn surface(colors: &[Color], shown: &[bool], away: &[u32], [reach, rim]: [u32; 2], side: usize) -> Option<Vec<bool>> {
-    let near: Vec<usize> = (0..shown.len()).filter(|i| shown[*i] && away[*i] > 0 && away[*i] <= reach).collect();
-    if near.len() < 200 {
-        return None;
+/// The surface that the object stands on, by its hue.
+struct Surface {
+    /// `[cell]` those of the hue that most around the foot have. Beside those of another hue, and beside what nobody sees,
+    /// colours are mixed: none there.
+    same: Vec<bool>,
+    /// `[cell]` those of another hue.
+    other: Vec<bool>,
+}
+
+impl Surface {
+    /// The surface around a foot, from which cells are so far `away`; what is farther than `reach` does not say what its hue is.
+    /// Colours are mixed within `rim`.
+    fn of(colors: &[Color], shown: &[bool], away: &[u32], [reach, rim]: [u32; 2], side: usize) -> Option<Self> {
+        let near: Vec<usize> = (0..shown.len()).filter(|i| shown[*i] && away[*i] > 0 && away[*i] <= reach).collect();
+        if near.len() < 200 {
+            return None;
+        }
+        let cell = |[_, u, v]: Color| [u, v].map(|hue| (hue / (0.5 * HUE)).round() as i64);
+        let mut counts: BTreeMap<[i64; 2], u32> = BTreeMap::new();
+        for i in &near {
+            *counts.entry(cell(colors[*i])).or_default() += 1;
+        }
+        let around = |[a, b]: [i64; 2]| -> u32 {
+            let cells = (-1..=1).flat_map(|da| (-1..=1).map(move |db| [a + da, b + db]));
+            cells.filter_map(|cell| counts.get(&cell)).sum()
+        };
+        let mode = counts.keys().copied().max_by_key(|cell| around(*cell))?;
+        let mut hue = mode.map(|hue| hue as f64 * 0.5 * HUE);
+        let is = |[_, u, v]: Color, hue: [f64; 2]| (u - hue[0]).abs() <= HUE && (v - hue[1]).abs() <= HUE;
+        for _ in 0..4 {
+            let own: Vec<Color> = near.iter().map(|i| colors[*i]).filter(|color| is(*color, hue)).collect();
+            hue = [median(own.iter().map(|c| c[1]))?, median(own.iter().map(|c| c[2]))?];
+        }
+        let alike: Vec<bool> = (0..shown.len()).map(|i| shown[i] && is(colors[i], hue)).collect();
+        // Single cells of another hue are noise.
+        let not: Vec<bool> = (0..shown.len()).map(|i| shown[i] && !alike[i]).collect();
+        let other = resample::opened([side as u32; 2], |i| not[i], 2);
+        let other: Vec<bool> = other.as_raw().iter().map(|other| *other != 0).collect();
+        let unknown: Vec<bool> = (0..shown.len()).map(|i| other[i] || (!shown[i] && away[i] > reach / 2)).collect();
+        let beside = distances(&unknown, side, rim);
+        let same = (0..shown.len()).map(|i| alike[i] && beside[i] > rim).collect();
+        Some(Self { same, other })
     }
-    let cell = |[_, u, v]: Color| [u, v].map(|hue| (hue / (0.5 * HUE)).round() as i64);
-    let mut counts: std::collections::BTreeMap<[i64; 2], u32> = std::collections::BTreeMap::new();
-    for i in &near {
-        *counts.entry(cell(colors[*i])).or_default() += 1;
-    }
-    let around = |[a, b]: [i64; 2]| -> u32 {
-        let cells = (-1..=1).flat_map(|da| (-1..=1).map(move |db| [a + da, b + db]));
-        cells.filter_map(|cell| counts.get(&cell)).sum()
-    };
-    let mode = counts.keys().copied().max_by_key(|cell| around(*cell))?;
-    let mut hue = mode.map(|hue| hue as f64 * 0.5 * HUE);
-    let is = |[_, u, v]: Color, hue: [f64; 2]| (u - hue[0]).abs() <= HUE && (v - hue[1]).abs() <= HUE;
-    for _ in 0..4 {
-        let own: Vec<Color> = near.iter().map(|i| colors[*i]).filter(|color| is(*color, hue)).collect();
-        hue = [median(own.iter().map(|c| c[1]))?, median(own.iter().map(|c| c[2]))?];
-    }
-    let alike: Vec<bool> = (0..shown.len()).map(|i| shown[i] && is(colors[i], hue)).collect();
-    // Single cells of another hue are noise.
-    let not: Vec<bool> = (0..shown.len()).map(|i| shown[i] && !alike[i]).collect();
-    let other = resample::opened([side as u32; 2], |i| not[i], 2);
-    let other: Vec<bool> =
-        (0..shown.len()).map(|i| other.as_raw()[i] != 0 || (!shown[i] && away[i] > reach / 2)).collect();
-    let beside = distances(&other, side, rim);
-    Some((0..shown.len()).map(|i| alike[i] && beside[i] > rim).collect())
 }
 
 /// Smooth light on the surface: a polynomial of second degree of the brightness' logarithm.
@@ -335,16 +348,25 @@ fn beside(i: usize, side: usize) -> impl Iterator<Item = usize> {
     all.into_iter().filter(|(inside, _)| *inside).map(|(_, at)| at)
 }
 
-/// Cells that hang together with the first ones through steps, from one cell to the next, that `passes` says.
-fn reached(first: impl Iterator<Item = usize>, side: usize, passes: impl Fn(usize, usize) -> bool) -> Vec<bool> {
-    let mut queue: Vec<usize> = first.collect();
+/// Cells that hang together with the first ones through those that `passes` says, on ways that do not get darker again once
+/// they got brighter: another dip is another thing's. The first ones come with the brightest that led there.
+fn reached(
+    first: impl Iterator<Item = (usize, f64)>,
+    side: usize,
+    passes: impl Fn(usize) -> bool,
+    off: &[f64],
+) -> Vec<bool> {
+    // The darkest ways first, so that each cell is reached by the way whose brightest place is the darkest.
+    let rank = |brightest: f64| Reverse((1e6 * brightest.max(-1e3)) as i64);
+    let mut queue: BinaryHeap<(Reverse<i64>, usize)> = first.map(|(i, brightest)| (rank(brightest), i)).collect();
     let mut out = vec![false; side * side];
-    queue.iter().for_each(|i| out[*i] = true);
-    while let Some(i) = queue.pop() {
+    queue.iter().for_each(|(_, i)| out[*i] = true);
+    while let Some((Reverse(brightest), i)) = queue.pop() {
+        let brightest = brightest as f64 / 1e6;
         for next in beside(i, side) {
-            if !out[next] && passes(i, next) {
+            if !out[next] && passes(next) && off[next] > brightest - REBOUND {
                 out[next] = true;
-                queue.push(next);
+                queue.push((rank(brightest.max(off[next])), next));
             }
         }
     }
@@ -379,8 +401,8 @@ fn blurred(mut values: Vec<f64>, side: usize, deviation: f64) -> Vec<f64> {
 fn faded(off: &[f64], region: &[bool], foot: &[bool], side: usize, fade: u32) -> Vec<f64> {
     let inside: Vec<bool> = region.iter().zip(foot).map(|(region, foot)| *region || *foot).collect();
     let away = distances(&inside, side, fade);
-    let first = (0..off.len()).filter(|i| region[*i]);
-    let own = reached(first, side, |from, i| away[i] <= fade && off[i] < END && off[i] > off[from] - STEP);
+    let first = (0..off.len()).filter(|i| region[*i]).map(|i| (i, off[i]));
+    let own = reached(first, side, |i| away[i] <= fade && off[i] < END, off);
     let one = |i: usize| {
         let part = 1.0 - f64::from(away[i]) / f64::from(fade + 1);
         if own[i] && off[i] < 0.0 { -off[i] * part } else { 0.0 }
@@ -473,6 +495,26 @@ mod tests {
         ] {
             assert!(look(|x, y| tone(floor(x, y))).is_err(), "{what}");
         }
+    }
+
+    /// A shadow beside another object's, between which it is lighter, and a wall of another hue in which it ends: both stay.
+    #[test]
+    fn a_shadow_ends_at_the_next_one_and_at_a_wall() {
+        let next = |x: f64, y: f64| 0.3 * (-((x - 22.0) / 6.0).powi(2) - ((y - 60.0) / 8.0).powi(2)).exp();
+        let wall = |y: f64| y > 76.0;
+        let shadow = look(|x, y| {
+            let tone = if wall(y) { [0.6, 0.7, 0.8] } else { [0.8, 0.75, 0.7] };
+            tone.map(|v| v * (1.0 - shade(x, y)) * (1.0 - next(x, y)))
+        });
+        let shadow = shadow.expect("a shadow");
+        let most = |of: &dyn Fn(f64, f64) -> bool| {
+            let cells = (0..SIDE * SIDE).filter(|i| of((i % SIDE) as f64, (i / SIDE) as f64));
+            cells.map(|i| shadow.amount[i]).fold(0.0, f32::max)
+        };
+        assert!(most(&|x, y| (x - 46.0).hypot(y - 60.0) < 3.0) > 0.8);
+        assert_eq!(most(&|_, y| y > 79.0), 0.0, "the wall");
+        // What it takes there is at most the lighter place between both and as much as it may get darker again.
+        assert!(most(&|x, y| (x - 22.0).hypot(y - 60.0) < 3.0) < 0.1, "the other's");
     }
 
     /// An even floor, light that falls off, and a stain of another colour have none.
