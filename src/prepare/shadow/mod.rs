@@ -44,7 +44,7 @@ pub struct Ground<'a> {
 /// The longer side of the photographs that a shadow is looked for in, pixels.
 pub const SIDE: u32 = 1024;
 /// Name of the way in which it is looked for: where that was another one it is looked for anew.
-pub const METHOD: &str = "on the plane of measured depth, soft ones too, up to the next dip";
+pub const METHOD: &str = "on the plane of measured depth, soft ones of many views too";
 /// A picture of what was found, below the scene's folder.
 pub const PICTURE: &str = "prepare/shadow.png";
 /// Places that are looked at, of the object and of what is around it.
@@ -56,6 +56,8 @@ const OBJECT: f64 = 0.8;
 const NEAR: f64 = 3.0;
 /// Views of which each has to see the shadow about as dark as all of them do.
 const VIEWS: f64 = 0.7;
+/// Of a soft shadow this share of all photographs has to see enough to tell: a few may be mixed with the object's own colours.
+const TELLING: f64 = 0.25;
 /// About as dark: the logarithm of what is left differs by this share at most, or by so much.
 const SAME: [f64; 2] = [0.4, 0.06];
 
@@ -183,6 +185,14 @@ pub fn look(task: &Task<'_>, maps: &[DepthMap], photographs: &[Photograph<'_>]) 
     };
     let views = alike(&texture, &support, &shadow, photographs);
     log::debug!("shadow: {views:?} views, ratio {:?}, alike {:.2}", shadow.ratio, shadow.alike);
+    let is_soft = !shadow.contact.is_empty();
+    if is_soft && (views[1] as f64) < TELLING * photographs.len() as f64 {
+        return Err(format!(
+            "only {} of {} photographs show what is darker around its foot",
+            views[1],
+            photographs.len()
+        ));
+    }
     if (views[0] as f64) < VIEWS * views[1] as f64 || views[1] == 0 {
         return Err(format!("only {} of {} views see what is darker as dark as the others do", views[0], views[1]));
     }
