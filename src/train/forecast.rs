@@ -169,10 +169,11 @@ fn survey_of(
 /// The anchors there will be at the end of training, an estimate.
 ///
 /// New anchors fill up the surfaces around the first ones: a cell of the coarsest growth grid that a surface passes through
-/// has `(cells of the finest grid along its side)^2` places for them, of which a fifth is filled in the long run, half of
-/// that within the first eight rounds: `N + M c^2 / 5 * r / (r + 8)` for N anchors in M such cells after r rounds. The two
+/// has `(cells of the finest grid along its side)^2` places for them, of which a thirtieth is filled in the long run, half of
+/// that within the first eight rounds: `N + M c^2 / 30 * r / (r + 8)` for N anchors in M such cells after r rounds. The two
 /// numbers come from three scenes (the built-in one, fern and SPIn-NeRF's scene 1 at a quarter of its size), whose growth
-/// the formula meets within 4 % of all anchors; other scenes may differ by more. `densify.max_anchors` and the device's
+/// the formula meets within 16 % of all anchors; other scenes may differ by more. Before dense starts it was a fifth:
+/// surfaces that begin full have less to fill. `densify.max_anchors` and the device's
 /// largest binding limit it. Plain Gaussians grow by the same share in each round, up to `densify.max_gaussians`.
 pub fn expected_anchors(gpu: &Gpu, plan: &Plan, settings: &Settings, initial: &Beginning) -> u32 {
     let count = initial.count();
@@ -191,7 +192,7 @@ pub fn expected_anchors(gpu: &Gpu, plan: &Plan, settings: &Settings, initial: &B
     let cells: BTreeSet<[i64; 3]> =
         initial.anchors.position.iter().map(|p| p.map(|x| (f64::from(x) / side).round_ties_even() as i64)).collect();
     let rounds = f64::from((rounds.last - rounds.first) / config.every + 1);
-    let per_cell = 16f64.powi(LEVELS as i32 - 1) / 5.0;
+    let per_cell = 16f64.powi(LEVELS as i32 - 1) / 30.0;
     let grown = cells.len() as f64 * per_cell * rounds / (rounds + 8.0);
     (f64::from(count) + grown).min(f64::from(most_anchors(gpu, settings, count))) as u32
 }
