@@ -44,7 +44,7 @@ pub struct Ground<'a> {
 /// The longer side of the photographs that a shadow is looked for in, pixels.
 pub const SIDE: u32 = 1024;
 /// Name of the way in which it is looked for: where that was another one it is looked for anew.
-pub const METHOD: &str = "on the plane of measured depth, soft ones of many views too";
+pub const METHOD: &str = "on the plane of measured depth, soft ones of many views too, below what is round";
 /// A picture of what was found, below the scene's folder.
 pub const PICTURE: &str = "prepare/shadow.png";
 /// Places that are looked at, of the object and of what is around it.
@@ -54,6 +54,8 @@ const AROUND: usize = 8000;
 const OBJECT: f64 = 0.8;
 /// Surroundings reach so many radii of the object's.
 const NEAR: f64 = 3.0;
+/// The lowest places of an object, this share of them, are seen unless they are higher than this share of its height.
+const LOWEST: (f64, f64) = (0.05, 0.1);
 /// Views of which each has to see the shadow about as dark as all of them do.
 const VIEWS: f64 = 0.7;
 /// Of a soft shadow this share of all photographs has to see enough to tell: a few may be mixed with the object's own colours.
@@ -172,11 +174,9 @@ pub fn look(task: &Task<'_>, maps: &[DepthMap], photographs: &[Photograph<'_>]) 
     log::debug!("shadow: {support:?}, {} places of the object, {} around", object.len(), around.len());
     let texture = Texture::of(&support, photographs);
     let middle = 0.5 * texture.side as f64;
-    let in_cells = |point: &DVec3| {
-        let local = support.local(*point) / texture.cell;
-        [local.x + middle, local.y + middle, local.z]
-    };
-    let places: Vec<[f64; 3]> = object.iter().map(in_cells).collect();
+    let places = standing(object.iter().map(|point| support.local(*point)).collect(), support.height);
+    let places: Vec<[f64; 3]> =
+        places.iter().map(|p| [p.x / texture.cell + middle, p.y / texture.cell + middle, p.z / texture.cell]).collect();
     let ground =
         Ground { side: texture.side, log: &texture.log, object: &places, height: support.height / texture.cell };
     let shadow = match detect::find(&ground) {
@@ -197,6 +197,17 @@ pub fn look(task: &Task<'_>, maps: &[DepthMap], photographs: &[Photograph<'_>]) 
         return Err(format!("only {} of {} views see what is darker as dark as the others do", views[0], views[1]));
     }
     Ok(Found { support, texture, shadow, views })
+}
+
+/// An object's places from its foot on, along the surface and above it, with what nobody sees between it and the surface: its lower
+/// places narrow to the foot, as those of what is round do. What is seen down to the surface stays as it is.
+fn standing(mut places: Vec<DVec3>, height: f64) -> Vec<DVec3> {
+    let lowest = quantile(places.iter().map(|p| p.z), LOWEST.0).unwrap_or(0.0);
+    if lowest > LOWEST.1 * height {
+        let lower: Vec<DVec3> = places.iter().copied().filter(|p| p.z < 0.5 * height).collect();
+        places.extend([0.25, 0.5, 0.75].iter().flat_map(|part| lower.iter().map(move |p| *p * *part)));
+    }
+    places
 }
 
 /// Views that see the shadow as dark as it is on the whole, and all that see enough of it.

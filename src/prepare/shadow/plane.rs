@@ -12,9 +12,10 @@ const DRAWS: usize = 4000;
 const ON: f64 = 0.03;
 /// Share of the object's places that lie above the plane, at least; what lies below is an error of their depth.
 const ABOVE: f64 = 0.9;
-/// The object's lowest places, by this share of them, lie as near to the plane as this share of its size.
+/// The object's lowest places, by this share of them, lie as near to the plane as the first share of its size. Up to the second one a
+/// plane counts less and less: of what is round nobody sees the lowest places.
 const LOWEST: f64 = 0.05;
-const GAP: f64 = 0.2;
+const GAP: [f64; 2] = [0.2, 0.6];
 /// Cosine between a plane's normal and the cameras' common up below which it counts half.
 const STEEP: f64 = 0.7;
 
@@ -72,16 +73,18 @@ pub fn find(around: &[DVec3], object: &[DVec3], up: DVec3, seed: u64) -> Option<
     let rests = |(through, normal): Plane| {
         let heights: Vec<f64> = object.iter().map(|p| (*p - through).dot(normal)).collect();
         let above = heights.iter().filter(|h| **h > -ON * size).count() as f64 / heights.len() as f64;
-        above >= ABOVE && quantile(heights, LOWEST).is_some_and(|lowest| lowest.abs() <= GAP * size)
+        let lowest = quantile(heights, LOWEST).map_or(f64::INFINITY, f64::abs) / size;
+        if above >= ABOVE { ((GAP[1] - lowest) / (GAP[1] - GAP[0])).clamp(0.0, 1.0) } else { 0.0 }
     };
     let drawn = plane::drawn(around, DRAWS, &mut Pcg64::new(seed.into(), 61), |(through, normal)| {
         let normal = if (middle - through).dot(normal) < 0.0 { -normal } else { normal };
         let plane = (through, normal);
         let level = if normal.dot(up) >= STEEP { 1.0 } else { 0.5 };
         let count = || around.iter().filter(|p| plane::distance(plane, **p) <= on).map(weight).sum::<f64>();
-        rests(plane).then(|| (count() * level, plane))
+        let rests = rests(plane);
+        (rests > 0.0).then(|| (count() * level * rests, plane))
     })?;
-    let (through, normal) = plane::refined(around, drawn, on, weight, rests);
+    let (through, normal) = plane::refined(around, drawn, on, weight, |plane| rests(plane) > 0.0);
     let foot = middle - normal * (middle - through).dot(normal);
     let (x, y) = normal.any_orthonormal_pair();
     let support = Support { foot, up: normal, along: [x, y], height: 0.0, radius: 0.0 };
@@ -98,6 +101,27 @@ mod tests {
     use rand::RngExt as _;
 
     use super::*;
+
+    /// A ball on a floor, of which cameras from above see the upper three quarters, and fog around it: the floor is found.
+    #[test]
+    fn what_is_round_rests_on_what_is_below_it() {
+        let mut rng = Pcg64::new(5, 5);
+        let mut noise = move |by: f64| rng.random_range(-by..by);
+        let mut object = vec![];
+        while object.len() < 400 {
+            let p = dvec3(noise(1.0), noise(1.0), noise(1.0));
+            if (0.5..1.0).contains(&p.length()) && p.z > -0.5 * p.length() {
+                object.push(p.normalize() * 0.5 + DVec3::Z * 0.5);
+            }
+        }
+        let mut around = vec![];
+        for _ in 0..600 {
+            around.push(dvec3(noise(1.5), noise(1.5), noise(0.008)));
+            around.push(dvec3(noise(1.5), noise(1.5), 0.4 + noise(0.4)));
+        }
+        let found = find(&around, &object, DVec3::Z, 0).expect("a plane");
+        assert!(found.up.z > 0.9995 && found.foot.z.abs() < 0.004, "{found:?}");
+    }
 
     /// A box on a table before a wall, and a floor below the table that has more places: the table is found.
     #[test]
