@@ -7,9 +7,6 @@ use crate::config::Settings;
 use crate::gpu::{self, DeviceInfo};
 use crate::work::{Loaded, SYNTHETIC};
 
-/// Longer side of the pictures that a CPU trains on in minutes, pixels: a quarter of SPIn-NeRF's 1008.
-const SIDE: f64 = 252.0;
-
 /// A GPU takes the defaults. A CPU takes `demo` for the built-in scene and `gaussians` for others.
 fn choose(device: &DeviceInfo, scene: &Path) -> &'static str {
     match device.kind {
@@ -17,13 +14,6 @@ fn choose(device: &DeviceInfo, scene: &Path) -> &'static str {
         "cpu" => "gaussians",
         _ => "gscream",
     }
-}
-
-/// How far a preset reduces pictures whose longer side is `longest` pixels: those for CPUs to about [`SIDE`]. Nothing
-/// where the preset's own setting holds.
-pub(super) fn downscale(preset: Option<&str>, longest: Option<u32>) -> Option<u32> {
-    let reduces = matches!(preset, Some("gaussians" | "lavapipe"));
-    longest.filter(|_| reduces).map(|side| (f64::from(side) / SIDE).round().max(1.0) as u32)
 }
 
 /// The scene and the settings of a training: those that the arguments ask for, over a preset for the device and the size
@@ -111,18 +101,6 @@ mod tests {
         assert_eq!(of("cpu", "garden"), "gaussians");
         assert_eq!(of("discrete", SYNTHETIC), "gscream");
         assert_eq!(of("integrated", "garden"), "gscream");
-    }
-
-    #[test]
-    fn presets_for_a_cpu_reduce_by_the_pictures_size() {
-        for (longest, n) in
-            [(Some(1008), Some(4)), (Some(4032), Some(16)), (Some(256), Some(1)), (Some(32), Some(1)), (None, None)]
-        {
-            assert_eq!(downscale(Some("gaussians"), longest), n, "{longest:?}");
-            assert_eq!(downscale(Some("lavapipe"), longest), n, "{longest:?}");
-            assert_eq!(downscale(Some("paper"), longest), None, "{longest:?}");
-            assert_eq!(downscale(None, longest), None, "{longest:?}");
-        }
     }
 
     #[derive(Debug, clap::Parser)]

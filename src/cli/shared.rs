@@ -4,12 +4,14 @@ use std::path::{Path, PathBuf};
 
 use anyhow::bail;
 
-use super::preset;
 use crate::config::{Settings, SettingsArgs};
 use crate::gpu::{Descriptors, Form, Gpu, Options};
 use crate::model::config;
 use crate::scene::{self, Scene};
 use crate::work::{Loaded, SYNTHETIC, load_scene};
+
+/// Longer side of the pictures that a CPU trains on in minutes, pixels: a quarter of SPIn-NeRF's 1008.
+const SIDE: f64 = 252.0;
 
 /// Which device to compute on, and how closely to watch it.
 #[derive(Debug, Clone, Default, clap::Args)]
@@ -109,7 +111,7 @@ impl SceneArgs {
     /// # Errors
     /// Settings that make no sense.
     pub fn resolve(&self) -> anyhow::Result<Settings> {
-        let reduced = preset::downscale(self.settings.preset.as_deref(), scene::longest_side(&self.scene));
+        let reduced = downscale(self.settings.preset.as_deref(), scene::longest_side(&self.scene));
         Ok(SettingsArgs { reduced, ..self.settings.clone() }.resolve()?)
     }
 
@@ -122,6 +124,13 @@ impl SceneArgs {
         let absolute = std::path::absolute(&self.scene).unwrap_or_else(|_| self.scene.clone());
         absolute.to_string_lossy().into_owned()
     }
+}
+
+/// How far a preset reduces pictures whose longer side is `longest` pixels: those for CPUs to about [`SIDE`]. Nothing
+/// where the preset's own setting holds.
+fn downscale(preset: Option<&str>, longest: Option<u32>) -> Option<u32> {
+    let reduces = matches!(preset, Some("gaussians" | "lavapipe"));
+    longest.filter(|_| reduces).map(|side| (f64::from(side) / SIDE).round().max(1.0) as u32)
 }
 
 /// A step that is measured, and how often.
@@ -215,6 +224,18 @@ mod tests {
         let error =
             probe(&["synthetic", "--device", "abacus"]).device.with_gpu(|_| Ok(())).expect_err("no such device");
         assert!(message(&error).starts_with("error: no device matches \"abacus\": `gscream-vk devices` lists them"));
+    }
+
+    #[test]
+    fn presets_for_a_cpu_reduce_by_the_pictures_size() {
+        for (longest, n) in
+            [(Some(1008), Some(4)), (Some(4032), Some(16)), (Some(256), Some(1)), (Some(32), Some(1)), (None, None)]
+        {
+            assert_eq!(downscale(Some("gaussians"), longest), n, "{longest:?}");
+            assert_eq!(downscale(Some("lavapipe"), longest), n, "{longest:?}");
+            assert_eq!(downscale(Some("paper"), longest), None, "{longest:?}");
+            assert_eq!(downscale(None, longest), None, "{longest:?}");
+        }
     }
 
     #[test]
