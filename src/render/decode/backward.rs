@@ -1,6 +1,6 @@
 //! The backward stage and its twins.
 
-use super::forward::lists;
+use super::forward::{each, lists};
 use super::*;
 use crate::gpu::kernels::render::{
     decode_backward, decode_backward_feature, decode_backward_first, decode_backward_hidden, decode_backward_second,
@@ -212,11 +212,6 @@ impl Reference for decode_backward_weights_second::Kernel {
     fn check(_: &'static str) -> Check {
         sums(BLOCK)
     }
-}
-
-/// Anchors whose Gaussians a workgroup has a thread for each of; 0 where they are too many for one.
-pub(super) fn each(offsets: u32) -> u32 {
-    64 / offsets
 }
 
 /// Threads that share a vec4's sum over chunks: a GPU has more threads than there are sums, a CPU has not.

@@ -1,6 +1,5 @@
 //! The forward stage and its twins.
 
-use super::backward::each;
 use super::*;
 use crate::gpu::kernels::render::{
     decode, decode_backward_feature, decode_backward_first, decode_backward_hidden, decode_hidden, decode_input,
@@ -122,6 +121,11 @@ impl Reference for decode_lists::Kernel {
         }
         host.segments[offsets as usize + 1] = n;
     }
+}
+
+/// Anchors whose Gaussians a workgroup has a thread for each of; 0 where they are too many for one.
+pub(super) fn each(offsets: u32) -> u32 {
+    64 / offsets
 }
 
 /// For each k the visible anchors whose Gaussian k is listed.

@@ -1,7 +1,8 @@
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
 
-use super::backward::{chunks, each, listed_chunks, second_sum_threads, sum_threads};
+use super::backward::{chunks, listed_chunks, second_sum_threads, sum_threads};
+use super::forward::each;
 use super::*;
 use crate::gpu::Reference;
 use crate::gpu::kernels::render::{
