@@ -26,15 +26,15 @@ const LEAST: f64 = 0.08;
 /// A map that cannot be read.
 pub fn add(root: &Path, views: &[View], masks: &mut [GrayImage]) -> Result<(), Error> {
     views.par_iter().zip(masks).try_for_each(|(View { name, image, .. }, mask)| {
-        let path = root.join(relight::path(name));
-        if !path.is_file() {
-            return Ok(());
-        }
         // A soft shadow has no seam.
         let contact = root.join(relight::contact_path(name));
         if contact.is_file() {
             let contact = resample::mask(&scene::mask(&contact, 1)?, [mask.width(), mask.height()]);
             mask.iter_mut().zip(contact.as_raw()).for_each(|(mask, more)| *mask = (*mask).max(*more));
+            return Ok(());
+        }
+        let path = root.join(relight::path(name));
+        if !path.is_file() {
             return Ok(());
         }
         let map = resample::photograph(&scene::photograph(&path, 1)?, [mask.width(), mask.height()]);

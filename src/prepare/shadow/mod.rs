@@ -44,7 +44,8 @@ pub struct Ground<'a> {
 /// The longer side of the photographs that a shadow is looked for in, pixels.
 pub const SIDE: u32 = 1024;
 /// Name of the way in which it is looked for: where that was another one it is looked for anew.
-pub const METHOD: &str = "on the plane of measured depth, soft ones of many views too, below what is round";
+pub const METHOD: &str =
+    "on the plane of measured depth, soft ones of many views too, below what is round, by parts where they differ";
 /// A picture of what was found, below the scene's folder.
 pub const PICTURE: &str = "prepare/shadow.png";
 /// Places that are looked at, of the object and of what is around it.
@@ -135,28 +136,34 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
         }
     };
     watch.turn(1)?;
-    let [alike, all] = found.views;
+    let first = &found[0];
+    let [alike, all] = first.views;
     let share = alike as f64 / all.max(1) as f64;
-    let left = found.shadow.ratio.iter().sum::<f64>() / 3.0;
+    let left = first.shadow.ratio.iter().sum::<f64>() / 3.0;
     let mut lit = 0;
     for (i, (view, photograph)) in task.fine.train.iter().zip(&photographs).enumerate() {
-        if let Some(map) = relight::map(&found, photograph) {
+        if let Some(map) = relight::map(first, photograph) {
             batch.rgb_aside(relight::path(&view.name), &map, "the object's shadow, found on its surface")?;
-            if !found.shadow.contact.is_empty() {
-                let contact = relight::contact(&found, photograph);
-                batch.gray(relight::contact_path(&view.name), &contact, "where the soft shadow leaves too little");
-            }
             lit += 1;
+        }
+        if let Some(contact) = relight::contact(&found, photograph) {
+            batch.gray(relight::contact_path(&view.name), &contact, "where the soft shadow leaves too little");
         }
         watch.turn(2 + i as u64)?;
     }
-    batch.rgb(PICTURE, &relight::picture(&found, &photographs), "the surface from above, the shadow, and without it");
-    batch.notes.push(format!(
+    batch.rgb(PICTURE, &relight::picture(first, &photographs), "the surface from above, the shadow, and without it");
+    batch.notes.push(if lit == 0 {
+        "the soft shadow around the object's foot, which photographs see in different places, goes with the hole (--shadow \
+         keep: it stays)"
+            .into()
+    } else {
+        format!(
         "the object's shadow on the surface below it leaves {:.0} % of the light, alike in {:.0} % of {all} views; it is taken \
          out of {lit} photographs for training ({PICTURE} shows it, --shadow keep leaves it)",
         100.0 * left,
         100.0 * share
-    ));
+        )
+    });
     batch.figures.extend([("light left".to_owned(), left), ("views that see it alike".to_owned(), share)]);
     Ok(batch)
 }
@@ -165,14 +172,48 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
 ///
 /// # Errors
 /// There is none.
-pub fn look(task: &Task<'_>, maps: &[DepthMap], photographs: &[Photograph<'_>]) -> Result<Found, String> {
+pub fn look(task: &Task<'_>, maps: &[DepthMap], photographs: &[Photograph<'_>]) -> Result<Vec<Found>, String> {
     let cameras: Vec<Camera> = task.scene.train.iter().map(|view| view.camera).collect();
     let object = object(maps, task.masks);
     let around = around(task.scene, maps, photographs, &object);
     let support = plane::find(&around, &object, up::estimate(&cameras), task.seed)
         .ok_or("no surface is known that it stands on")?;
     log::debug!("shadow: {support:?}, {} places of the object, {} around", object.len(), around.len());
-    let texture = Texture::of(&support, photographs);
+    let (texture, shadow) = detected(&support, &object, photographs)?;
+    let says = alike(&texture, &support, &shadow, photographs);
+    let views = [says.iter().filter(|says| **says == Some(true)).count(), says.iter().flatten().count()];
+    log::debug!("shadow: {views:?} views, ratio {:?}, alike {:.2}", shadow.ratio, shadow.alike);
+    let is_soft = !shadow.contact.is_empty();
+    if is_soft && (views[1] as f64) < TELLING * photographs.len() as f64 {
+        return Err(format!(
+            "only {} of {} photographs show what is darker around its foot",
+            views[1],
+            photographs.len()
+        ));
+    }
+    if (views[0] as f64) >= VIEWS * views[1] as f64 && views[1] > 0 {
+        return Ok(vec![Found { support, texture, shadow, views }]);
+    }
+    // Where the model is folded or torn, each part shows the shadow on a side of its own.
+    let parts = [true, false].into_iter().filter(|_| is_soft).filter_map(|same| {
+        let own = photographs.iter().zip(&says).filter(|(_, says)| **says == Some(same));
+        let own: Vec<Photograph<'_>> = own.map(|(photograph, _)| *photograph).collect();
+        let (texture, mut shadow) = detected(&support, &object, &own).ok()?;
+        shadow.contact.resize(shadow.region.len(), false);
+        shadow.contact.iter_mut().zip(&shadow.region).for_each(|(contact, region)| *contact |= region);
+        shadow.amount.fill(0.0);
+        Some(Found { support, texture, shadow, views })
+    });
+    let parts: Vec<Found> = parts.collect();
+    if parts.is_empty() {
+        return Err(format!("only {} of {} views see what is darker as dark as the others do", views[0], views[1]));
+    }
+    Ok(parts)
+}
+
+/// The surface as photographs show it, and the shadow on it.
+fn detected(support: &Support, object: &[DVec3], photographs: &[Photograph<'_>]) -> Result<(Texture, Shadow), String> {
+    let texture = Texture::of(support, photographs);
     let middle = 0.5 * texture.side as f64;
     let places = standing(object.iter().map(|point| support.local(*point)).collect(), support.height);
     let places: Vec<[f64; 3]> =
@@ -183,20 +224,7 @@ pub fn look(task: &Task<'_>, maps: &[DepthMap], photographs: &[Photograph<'_>]) 
         Verdict::Found(shadow) => *shadow,
         Verdict::Nothing(why) => soft::find(&ground).map_err(|soft| format!("{why}, and {soft}"))?,
     };
-    let views = alike(&texture, &support, &shadow, photographs);
-    log::debug!("shadow: {views:?} views, ratio {:?}, alike {:.2}", shadow.ratio, shadow.alike);
-    let is_soft = !shadow.contact.is_empty();
-    if is_soft && (views[1] as f64) < TELLING * photographs.len() as f64 {
-        return Err(format!(
-            "only {} of {} photographs show what is darker around its foot",
-            views[1],
-            photographs.len()
-        ));
-    }
-    if (views[0] as f64) < VIEWS * views[1] as f64 || views[1] == 0 {
-        return Err(format!("only {} of {} views see what is darker as dark as the others do", views[0], views[1]));
-    }
-    Ok(Found { support, texture, shadow, views })
+    Ok((texture, shadow))
 }
 
 /// An object's places from its foot on, along the surface and above it, with what nobody sees between it and the surface: its lower
@@ -210,8 +238,8 @@ fn standing(mut places: Vec<DVec3>, height: f64) -> Vec<DVec3> {
     places
 }
 
-/// Views that see the shadow as dark as it is on the whole, and all that see enough of it.
-fn alike(texture: &Texture, support: &Support, shadow: &Shadow, photographs: &[Photograph<'_>]) -> [usize; 2] {
+/// Whether views see the shadow as dark as it is on the whole; nothing of those that see too little of it.
+fn alike(texture: &Texture, support: &Support, shadow: &Shadow, photographs: &[Photograph<'_>]) -> Vec<Option<bool>> {
     let shaded = (0..shadow.region.len()).filter(|i| shadow.amount[*i] > 0.0 && texture.seen(*i));
     let nearly = 0.8 * quantile(shaded.map(|i| shadow.amount[i]), 0.9).unwrap_or(1.0);
     let is_deep = |i: &usize| f64::from(shadow.amount[*i]) > nearly && texture.seen(*i);
@@ -224,12 +252,9 @@ fn alike(texture: &Texture, support: &Support, shadow: &Shadow, photographs: &[P
     let (deep, lit) = (some(deep), some(lit));
     let full = (shadow.ratio.iter().map(|r| r.ln()).sum::<f64>() / 3.0).abs();
     let whole = full * median(deep.iter().map(|i| shadow.amount[*i])).unwrap_or(1.0);
-    let says: Vec<f64> = photographs
-        .iter()
-        .filter_map(|photograph| texture::left(photograph, texture, support, [&deep, &lit], &shadow.expected))
-        .collect();
-    let same = says.iter().filter(|left| (left.ln() + whole).abs() <= (SAME[0] * whole).max(SAME[1]));
-    [same.count(), says.len()]
+    let same = |left: f64| (left.ln() + whole).abs() <= (SAME[0] * whole).max(SAME[1]);
+    let left = |photograph| texture::left(photograph, texture, support, [&deep, &lit], &shadow.expected);
+    photographs.iter().map(|photograph| left(photograph).map(same)).collect()
 }
 
 /// Every so many pixels of all views, so that there are about so many in all.

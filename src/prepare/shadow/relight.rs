@@ -136,19 +136,22 @@ pub fn contact_path(name: &str) -> String {
     format!("prepare/contact/{name}.png")
 }
 
-/// The pixels of a photograph that show where a soft shadow leaves too little to be given back ([`super::Shadow::contact`]).
-pub fn contact(found: &Found, photograph: &Photograph<'_>) -> GrayImage {
+/// The pixels of a photograph that show where soft shadows leave too little to be given back ([`Shadow::contact`](super::detect::Shadow));
+/// nothing where none is soft.
+pub fn contact(found: &[Found], photograph: &Photograph<'_>) -> Option<GrayImage> {
     let [w, h] = photograph.camera.size;
-    let is = |x: u32, y: u32| {
+    let is = |found: &Found, x: u32, y: u32| {
         let pixel = [f64::from(x) + 0.5, f64::from(y) + 0.5];
         let Some(seen) = Seen::at(found, photograph, pixel) else { return false };
         let [u, v] = seen.cell.map(|at| at.round() as usize);
         let cell = v * found.texture.side + u;
         found.shadow.contact[cell] && surface(found, photograph, pixel, &seen, cell) > 0.5
     };
-    let rows: Vec<Vec<u8>> =
-        (0..h).into_par_iter().map(|y| (0..w).map(|x| if is(x, y) { 255 } else { 0 }).collect()).collect();
-    GrayImage::from_raw(w, h, rows.into_iter().flatten().collect()).expect("a value per pixel")
+    let soft: Vec<&Found> = found.iter().filter(|found| !found.shadow.contact.is_empty()).collect();
+    let value = |x: u32, y: u32| if soft.iter().any(|found| is(found, x, y)) { 255 } else { 0 };
+    let rows: Vec<Vec<u8>> = (0..h).into_par_iter().map(|y| (0..w).map(|x| value(x, y)).collect()).collect();
+    let picture = || GrayImage::from_raw(w, h, rows.into_iter().flatten().collect()).expect("a value per pixel");
+    (!soft.is_empty()).then(picture)
 }
 
 /// The photograph without the shadow, by its map: as training sees it.

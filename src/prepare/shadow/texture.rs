@@ -25,6 +25,7 @@ const FEWEST: usize = 2;
 const DARK: f32 = 4.0;
 
 /// A photograph and what is known of it.
+#[derive(Clone, Copy)]
 pub struct Photograph<'a> {
     /// Its camera.
     pub camera: Camera,
