@@ -3,8 +3,9 @@
 //! A static shadow contradicts nothing between views, so that no comparison of views finds it, and it stays when the object
 //! goes. Here the surface is found ([`plane`]) and seen straight from above ([`texture`]); a shadow is a place of it that is
 //! darker by one ratio of all channels where a light from one side would put the object's ([`detect`]). Photographs of it are
-//! made brighter by the inverse ratio ([`relight`]): what it lies on keeps its texture, and nothing has to be painted. The
-//! photographs stay as they are; `relight/NAME.png` says what is left of each pixel's light, and training divides by it.
+//! made brighter by the inverse ratio ([`relight`]): what it lies on keeps its texture, and nothing has to be painted. A
+//! shadow that no light from one side explains is looked for as a soft one (`soft`). The photographs stay as they are;
+//! `relight/NAME.png` says what is left of each pixel's light, and training divides by it.
 
 mod border;
 pub mod detect;
@@ -157,11 +158,10 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
          keep: it stays)"
             .into()
     } else {
+        let [left, share] = [left, share].map(|part| 100.0 * part);
         format!(
-        "the object's shadow on the surface below it leaves {:.0} % of the light, alike in {:.0} % of {all} views; it is taken \
-         out of {lit} photographs for training ({PICTURE} shows it, --shadow keep leaves it)",
-        100.0 * left,
-        100.0 * share
+            "the object's shadow on the surface below it leaves {left:.0} % of the light, alike in {share:.0} % of {all} views; \
+             it is taken out of {lit} photographs for training ({PICTURE} shows it, --shadow keep leaves it)"
         )
     });
     batch.figures.extend([("light left".to_owned(), left), ("views that see it alike".to_owned(), share)]);
