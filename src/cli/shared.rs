@@ -111,7 +111,7 @@ impl SceneArgs {
     /// # Errors
     /// Settings that make no sense.
     pub fn resolve(&self) -> anyhow::Result<Settings> {
-        let reduced = downscale(self.settings.preset.as_deref(), scene::longest_side(&self.scene));
+        let reduced = downscale(self.settings.preset.as_deref(), || scene::longest_side(&self.scene));
         Ok(SettingsArgs { reduced, ..self.settings.clone() }.resolve()?)
     }
 
@@ -127,10 +127,11 @@ impl SceneArgs {
 }
 
 /// How far a preset reduces pictures whose longer side is `longest` pixels: those for CPUs to about [`SIDE`]. Nothing
-/// where the preset's own setting holds.
-fn downscale(preset: Option<&str>, longest: Option<u32>) -> Option<u32> {
+/// where the preset's own setting holds; no picture is looked at then.
+fn downscale(preset: Option<&str>, longest: impl FnOnce() -> Option<u32>) -> Option<u32> {
     let reduces = matches!(preset, Some("gaussians" | "lavapipe"));
-    longest.filter(|_| reduces).map(|side| (f64::from(side) / SIDE).round().max(1.0) as u32)
+    let longest = reduces.then(longest).flatten();
+    longest.map(|side| (f64::from(side) / SIDE).round().max(1.0) as u32)
 }
 
 /// A step that is measured, and how often.
@@ -231,10 +232,10 @@ mod tests {
         for (longest, n) in
             [(Some(1008), Some(4)), (Some(4032), Some(16)), (Some(256), Some(1)), (Some(32), Some(1)), (None, None)]
         {
-            assert_eq!(downscale(Some("gaussians"), longest), n, "{longest:?}");
-            assert_eq!(downscale(Some("lavapipe"), longest), n, "{longest:?}");
-            assert_eq!(downscale(Some("paper"), longest), None, "{longest:?}");
-            assert_eq!(downscale(None, longest), None, "{longest:?}");
+            assert_eq!(downscale(Some("gaussians"), || longest), n, "{longest:?}");
+            assert_eq!(downscale(Some("lavapipe"), || longest), n, "{longest:?}");
+            assert_eq!(downscale(Some("paper"), || longest), None, "{longest:?}");
+            assert_eq!(downscale(None, || longest), None, "{longest:?}");
         }
     }
 

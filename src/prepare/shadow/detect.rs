@@ -114,6 +114,23 @@ fn shrunk(mask: &[bool], side: usize, radius: f64) -> Cells {
     grown(&outside, side, radius).into_iter().map(|m| !m).collect()
 }
 
+/// A mask with gaps up to a radius closed.
+pub fn closed(mask: &[bool], side: usize, radius: f64) -> Cells {
+    shrunk(&grown(mask, side, radius), side, radius)
+}
+
+/// The cells below the object's lowest places: its foot.
+pub fn low(ground: &Ground<'_>) -> Cells {
+    let side = ground.side;
+    let mut cells = vec![false; side * side];
+    for [x, y, _] in ground.object.iter().filter(|[_, _, height]| *height < LOW * ground.height) {
+        if *x >= 0.0 && *y >= 0.0 && *x < side as f64 && *y < side as f64 {
+            cells[*y as usize * side + *x as usize] = true;
+        }
+    }
+    cells
+}
+
 /// Where the object's shadow falls: its places moved along the light, gaps between them closed.
 fn cast(ground: &Ground<'_>, [a, b]: [f64; 2], side: usize, close: f64) -> Cells {
     let scale = 1.0 / (ground.side / side) as f64;
@@ -125,7 +142,7 @@ fn cast(ground: &Ground<'_>, [a, b]: [f64; 2], side: usize, close: f64) -> Cells
             cells[v as usize * side + u as usize] = true;
         }
     }
-    shrunk(&grown(&cells, side, close), side, close)
+    closed(&cells, side, close)
 }
 
 /// A direction and how well it explains the colours.
@@ -278,15 +295,7 @@ fn closely(ground: &Ground<'_>, best: &Hypothesis) -> Verdict {
             count += 1;
         }
     }
-    let foot = {
-        let mut cells = vec![false; side * side];
-        for [x, y, _] in ground.object.iter().filter(|[_, _, height]| *height < LOW * ground.height) {
-            if *x >= 0.0 && *y >= 0.0 && *x < side as f64 && *y < side as f64 {
-                cells[*y as usize * side + *x as usize] = true;
-            }
-        }
-        grown(&cells, side, NEAR * ground.height + 3.0)
-    };
+    let foot = grown(&low(ground), side, NEAR * ground.height + 3.0);
     if (0..seen.len()).filter(|i| seen[*i] && region[*i] && foot[*i]).count() < FEWEST {
         return nothing("what is darker around it does not reach its foot");
     }

@@ -60,7 +60,7 @@ const NEAR: f64 = 3.0;
 const LOWEST: (f64, f64) = (0.05, 0.1);
 /// Views of which each has to see the shadow about as dark as all of them do.
 const VIEWS: f64 = 0.7;
-/// Of a soft shadow this share of all photographs has to see enough to tell: a few may be mixed with the object's own colours.
+/// The share of all photographs that have to see enough of a soft shadow to tell: a few may be mixed with the object's own colours.
 const TELLING: f64 = 0.25;
 /// About as dark: the logarithm of what is left differs by this share at most, or by so much.
 const SAME: [f64; 2] = [0.4, 0.06];
@@ -195,7 +195,7 @@ pub fn look(task: &Task<'_>, maps: &[DepthMap], photographs: &[Photograph<'_>]) 
         return Ok(vec![Found { support, texture, shadow, views }]);
     }
     // Where the model is folded or torn, each part shows the shadow on a side of its own.
-    let parts = [true, false].into_iter().filter(|_| is_soft).filter_map(|same| {
+    let part = |same: bool| {
         let own = photographs.iter().zip(&says).filter(|(_, says)| **says == Some(same));
         let own: Vec<Photograph<'_>> = own.map(|(photograph, _)| *photograph).collect();
         let (texture, mut shadow) = detected(&support, &object, &own).ok()?;
@@ -203,8 +203,8 @@ pub fn look(task: &Task<'_>, maps: &[DepthMap], photographs: &[Photograph<'_>]) 
         shadow.contact.iter_mut().zip(&shadow.region).for_each(|(contact, region)| *contact |= region);
         shadow.amount.fill(0.0);
         Some(Found { support, texture, shadow, views })
-    });
-    let parts: Vec<Found> = parts.collect();
+    };
+    let parts: Vec<Found> = if is_soft { [true, false].into_iter().filter_map(part).collect() } else { vec![] };
     if parts.is_empty() {
         return Err(format!("only {} of {} views see what is darker as dark as the others do", views[0], views[1]));
     }

@@ -12,13 +12,13 @@ use image::GrayImage;
 use rayon::prelude::*;
 
 use super::Ground;
-use super::detect::{Shadow, grown};
+use super::detect::{Shadow, closed, low};
 use super::mixture::{Color, channels, color};
+use crate::prepare::planes::neighbours;
 use crate::scene::resample;
 use crate::statistics::median;
 
-/// The object's foot is what of it is lower than this share of its height, with gaps of this share of it closed.
-const LOW: f64 = 0.2;
+/// Gaps of this share of the object's height are closed in its foot.
 const GAPS: f64 = 0.12;
 /// The shadow reaches at most so many times the object's size, the larger one of its foot's width and [`TALL`] of its height.
 const REACH: f64 = 1.0;
@@ -41,14 +41,14 @@ const END: f64 = -0.008;
 const REBOUND: f64 = 0.04;
 /// Largest deviation of the surface from smooth light (median of absolute values) for a shadow to be told on it.
 const ROUGH: f64 = 0.05;
-/// Of what is around the foot, half as far as the shadow reaches, at least this part is seen.
+/// The least part that is seen of what is around the foot, half as far as the shadow reaches.
 const SEEN: f64 = 0.4;
 /// The dark part covers at least this part of the square of the object's size, and all of the shadow at most so much.
 const LEAST: f64 = 0.03;
 const MOST: f64 = 2.5;
 /// The dark part is at least this part of the shadow.
 const CORE: f64 = 0.15;
-/// Of what is known where the farthest shadow would end at most this part is dark: a shadow ends.
+/// A shadow ends: of what is known where the farthest one would end at most this part is dark.
 const OPEN: f64 = 0.2;
 /// Least cells there, as a part of the square of the object's size.
 const LEAST_RING: f64 = 0.1;
@@ -70,7 +70,7 @@ const LEFT: f64 = 0.2;
 pub fn find(ground: &Ground<'_>) -> Result<Shadow, String> {
     let no = |why: &str| why.to_owned();
     let side = ground.side;
-    let foot = foot(ground);
+    let foot = closed(&low(ground), side, GAPS * ground.height + 2.0);
     let width = width(&foot, side).ok_or_else(|| no("nothing of it is near the surface"))?;
     let size = width.max(TALL * ground.height);
     let reach = (REACH * size).ceil() as u32;
@@ -103,7 +103,8 @@ pub fn find(ground: &Ground<'_>) -> Result<Shadow, String> {
     region.iter_mut().zip(&foot).for_each(|(region, foot)| *region &= !foot);
     let count = |wanted: &dyn Fn(usize) -> bool| (0..foot.len()).filter(|i| wanted(*i)).count() as f64;
     let area = count(&|i| region[i] && same[i]);
-    let core = count(&|i| region[i] && same[i] && off[i] < DARK);
+    let is_core = |i: usize| region[i] && same[i] && off[i] < DARK;
+    let core = count(&is_core);
     let ring = |i: usize| same[i] && away[i] <= reach && f64::from(away[i]) > 0.9 * f64::from(reach);
     let (all, at_end) = (count(&ring), count(&|i| ring(i) && region[i]));
     log::debug!("shadow: soft: {area} cells, {core} of them dark, {at_end} of {all} at the end of what is looked at");
@@ -119,30 +120,14 @@ pub fn find(ground: &Ground<'_>) -> Result<Shadow, String> {
     if (-most).exp() < LEFT {
         return Err(no("what is darker around its foot is no shadow by its ratio"));
     }
-    let tint = tint(&colors, &amounts, [&|i| region[i] && same[i] && off[i] < DARK, &|i| ring(i) && amounts[i] == 0.0]);
+    let tint = tint(&colors, &amounts, [&is_core, &|i| ring(i) && amounts[i] == 0.0]);
     let ratio = channels([most, most * tint[0], most * tint[1]]).map(|taken| (-taken).exp());
-    let expected =
-        (0..foot.len()).map(|i| if shown[i] { (colors[i][0] + amounts[i]) as f32 } else { f32::NAN }).collect();
+    let expected = colors.iter().zip(&amounts).map(|(color, amount)| (color[0] + amount) as f32).collect();
     let lit = (0..foot.len()).map(|i| same[i] && amounts[i] == 0.0 && away[i] <= far).collect();
     let band = (CONTACT * size).round() as u32;
     let contact = (0..foot.len()).map(|i| amounts[i] > MUCH || away[i] <= band).collect();
     let amount = amounts.into_iter().map(|v| (v / most) as f32).collect();
     Ok(Shadow { ratio, amount, region, lit, expected, alike: 1.0, contact })
-}
-
-/// Where the object stands: the cells below its lowest places, gaps closed.
-fn foot(ground: &Ground<'_>) -> Vec<bool> {
-    let side = ground.side;
-    let mut cells = vec![false; side * side];
-    for [x, y, height] in ground.object {
-        let inside = *x >= 0.0 && *y >= 0.0 && *x < side as f64 && *y < side as f64;
-        if inside && *height < LOW * ground.height {
-            cells[*y as usize * side + *x as usize] = true;
-        }
-    }
-    let close = GAPS * ground.height + 2.0;
-    let not = |cells: Vec<bool>| -> Vec<bool> { cells.into_iter().map(|on| !on).collect() };
-    not(grown(&not(grown(&cells, side, close)), side, close))
 }
 
 /// The larger side of the box around a mask, cells; nothing of an empty one.
@@ -310,6 +295,9 @@ fn over(values: &[f64], side: usize, radius: isize, made: impl Fn(&[f64]) -> f64
     let row = |y: usize| -> Vec<f64> {
         let mut near = vec![];
         let one = |x: usize| {
+            if values[y * side + x].is_nan() {
+                return f64::NAN;
+            }
             near.clear();
             for [dx, dy] in &disc {
                 let (u, v) = (x as isize + dx, y as isize + dy);
@@ -320,7 +308,7 @@ fn over(values: &[f64], side: usize, radius: isize, made: impl Fn(&[f64]) -> f64
                     }
                 }
             }
-            if values[y * side + x].is_nan() || near.is_empty() { f64::NAN } else { made(&near) }
+            made(&near)
         };
         (0..side).map(one).collect()
     };
@@ -331,21 +319,13 @@ fn over(values: &[f64], side: usize, radius: isize, made: impl Fn(&[f64]) -> f64
 fn fill(values: &mut [f64], side: usize) {
     let mut queue: VecDeque<usize> = (0..values.len()).filter(|i| !values[*i].is_nan()).collect();
     while let Some(i) = queue.pop_front() {
-        for next in beside(i, side) {
+        for next in neighbours(i, [side; 2]) {
             if values[next].is_nan() {
                 values[next] = values[i];
                 queue.push_back(next);
             }
         }
     }
-}
-
-/// The four cells beside one.
-fn beside(i: usize, side: usize) -> impl Iterator<Item = usize> {
-    let (x, y) = (i % side, i / side);
-    let all =
-        [(x > 0, i.wrapping_sub(1)), (x + 1 < side, i + 1), (y > 0, i.wrapping_sub(side)), (y + 1 < side, i + side)];
-    all.into_iter().filter(|(inside, _)| *inside).map(|(_, at)| at)
 }
 
 /// Cells that hang together with the first ones through those that `passes` says, on ways that do not get darker again once
@@ -363,7 +343,7 @@ fn reached(
     queue.iter().for_each(|(_, i)| out[*i] = true);
     while let Some((Reverse(brightest), i)) = queue.pop() {
         let brightest = brightest as f64 / 1e6;
-        for next in beside(i, side) {
+        for next in neighbours(i, [side; 2]) {
             if !out[next] && passes(next) && off[next] > brightest - REBOUND {
                 out[next] = true;
                 queue.push((rank(brightest.max(off[next])), next));
@@ -396,8 +376,8 @@ fn blurred(mut values: Vec<f64>, side: usize, deviation: f64) -> Vec<f64> {
     values
 }
 
-/// What the shadow takes, logarithms: all that is darker within its region and around it as far as it hangs together, less
-/// and less from the region's border on.
+/// The shadow takes, logarithms, all that is darker within its region and around it as far as it hangs together, less and
+/// less from the region's border on.
 fn faded(off: &[f64], region: &[bool], foot: &[bool], side: usize, fade: u32) -> Vec<f64> {
     let inside: Vec<bool> = region.iter().zip(foot).map(|(region, foot)| *region || *foot).collect();
     let away = distances(&inside, side, fade);
@@ -454,7 +434,7 @@ mod tests {
         x.rem_euclid(30.0) < 2.0 || y.rem_euclid(30.0) < 2.0
     }
 
-    /// What a soft shadow to the left of the foot takes.
+    /// A soft shadow to the left of the foot takes this share of the light.
     fn shade(x: f64, y: f64) -> f64 {
         0.35 * (-((x - 46.0) / 9.0).powi(2) - ((y - 60.0) / 9.0).powi(2)).exp()
     }
