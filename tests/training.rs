@@ -595,9 +595,14 @@ fn a_device_that_binds_little_trains_to_the_end() {
 
     // Little memory: growing stops earlier, or begins on a coarser grid.
     let gpu = testing::gpu();
-    let whole =
-        forecast::fitting(&gpu, &scene, &settings, None).expect("a forecast").verdict.forecast.expect("it fits");
-    let between = u64::midpoint(whole.start, whole.peak) + gscream_vk::gpu::device::SPARE_BYTES;
+    let needs = |anchors| {
+        let question = forecast::Question { anchors, ..Default::default() };
+        let verdict = forecast::forecast(&gpu, &scene, &settings, question).expect("a forecast");
+        verdict.forecast.expect("it fits").needs()
+    };
+    let (still, grown) = (needs(Some(initial)), needs(None));
+    assert!(still < grown, "{still} {grown}");
+    let between = u64::midpoint(still, grown);
     let fitting = forecast::fitting(&gpu, &scene, &settings, Some(between)).expect("a forecast");
     let reduced = fitting.reduced.expect("it does not fit as it is");
     assert!(reduced.starts_with("growing stops earlier, at "), "{reduced}");
