@@ -1,13 +1,19 @@
-//! Carried masks that lie beside the object: of photographs whose cameras are wrong.
+//! Photographs whose cameras are wrong: masks of theirs that are not carried, and masks that are carried beside the object.
+//!
+//! A mask in a photograph that stands elsewhere than its camera is carried to whatever else is in its way.
 //!
 //! A camera that a model without texture has a little turned still fits its few points, and what is carried to it falls beside the
 //! object: half of that is outside the mask, for every other photograph to take for what is behind it. The object's colours tell:
 //! they are learnt where its masks are given, and a mask under which they are not is moved to where they are.
 
+use std::collections::{BTreeMap, BTreeSet};
+
 use image::{GrayImage, RgbImage};
 
-use super::masks;
-use crate::scene::resample;
+use super::object::Given;
+use super::{Error, abridged, masks};
+use crate::multiview::DepthGrid;
+use crate::scene::{Scene, View, resample};
 
 /// Longer side of the pictures that masks are moved in, pixels.
 const SIDE: u32 = 160;
@@ -34,6 +40,40 @@ const FITS: f32 = 2.0;
 const BETTER: f32 = 1.5;
 /// The mean of the logarithms from which on a mask lies on the object, whatever is beside it: two thirds of a mask where colours are sure.
 const THERE: f32 = 1.0;
+
+/// Names of the train views that agree with the others next to nowhere.
+pub fn wrong<'a>(scene: &'a Scene, grids: &[DepthGrid]) -> BTreeSet<&'a str> {
+    scene.train.iter().zip(grids).filter(|(_, grid)| !grid.trusted).map(|(view, _)| view.name.as_str()).collect()
+}
+
+/// The views whose given masks are carried to the others, and a line on those whose masks are not, being wrong.
+///
+/// # Errors
+/// Where no given mask can be carried.
+pub fn voters<'a>(
+    scene: &'a Scene,
+    wrong: &BTreeSet<&str>,
+    given: &BTreeMap<String, Given>,
+) -> Result<(Vec<&'a View>, Option<String>), Error> {
+    let masked = scene.train.iter().filter(|view| given.contains_key(&view.name));
+    let (lost, voters): (Vec<&View>, Vec<&View>) = masked.partition(|view| wrong.contains(view.name.as_str()));
+    let names: Vec<&str> = lost.iter().map(|view| view.name.as_str()).collect();
+    let why = "the model has the camera in a wrong place, for what is seen from there agrees with the other photographs next to nowhere";
+    match (lost.first(), voters.is_empty()) {
+        (None, _) => Ok((voters, None)),
+        (Some(_), false) => {
+            Ok((voters, Some(format!("{}: {why}; the masks there are not carried to these", abridged(&names)))))
+        }
+        (Some(first), true) => {
+            let right = scene.train.iter().map(|view| view.name.as_str()).filter(|name| !wrong.contains(name));
+            let (before, after): (Vec<&str>, Vec<&str>) = right.partition(|name| *name < first.name.as_str());
+            let hint = after.first().or(before.last()).map_or_else(String::new, |name| format!(", such as {name}"));
+            let what =
+                format!("{}: {why}, so that no mask is carried to these; mask another one{hint}", abridged(&names));
+            Err(Error::Request(what))
+        }
+    }
+}
 
 /// The colours of the object, and of what is around it where its masks are given.
 pub struct Looks {
@@ -167,6 +207,7 @@ mod tests {
     use image::{Luma, Rgb};
 
     use super::*;
+    use crate::scene::{self, synthetic};
 
     /// A blue can with a red label on a grey floor, its left side at this column.
     fn picture(left: u32) -> (RgbImage, GrayImage) {
@@ -179,6 +220,39 @@ mod tests {
         };
         let mask = GrayImage::from_fn(160, 120, |x, y| Luma([if on(x, y) { 255 } else { 0 }]));
         (RgbImage::from_fn(160, 120, color), mask)
+    }
+
+    /// A mask in a photograph whose camera is wrong is not carried; where there is no other, another photograph is named.
+    #[test]
+    fn masks_of_wrong_cameras_are_not_carried() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let dir = folder.path().join("scene");
+        let options = synthetic::Options {
+            width: 32,
+            height: 24,
+            train_views: 4,
+            test_views: 0,
+            points: 50,
+            ..Default::default()
+        };
+        synthetic::write(&dir, &options).expect("a scene");
+        let scene = scene::load(&dir, &scene::Config::default()).expect("it loads");
+        let name = |at: usize| scene.train[at].name.clone();
+        let mask = || Given::fixed(GrayImage::new(32, 24), String::new());
+        let given =
+            |views: &[usize]| -> BTreeMap<String, Given> { views.iter().map(|at| (name(*at), mask())).collect() };
+        let (own, other, next) = (name(1), name(2), name(3));
+        let wrong = BTreeSet::from([own.as_str(), other.as_str()]);
+        let found = |views: &[usize]| voters(&scene, &wrong, &given(views));
+        let (voters, note) = found(&[1, 3]).expect("one is right");
+        assert_eq!(voters.iter().map(|view| &view.name).collect::<Vec<_>>(), [&next]);
+        assert!(note.is_some_and(|note| note.starts_with(&format!("{own}: "))));
+        assert!(found(&[0, 3]).is_ok_and(|(voters, note)| voters.len() == 2 && note.is_none()));
+        let error = found(&[1, 2]).expect_err("both are wrong").to_string();
+        assert!(
+            error.starts_with(&format!("{own}, {other}: ")) && error.ends_with(&format!("such as {next}")),
+            "{error}"
+        );
     }
 
     #[test]

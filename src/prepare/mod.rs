@@ -579,19 +579,20 @@ impl Preparation<'_> {
         let needs_depth = !all_given || given.values().any(|given| !given.drawn.is_empty());
         let grids = if needs_depth { self.matched(scene)?.depths(scene) } else { vec![] };
         let given = &placed(scene, &grids, splats, given, &files)?;
+        let wrong = misplaced::wrong(scene, &grids);
+        let (voters, misplaced) = misplaced::voters(scene, &wrong, given)?;
         let mut votes = masks::Votes::new(splats);
         let mut unit = 0;
-        for view in &scene.train {
-            if let Some(Given { mask, .. }) = given.get(&view.name) {
-                votes.add(splats, &view.camera, &masks::parts(mask, view.camera.size))?;
-                unit += 1;
-                self.watch.turn(unit)?;
-            }
+        for view in &voters {
+            votes.add(splats, &view.camera, &masks::parts(&given[&view.name].mask, view.camera.size))?;
+            unit += 1;
+            self.watch.turn(unit)?;
         }
         let colors = masks::colors(splats, &scene.train)?;
         let mut shares = votes.count(fit.positions(), &colors);
         let mut batch = Batch::default();
-        let names: Vec<&str> = given.keys().map(String::as_str).collect();
+        batch.notes.extend(misplaced);
+        let names: Vec<&str> = voters.iter().map(|view| view.name.as_str()).collect();
         let from = format!("carried from {}", abridged(&names));
         let others: Vec<&scene::View> = scene.train.iter().filter(|view| !given.contains_key(&view.name)).collect();
         let beside = if all_given { vec![] } else { beside(scene, &grids, given) };
@@ -629,10 +630,12 @@ impl Preparation<'_> {
         // What the first views miss of the object's other sides the masks of more views have between them.
         let every = others.len().div_ceil(outline::VOTERS).max(1);
         for _ in 0..outline::ROUNDS {
-            let voters = (0..others.len()).into_par_iter().step_by(every);
-            let outlines: Vec<_> = voters.map(|at| (others[at], refine(&carried[at], at))).collect();
-            let given = scene.train.iter().filter_map(|view| Some((view, &given.get(&view.name)?.mask)));
-            let found = outlines.iter().filter(|(_, (_, moved))| !moved).map(|(view, (mask, _))| (*view, mask));
+            let some = (0..others.len()).into_par_iter().step_by(every);
+            let outlines: Vec<_> = some.map(|at| (others[at], refine(&carried[at], at))).collect();
+            let given = voters.iter().map(|view| (*view, &given[&view.name].mask));
+            let sound = |view: &scene::View, moved: bool| !moved && !wrong.contains(view.name.as_str());
+            let found = outlines.iter().filter(|(view, (_, moved))| sound(view, *moved));
+            let found = found.map(|(view, (mask, _))| (*view, mask));
             let mut votes = masks::Votes::new(splats);
             for (view, mask) in given.chain(found) {
                 votes.add(splats, &view.camera, &masks::parts(mask, view.camera.size))?;

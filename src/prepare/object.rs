@@ -101,7 +101,7 @@ impl Drawn {
 
 impl Given {
     /// A mask that counts as it is.
-    fn fixed(mask: GrayImage, from: String) -> Self {
+    pub fn fixed(mask: GrayImage, from: String) -> Self {
         Self { mask, from, drawn: vec![] }
     }
 
