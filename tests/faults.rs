@@ -3,14 +3,14 @@
 #![cfg(target_os = "linux")]
 
 use std::fs;
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::path::PathBuf;
+use std::process::{Command, Output};
 use std::sync::LazyLock;
 use std::time::{Duration, Instant};
 
 use crate::common;
-use crate::common::place::{Files, Place, assert_same, output, succeeds, text};
-use crate::common::skip::{Lack, is_allowed, skip};
+use crate::common::place::{Files, Place, assert_same, library, output, succeeds, text};
+use crate::common::skip::{Lack, is_allowed};
 use gscream_vk::folder::LOCK;
 use rand::{RngExt as _, SeedableRng as _};
 
@@ -203,22 +203,7 @@ fn assert_one_sentence(output: &Output, disk: Disk, what: &str) {
     assert_eq!(advice, disk.errno == FULL.errno, "{what}: {stderr}");
 }
 
-/// `common/failing_disk.rs`, compiled.
-static LIBRARY: LazyLock<Option<PathBuf>> = LazyLock::new(|| {
-    let library = Path::new(env!("CARGO_TARGET_TMPDIR")).join("libfailing_disk.so");
-    let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/common/failing_disk.rs");
-    let mut rustc = Command::new(std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
-    rustc
-        .args(["--edition", "2024", "--crate-type", "cdylib", "-C", "panic=abort", "-O", "-o"])
-        .arg(&library)
-        .arg(source);
-    let Ok(done) = rustc.stdin(Stdio::null()).output() else {
-        skip(Lack::Compiler, "no rustc: no disk that fails can be made");
-        return None;
-    };
-    assert!(done.status.success(), "{}", text(&done.stderr));
-    Some(library)
-});
+static LIBRARY: LazyLock<Option<PathBuf>> = LazyLock::new(|| library("failing_disk"));
 
 #[test]
 fn a_training_killed_at_any_moment() {

@@ -10,6 +10,7 @@ mod common;
 mod compose;
 mod config;
 mod device;
+mod driver;
 mod evaluate;
 mod export;
 mod faults;

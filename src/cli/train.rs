@@ -459,6 +459,14 @@ fn finish(mut run: Run<'_>, settings: &Settings, folder: &Path, manner: &Manner)
     Ok(Trained { summary, report, written })
 }
 
+/// The trained model could not be judged.
+#[derive(Debug, thiserror::Error)]
+#[error("{source}; {how}")]
+struct Unjudged {
+    source: anyhow::Error,
+    how: String,
+}
+
 /// Judges the model of a run that has ended by all that there is to judge it by, in place of the run's own figures, makes
 /// its page, and marks the run as complete.
 fn judged(
@@ -476,7 +484,11 @@ fn judged(
         let how = || format!("`gscream-vk train --resume {}` judges the trained model", folder.display());
         let go_on = || if kept { Ok(signals::check(how)?) } else { Ok(()) };
         let measured = instruments::measure(gpu, &folder.join(MODEL), scene, settings, judge, &go_on);
-        let measured = measured.inspect_err(|_| index::of_stopped(folder))?;
+        let measured = measured.map_err(|source| {
+            index::of_stopped(folder);
+            let says = source.is::<signals::Stopped>();
+            if kept && !says { Unjudged { source, how: how() }.into() } else { source }
+        })?;
         measured.write_seen(scene, &folder.join(SEEN))?;
         measured.report.write_json(&folder.join(METRICS))?;
         trained.report = Some(measured.report);

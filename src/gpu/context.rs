@@ -63,6 +63,22 @@ impl Context {
         Ok(())
     }
 
+    /// Makes it ready to be recorded in.
+    ///
+    /// # Safety
+    /// Nothing in flight uses it.
+    ///
+    /// # Errors
+    /// When the device refuses; it can be tried again.
+    pub(super) unsafe fn begin(&mut self, device: &Device) -> Result<(), Error> {
+        let info = vk::CommandBufferBeginInfo::default().flags(vk::CommandBufferUsageFlags::ONE_TIME_SUBMIT);
+        // SAFETY: by the caller's promise.
+        unsafe {
+            self.sets.recycle(device).named("recycling descriptor sets")?;
+            device.begin_command_buffer(self.commands, &info).named("beginning a command buffer")
+        }
+    }
+
     /// # Safety
     /// Nothing in flight uses it.
     pub(super) unsafe fn destroy(self, inner: &Inner) {

@@ -114,6 +114,8 @@ pub(super) struct Inner {
     pub info: DeviceInfo,
     pub options: Options,
     pub contexts: Mutex<Vec<Context>>,
+    /// Of submissions that could not be waited for, and may run still.
+    pub stuck: Mutex<Vec<Context>>,
     pub debug: Option<ash::ext::debug_utils::Device>,
     pub ledger: Ledger,
     /// Dispatches that were kept.
@@ -221,6 +223,7 @@ impl Gpu {
             info,
             options: options.clone(),
             contexts: Mutex::default(),
+            stuck: Mutex::default(),
             ledger: Ledger::default(),
             cases: Mutex::default(),
             in_flight: Mutex::new(0),
@@ -400,12 +403,7 @@ impl Inner {
     ) -> Result<Allocation, gpu_allocator::AllocationError> {
         let mut allocator = lock(&self.allocator);
         let allocator = allocator.as_mut().expect("the allocator lives until the device is dropped");
-        let allocation = match allocator.allocate(description) {
-            Err(gpu_allocator::AllocationError::OutOfMemory) => {
-                return Err(gpu_allocator::AllocationError::OutOfMemory);
-            }
-            other => other?,
-        };
+        let allocation = allocator.allocate(description)?;
         self.ledger.take(allocation.size());
         Ok(allocation)
     }
@@ -623,7 +621,7 @@ impl Drop for Inner {
             }
             self.save_cache();
             self.empty_trash();
-            for context in lock(&self.contexts).drain(..) {
+            for context in lock(&self.contexts).drain(..).chain(lock(&self.stuck).drain(..)) {
                 context.destroy(self);
             }
         }

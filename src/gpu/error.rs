@@ -101,6 +101,9 @@ pub(super) trait Named<T> {
 
 impl<T> Named<T> for Result<T, vk::Result> {
     fn named(self, what: &'static str) -> Result<T, Error> {
-        self.map_err(|result| Error::Vulkan { what, result })
+        self.map_err(|result| match result {
+            vk::Result::ERROR_DEVICE_LOST => Error::DeviceLost { place: format!("while {what}") },
+            result => Error::Vulkan { what, result },
+        })
     }
 }

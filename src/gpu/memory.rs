@@ -4,11 +4,11 @@ use std::marker::PhantomData;
 use std::sync::Arc;
 
 use ash::vk::{self, Handle as _};
-use gpu_allocator::MemoryLocation;
 use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, AllocationScheme};
+use gpu_allocator::{AllocationError, MemoryLocation};
 
 use super::device::{Gpu, Inner};
-use super::error::{Error, Named};
+use super::error::Error;
 use super::hazards::Id;
 use super::ledger::Rehearsal;
 
@@ -265,10 +265,17 @@ impl Gpu {
             let feature = "memory (a driver without hardware compiles kernels and runs none)".to_owned();
             return Err(Error::Missing { device: self.info().name.clone(), feature });
         }
+        let full = |source| Error::OutOfMemory { name, bytes, device: self.info().name.clone(), source };
+        let refused = |result| match result {
+            vk::Result::ERROR_OUT_OF_DEVICE_MEMORY | vk::Result::ERROR_OUT_OF_HOST_MEMORY => {
+                full(AllocationError::OutOfMemory)
+            }
+            result => Error::Vulkan { what: "making a buffer", result },
+        };
         // SAFETY: the device outlives the buffer, which holds an Arc of it; the size is positive and below the limit of a binding
         // where kernels use it; memory is bound before anybody else sees it.
         let (raw, requirements) = unsafe {
-            let raw = inner.device.create_buffer(&info, None).named("creating a buffer")?;
+            let raw = inner.device.create_buffer(&info, None).map_err(refused)?;
             (raw, inner.device.get_buffer_memory_requirements(raw))
         };
         let description = AllocationCreateDesc {
@@ -283,14 +290,14 @@ impl Gpu {
             Err(source) => {
                 // SAFETY: never bound, never used.
                 unsafe { inner.device.destroy_buffer(raw, None) };
-                return Err(Error::OutOfMemory { name, bytes, device: self.info().name.clone(), source });
+                return Err(full(source));
             }
         };
         // SAFETY: a fresh buffer; the allocator was given its size, alignment and memory types.
         let bound = unsafe { inner.device.bind_buffer_memory(raw, allocation.memory(), allocation.offset()) };
         if let Err(result) = bound {
             inner.discard(raw, allocation);
-            return Err(result).named("binding a buffer's memory");
+            return Err(refused(result));
         }
         inner.name_object(raw, name);
         inner.ledger.open(raw.as_raw(), name, padded);

@@ -115,7 +115,6 @@ impl Gpu {
     }
 
     fn recorder_in(&self, mode: Mode) -> Result<Recorder<'_>, Error> {
-        // From here on the device may come to use whatever is recorded: dropped buffers wait.
         let target = match self.rehearsing() {
             Some(rehearsal) => {
                 rehearsal.began();
@@ -135,15 +134,23 @@ impl Gpu {
             mode,
             held: None,
         };
-        recorder.begin()?;
+        recorder.begin();
         Ok(recorder)
     }
 
-    /// A context that nothing uses, which counts as used from now on.
+    /// A context in recording, which counts as used from now on.
     fn begun_context(&self) -> Result<Context, Error> {
-        let context = lock(&self.inner().contexts).pop();
-        let context = context.map_or_else(|| Context::new(self), Ok)?;
-        self.inner().began();
+        let inner = self.inner();
+        let context = lock(&inner.contexts).pop();
+        let mut context = context.map_or_else(|| Context::new(self), Ok)?;
+        // From here on the device may come to use whatever is recorded: dropped buffers wait.
+        inner.began();
+        // SAFETY: not in flight: it is new, or it came from the list of those that were waited for.
+        if let Err(error) = unsafe { context.begin(&inner.device) } {
+            lock(&inner.contexts).push(context);
+            inner.ended();
+            return Err(error);
+        }
         Ok(context)
     }
 }
@@ -398,6 +405,9 @@ impl<'g> Recorder<'g> {
 
     /// Gives a pass its place: the next one, or one that is found later. A pass of a rehearsal has no work.
     fn pass(&mut self, name: &'static str, accesses: &[(Id, &'static str, Access)], work: Option<Work>) {
+        if self.error.is_some() {
+            return;
+        }
         let stage = self.stage;
         match &mut self.held {
             Some(held) => held.push(Held { name, stage, accesses: accesses.to_vec(), work }),
@@ -447,15 +457,10 @@ impl<'g> Recorder<'g> {
         self.passes.push(name);
     }
 
-    fn begin(&mut self) -> Result<(), Error> {
+    /// What comes before the first pass.
+    fn begin(&mut self) {
         let inner = self.gpu.inner();
-        let Some(Target::Device(context)) = &mut self.target else { return Ok(()) };
-        let info = vk::CommandBufferBeginInfo::default().flags(vk::CommandBufferUsageFlags::ONE_TIME_SUBMIT);
-        // SAFETY: the context is not in flight: it came from the free list or was waited for.
-        unsafe {
-            context.sets.recycle(&inner.device).named("recycling descriptor sets")?;
-            inner.device.begin_command_buffer(context.commands, &info).named("beginning a command buffer")?;
-        }
+        let Some(Target::Device(context)) = &self.target else { return };
         self.noted.clear();
         let mut commands = Commands { inner, raw: context.commands, noted: &mut self.noted };
         if inner.options.timestamps {
@@ -468,7 +473,6 @@ impl<'g> Recorder<'g> {
         commands.barrier();
         self.hazards = Hazards::default();
         self.passes.clear();
-        Ok(())
     }
 
     /// Ends the recording and gives it to the device.
@@ -514,7 +518,8 @@ impl<'g> Recorder<'g> {
         submission.start()?;
         submission.wait()?;
         self.target = Some(Target::Device(self.gpu.begun_context()?));
-        self.begin()
+        self.begin();
+        Ok(())
     }
 }
 

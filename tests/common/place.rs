@@ -1,7 +1,7 @@
 //! The program in a folder with the tiny scene: what it leaves behind, and how it ends.
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::Duration;
 
@@ -9,6 +9,8 @@ use assert_cmd::cargo::cargo_bin;
 use gscream_vk::config::Settings;
 use gscream_vk::train::checkpoint;
 use tempfile::TempDir;
+
+use super::skip::{Lack, skip};
 
 /// Files' contents by their path within a run folder, sorted.
 pub type Files = Vec<(String, Vec<u8>)>;
@@ -95,6 +97,20 @@ pub fn without_times(line: &str) -> String {
         text.replace_range(start..end, "");
     }
     text + "\n"
+}
+
+/// `tests/common/NAME.rs`, compiled to a library that a program is started with.
+pub fn library(name: &str) -> Option<PathBuf> {
+    let library = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("lib{name}.so"));
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/common/{name}.rs"));
+    let mut rustc = Command::new(std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
+    rustc.args(["--edition", "2024", "--crate-type", "cdylib", "-C", "panic=abort", "-O", "-o"]);
+    let Ok(done) = rustc.arg(&library).arg(source).stdin(Stdio::null()).output() else {
+        skip(Lack::Compiler, &format!("no rustc: {name} cannot be compiled"));
+        return None;
+    };
+    assert!(done.status.success(), "{}", text(&done.stderr));
+    Some(library)
 }
 
 pub fn text(bytes: &[u8]) -> String {

@@ -36,7 +36,7 @@ pub enum Lack {
     ProcessMemory,
     /// The program `ffmpeg`.
     Ffmpeg,
-    /// `rustc`, which the tests of a failing disk compile a library with.
+    /// `rustc`, which the tests of a failing disk and of a failing driver compile a library with.
     Compiler,
 }
 

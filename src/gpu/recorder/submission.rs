@@ -69,10 +69,10 @@ impl Submission<'_> {
             inner.device.queue_submit2(*lock(&inner.queue), &submit, context.fence)
         };
         self.submitted = result.is_ok();
-        self.lost(result)
+        self.lost(result, "submitting work")
     }
 
-    fn lost(&self, result: ash::prelude::VkResult<()>) -> Result<(), Error> {
+    fn lost(&self, result: ash::prelude::VkResult<()>, what: &'static str) -> Result<(), Error> {
         match result {
             Ok(()) => Ok(()),
             Err(vk::Result::ERROR_DEVICE_LOST) => {
@@ -80,7 +80,7 @@ impl Submission<'_> {
                 let markers = markers.and_then(|(_, allocation)| allocation.mapped_slice());
                 Err(Error::DeviceLost { place: place_of_fault(&self.passes, markers) })
             }
-            Err(result) => Err(Error::Vulkan { what: "submitting work", result }),
+            Err(result) => Err(Error::Vulkan { what, result }),
         }
     }
 
@@ -93,7 +93,7 @@ impl Submission<'_> {
         let Some(context) = self.context() else { return Ok(vec![]) };
         // SAFETY: the fence was given to the queue in `start`.
         let result = unsafe { inner.device.wait_for_fences(&[context.fence], true, u64::MAX) };
-        self.lost(result)?;
+        self.lost(result, "waiting for work")?;
         let mut timings = vec![];
         if inner.options.timestamps && inner.info.timestamp_period > 0.0 {
             let timed = self.passes.len().min(MAX_PASSES as usize);
@@ -149,9 +149,8 @@ impl Drop for Submission<'_> {
             // SAFETY: the fence was given to the queue in `start`.
             let waited = unsafe { inner.device.wait_for_fences(&[context.fence], true, u64::MAX) };
             if !is_over(waited) {
-                // It may run still: neither the context nor any buffer may be used again or freed, as long as this
-                // process has the device.
-                std::mem::forget(context);
+                // It may run still: neither the context nor any buffer may be used again or freed before the device is idle.
+                lock(&inner.stuck).push(context);
                 return;
             }
             // SAFETY: nothing runs that would signal the fence, and nobody else waits for it.
@@ -230,7 +229,7 @@ mod tests {
             let mut submission = rec.submit().expect("the device takes it");
             gpu.wait_idle().expect("the device runs it");
             submission.passes.push("primitives/scan");
-            let said = submission.lost(Err(vk::Result::ERROR_DEVICE_LOST)).expect_err("lost").to_string();
+            let said = submission.lost(Err(vk::Result::ERROR_DEVICE_LOST), "").expect_err("lost").to_string();
             submission.wait().expect("it is not");
             said
         };
