@@ -266,6 +266,9 @@ fn a_round_of_growth_at_allocations_that_fail() {
     let next = last + trace[last..].iter().position(|name| name.starts_with("render/")).expect("a step follows");
     let (before, within) = (allocations(&trace[..first]), allocations(&trace[first..next]));
     assert!(within > 100, "{within} allocations");
+    // The candidates of all levels, the free cells of each of three, what grows, who is pruned, and what is left.
+    let submissions = trace[first..next].iter().filter(|name| *name == "vkQueueSubmit2").count();
+    assert!(submissions <= 7, "{submissions} submissions");
     let fault = |moment: usize| {
         let at = before + 1 + moment * (within - 1) / (MOMENTS - 1);
         let result = [DEVICE_MEMORY, HOST_MEMORY][moment % 2];

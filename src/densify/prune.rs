@@ -1,7 +1,7 @@
 //! Anchors that stay transparent go.
 
 use crate::gpu::kernels::densify::{prune, prune_cap, prune_gather};
-use crate::gpu::{Buffer, Error, Gpu, Reference};
+use crate::gpu::{Buffer, Error, Gpu, Recorder, Reference};
 use crate::model::anchors::Anchors;
 use crate::primitives::{Compact, Count};
 
@@ -46,22 +46,22 @@ impl Reference for prune_cap::Kernel {
 }
 
 /// Moves the rows `kept` of `buffer` together, in order, by way of a fresh buffer of the same size that takes its place.
+/// Where there is no room for a second model, there is for one array at a time.
 fn gather<T: bytemuck::Pod>(
-    gpu: &Gpu,
+    rec: &mut Recorder<'_>,
     kept: &Buffer<u32>,
     rows: u32,
     width: u32,
     buffer: &mut Buffer<T>,
 ) -> Result<(), Error> {
+    rec.make_room(buffer.bytes())?;
+    let gpu = rec.gpu();
     let fresh: Buffer<T> = gpu.stage(buffer.stage(), || gpu.buffer(buffer.name(), buffer.len()))?;
-    let mut rec = gpu.recorder()?;
     // What lies behind the rows stays initialised: the optimiser works in whole vectors.
     rec.zero(&fresh);
     let buffers = prune_gather::Buffers { kept, from: &buffer.view(), to: &fresh.view() };
     let words = u64::from(rows) * u64::from(width);
     rec.run(prune_gather::Kernel, buffers, prune_gather::Push { rows, width }, words as usize);
-    // One array at a time: pruning needs room for one more, not for a second model.
-    rec.submit()?.wait()?;
     *buffer = fresh;
     Ok(())
 }
@@ -84,29 +84,33 @@ pub fn run(gpu: &Gpu, anchors: &mut Anchors, statistics: &mut Statistics, config
     let push = prune::Push { anchors: n, min_visits: config.min_anchor_visits, min_opacity: config.min_opacity as f32 };
     rec.run(prune::Kernel, buffers, push, n);
     compact.record(&mut rec, &keep, &kept, &kept_count, Count::Host(n));
-    rec.submit()?.wait()?;
+    let kept_count = rec.read_back(&kept_count)?;
+    rec.flush()?;
     let rows = gpu.read(&kept_count)?[0];
+    let cap = config.max_log_scaling as f32;
+    if rows == n && cap == f32::INFINITY {
+        return Ok(0);
+    }
     if rows < n {
-        gather(gpu, &kept, rows, 3, &mut anchors.position)?;
+        let rec = &mut rec;
+        gather(rec, &kept, rows, 3, &mut anchors.position)?;
         for parameter in anchors.parameters_mut() {
             let width = parameter.width;
             for tensor in parameter.tensors_mut() {
-                gather(gpu, &kept, rows, width, tensor)?;
+                gather(rec, &kept, rows, width, tensor)?;
             }
         }
-        gather(gpu, &kept, rows, offsets, &mut statistics.gradient)?;
-        gather(gpu, &kept, rows, offsets, &mut statistics.seen)?;
-        gather(gpu, &kept, rows, 1, &mut statistics.opacity_sum)?;
-        gather(gpu, &kept, rows, 1, &mut statistics.visits)?;
+        gather(rec, &kept, rows, offsets, &mut statistics.gradient)?;
+        gather(rec, &kept, rows, offsets, &mut statistics.seen)?;
+        gather(rec, &kept, rows, 1, &mut statistics.opacity_sum)?;
+        gather(rec, &kept, rows, 1, &mut statistics.visits)?;
         anchors.count = rows;
     }
-    let cap = config.max_log_scaling as f32;
     if cap < f32::INFINITY {
-        let mut rec = gpu.recorder()?;
         let buffers = prune_cap::Buffers { log_scaling: &anchors.log_scaling().value };
         rec.run(prune_cap::Kernel, buffers, prune_cap::Push { anchors: rows, cap }, rows);
-        rec.submit()?.wait()?;
     }
+    rec.submit()?.wait()?;
     Ok(n - rows)
 }
 

@@ -106,18 +106,17 @@ impl Statistics {
         self.visits.len() as u32
     }
 
-    /// Makes room for `capacity` anchors, of which the first `count` keep their statistics; zero for the others. An array
-    /// at a time, with nothing in flight.
+    /// Makes room for `capacity` anchors, of which the first `count` keep their statistics; zero for the others.
     ///
     /// # Errors
-    /// As [`Gpu::buffer`].
-    pub fn reserve(&mut self, gpu: &Gpu, count: u32, capacity: u32) -> Result<(), Error> {
+    /// As [`lengthen`].
+    pub fn reserve(&mut self, rec: &mut Recorder<'_>, count: u32, capacity: u32) -> Result<(), Error> {
         let [kept, anchors] = [count, capacity].map(|n| n as usize);
         let offsets = self.offsets as usize;
-        lengthen(gpu, &mut self.gradient, anchors * offsets, kept * offsets)?;
-        lengthen(gpu, &mut self.seen, anchors * offsets, kept * offsets)?;
-        lengthen(gpu, &mut self.opacity_sum, anchors, kept)?;
-        lengthen(gpu, &mut self.visits, anchors, kept)
+        lengthen(rec, &mut self.gradient, anchors * offsets, kept * offsets)?;
+        lengthen(rec, &mut self.seen, anchors * offsets, kept * offsets)?;
+        lengthen(rec, &mut self.opacity_sum, anchors, kept)?;
+        lengthen(rec, &mut self.visits, anchors, kept)
     }
 
     /// Adds a step: for each Gaussian drawn (it touches a tile, so it exists and lies in front of the near plane) the

@@ -157,6 +157,20 @@ impl Gpu {
         Ok(buffer)
     }
 
+    /// A few elements that stay as they are, written by the host: nothing is submitted for them. They lie in the device's
+    /// memory where the host can write there.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub fn constant<T: bytemuck::Pod>(&self, name: &'static str, data: &[T]) -> Result<Buffer<T>, Error> {
+        let mut buffer = self.allocate(name, data.len(), MemoryLocation::CpuToGpu)?;
+        if self.rehearsing().is_none() {
+            let data = bytemuck::cast_slice(data);
+            buffer.mapped_mut().expect("the host sees this memory")[..data.len()].copy_from_slice(data);
+        }
+        Ok(buffer)
+    }
+
     /// Overwrites the first `data.len()` elements and waits.
     ///
     /// # Errors

@@ -115,16 +115,9 @@ impl Gpu {
     }
 
     fn recorder_in(&self, mode: Mode) -> Result<Recorder<'_>, Error> {
-        let target = match self.rehearsing() {
-            Some(rehearsal) => {
-                rehearsal.began();
-                Target::Books(rehearsal.clone())
-            }
-            None => Target::Device(self.begun_context()?),
-        };
         let mut recorder = Recorder {
             gpu: self,
-            target: Some(target),
+            target: Some(self.target()?),
             stage: self.ledger().stage(),
             hazards: Hazards::default(),
             schedule: Schedule::default(),
@@ -136,6 +129,16 @@ impl Gpu {
         };
         recorder.begin();
         Ok(recorder)
+    }
+
+    fn target(&self) -> Result<Target, Error> {
+        match self.rehearsing() {
+            Some(rehearsal) => {
+                rehearsal.began();
+                Ok(Target::Books(rehearsal.clone()))
+            }
+            None => Ok(Target::Device(self.begun_context()?)),
+        }
     }
 
     /// A context in recording, which counts as used from now on.
@@ -513,13 +516,39 @@ impl<'g> Recorder<'g> {
         &self.schedule
     }
 
-    fn flush(&mut self) -> Result<(), Error> {
+    /// Runs what was recorded so far, to its end, and goes on behind it. Buffers that were dropped meanwhile are free then.
+    ///
+    /// # Errors
+    /// As [`Recorder::submit`] and [`Submission::wait`].
+    pub fn flush(&mut self) -> Result<(), Error> {
+        if let Some(error) = self.error.take() {
+            return Err(error);
+        }
         let mut submission = self.hand_over();
         submission.start()?;
         submission.wait()?;
-        self.target = Some(Target::Device(self.gpu.begun_context()?));
+        self.target = Some(self.gpu.target()?);
         self.begin();
         Ok(())
+    }
+
+    /// Flushes if a buffer of so many bytes beside what was dropped would take more memory than there ever was.
+    ///
+    /// # Errors
+    /// As [`Recorder::flush`].
+    pub fn make_room(&mut self, bytes: u64) -> Result<(), Error> {
+        let (now, peak) = self.gpu.memory();
+        if now + bytes > peak { self.flush() } else { Ok(()) }
+    }
+
+    /// A copy of a buffer as it is at this point, on the host: once this was run [`Gpu::read`] gives it and submits nothing.
+    ///
+    /// # Errors
+    /// As [`Gpu::readback`].
+    pub fn read_back<T: bytemuck::Pod>(&mut self, buffer: &Buffer<T>) -> Result<Buffer<T>, Error> {
+        let host = self.gpu.readback(buffer.name(), buffer.len())?;
+        self.copy(buffer, &host, buffer.len());
+        Ok(host)
     }
 }
 

@@ -2,7 +2,7 @@
 
 use super::arrays::{self, ARRAYS, Array};
 use super::parameter::{Parameter, lengthen};
-use crate::gpu::{Buffer, Error, Gpu};
+use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::optimizer::Group;
 
 /// The anchors, with room for `capacity`; the first `count` are in use. Their positions do not move.
@@ -81,15 +81,15 @@ impl Anchors {
         self.of(Group::LogScaling)
     }
 
-    /// Makes room for `capacity` anchors and keeps what there is, an array at a time: beside the model only the largest of
-    /// its arrays exists twice. Nothing that uses the anchors may be in flight.
+    /// Makes room for `capacity` anchors and keeps what there is. Arrays exist twice until this was run, as far as they have
+    /// room: an array at a time where there is none.
     ///
     /// # Errors
-    /// As [`Gpu::buffer`]; the anchors are the same then, some of their arrays longer.
-    pub fn reserve(&mut self, gpu: &Gpu, capacity: u32) -> Result<(), Error> {
+    /// As [`lengthen`].
+    pub fn reserve(&mut self, rec: &mut Recorder<'_>, capacity: u32) -> Result<(), Error> {
         let (capacity, count) = (capacity.max(self.count), self.count);
-        lengthen(gpu, &mut self.position, capacity as usize, count as usize)?;
-        self.parameters.iter_mut().try_for_each(|parameter| parameter.reserve(gpu, capacity, count))?;
+        lengthen(rec, &mut self.position, capacity as usize, count as usize)?;
+        self.parameters.iter_mut().try_for_each(|parameter| parameter.reserve(rec, capacity, count))?;
         self.capacity = capacity;
         Ok(())
     }
@@ -126,7 +126,9 @@ mod tests {
         );
         let mut anchors = Anchors::upload(&gpu, &model, 0).unwrap();
         assert_eq!(anchors.read(&gpu).unwrap(), model);
-        anchors.reserve(&gpu, 20).unwrap();
+        let mut rec = gpu.recorder().unwrap();
+        anchors.reserve(&mut rec, 20).unwrap();
+        rec.submit().unwrap().wait().unwrap();
         assert_eq!((anchors.count, anchors.capacity), (7, 20));
         assert_eq!(anchors.read(&gpu).unwrap(), model);
         assert_eq!(gpu.read(&anchors.offset().root).unwrap(), vec![0.0; 600]);

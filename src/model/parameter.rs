@@ -3,7 +3,7 @@
 //! A model is a list of these. Whatever handles parameters iterates over the list: zeroing of gradients, the search for
 //! values that are not finite, Adam, growth and pruning, checkpoints, read-back.
 
-use crate::gpu::{Buffer, Error, Gpu};
+use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::optimizer::Group;
 
 /// Names of a parameter's buffers.
@@ -141,14 +141,13 @@ impl Parameter {
         Ok(())
     }
 
-    /// Makes room for `rows`, of which the first `kept` stay; a buffer at a time, with nothing in flight. The others' values
-    /// and moments are zero.
+    /// Makes room for `rows`, of which the first `kept` stay. The others' values and moments are zero.
     ///
     /// # Errors
-    /// As [`Gpu::buffer`]; the rows are the same then, some of the buffers longer.
-    pub fn reserve(&mut self, gpu: &Gpu, rows: u32, kept: u32) -> Result<(), Error> {
+    /// As [`lengthen`].
+    pub fn reserve(&mut self, rec: &mut Recorder<'_>, rows: u32, kept: u32) -> Result<(), Error> {
         let (len, kept) = (Self::room(rows, self.width), kept as usize * self.width as usize);
-        self.tensors_mut().into_iter().try_for_each(|tensor| lengthen(gpu, tensor, len, kept))
+        self.tensors_mut().into_iter().try_for_each(|tensor| lengthen(rec, tensor, len, kept))
     }
 
     /// Value and moments.
@@ -173,13 +172,18 @@ impl Parameter {
 /// Puts `buffer` into one of `len` elements: the first `kept` as they are, zero behind them.
 ///
 /// # Errors
-/// As [`Gpu::buffer`].
-pub fn lengthen<T: bytemuck::Pod>(gpu: &Gpu, buffer: &mut Buffer<T>, len: usize, kept: usize) -> Result<(), Error> {
+/// As [`Gpu::buffer`]. What was recorded before is lost then, and with it what buffers that were made longer held.
+pub fn lengthen<T: bytemuck::Pod>(
+    rec: &mut Recorder<'_>,
+    buffer: &mut Buffer<T>,
+    len: usize,
+    kept: usize,
+) -> Result<(), Error> {
+    rec.make_room((len * size_of::<T>()) as u64)?;
+    let gpu = rec.gpu();
     let longer = gpu.stage(buffer.stage(), || gpu.buffer(buffer.name(), len))?;
-    let mut rec = gpu.recorder()?;
     rec.zero(&longer);
     rec.copy(buffer, &longer, kept);
-    rec.submit()?.wait()?;
     *buffer = longer;
     Ok(())
 }

@@ -137,7 +137,7 @@ pub(super) struct Blocks {
 impl Blocks {
     /// Workgroups of `group` threads for blocks of `items`.
     pub(super) fn new(gpu: &Gpu, capacity: u32, group: u32, items: u32) -> Result<Self, Error> {
-        Ok(Self { host: gpu.upload("count", &[u32::MAX])?, groups: groups(gpu, "groups", group)?, capacity, items })
+        Ok(Self { host: gpu.constant("count", &[u32::MAX])?, groups: groups(gpu, "groups", group)?, capacity, items })
     }
 
     /// Where kernels read the count, what they clamp it to, and the dispatch.

@@ -14,7 +14,7 @@ use super::{Config, Statistics};
 use crate::gpu::kernels::densify::{
     grow_append, grow_candidates, grow_cells, grow_heads, grow_keys, grow_lots, grow_occupied, grow_reset, grow_words,
 };
-use crate::gpu::{Buffer, Error, Gpu};
+use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::model::anchors::Anchors;
 use crate::model::arrays::ARRAYS;
 use crate::primitives::{Compact, Count, Pairs, Sort};
@@ -41,6 +41,16 @@ pub struct Round {
     pub seed: u64,
     /// Of the training: every round draws other numbers.
     pub step: u32,
+}
+
+/// The Gaussians of the anchors there are that ask for an anchor in a level's cells.
+struct Listed {
+    /// `[candidate]` their places among [anchor, offset].
+    candidates: Buffer<u32>,
+    /// Their number, on the host.
+    count: Buffer<u32>,
+    /// The lowest and the highest of their cells, and how many lie beyond the grid, on the host.
+    bounds: Buffer<i32>,
 }
 
 /// Cells of a level and the candidates in them, on the device.
@@ -74,69 +84,70 @@ fn fold(seed: u64) -> u32 {
     (seed ^ (seed >> 32)) as u32
 }
 
-/// The candidates of a level among the Gaussians of the first `judged` anchors, sorted into cells; `None` without any.
-/// Also how many lie beyond the grid.
-fn cells(
-    gpu: &Gpu,
+/// Finds the candidates of all levels.
+fn list(
+    rec: &mut Recorder<'_>,
     anchors: &Anchors,
     statistics: &Statistics,
-    judged: u32,
     config: &Config,
     round: Round,
-    level: u32,
-) -> Result<(Option<Cells>, u32), Error> {
-    let (_, inverse_size, _) = sizes(config, round.voxel, level);
+    levels: u32,
+) -> Result<Vec<Listed>, Error> {
+    let gpu = rec.gpu();
+    let slots = anchors.count * anchors.offsets;
+    let offset = anchors.offset().value.view::<[f32; 3]>();
+    let flags = gpu.buffer("candidate_flags", slots as usize)?;
+    let compact = Compact::new(gpu, slots)?;
+    let count = gpu.buffer("candidate_count", 1)?;
+    let bounds = gpu.buffer::<i32>("candidate_bounds", 7)?;
+    let list = |level| {
+        let candidates = gpu.buffer("candidates", slots as usize)?;
+        rec.fill_range(&bounds, 0, 3, i32::MAX as u32);
+        rec.fill_range(&bounds, 3, 3, i32::MIN as u32);
+        rec.zero_range(&bounds, 6, 1);
+        let buffers = grow_candidates::Buffers {
+            gradient: &statistics.gradient,
+            seen: &statistics.seen,
+            position: &anchors.position,
+            offset: &offset,
+            log_scaling: &anchors.log_scaling().value,
+            flags: &flags,
+            bounds: &bounds,
+        };
+        let push = grow_candidates::Push {
+            slots,
+            offsets: anchors.offsets,
+            threshold: (config.gradient_threshold * f64::from(1 << level)) as f32,
+            min_seen: config.min_slot_visits,
+            level,
+            step: round.step,
+            seed: fold(round.seed),
+            inverse_size: sizes(config, round.voxel, level).1,
+        };
+        rec.run(grow_candidates::Kernel, buffers, push, slots);
+        compact.record(rec, &flags, &candidates, &count, Count::Host(slots));
+        Ok(Listed { candidates, count: rec.read_back(&count)?, bounds: rec.read_back(&bounds)? })
+    };
+    (0..levels).map(list).collect()
+}
+
+/// The candidates of a level, sorted into cells.
+fn cells(
+    rec: &mut Recorder<'_>,
+    anchors: &Anchors,
+    candidates: Buffer<u32>,
+    found: u32,
+    bounds: &[i32],
+    inverse_size: f32,
+) -> Result<Cells, Error> {
+    let gpu = rec.gpu();
     let offsets = anchors.offsets;
-    let slots = judged * offsets;
     let position = &anchors.position;
     let offset = anchors.offset().value.view::<[f32; 3]>();
     let log_scaling = &anchors.log_scaling().value;
-
-    let flags = gpu.buffer("candidate_flags", slots as usize)?;
-    let listed = gpu.buffer("candidates", slots as usize)?;
-    let count = gpu.buffer("candidate_count", 1)?;
-    let bounds = gpu.upload("candidate_bounds", &[i32::MAX, i32::MAX, i32::MAX, i32::MIN, i32::MIN, i32::MIN, 0])?;
-    let compact = Compact::new(gpu, slots)?;
-    let mut rec = gpu.recorder()?;
-    let buffers = grow_candidates::Buffers {
-        gradient: &statistics.gradient,
-        seen: &statistics.seen,
-        position,
-        offset: &offset,
-        log_scaling,
-        flags: &flags,
-        bounds: &bounds,
-    };
-    let push = grow_candidates::Push {
-        slots,
-        offsets,
-        threshold: (config.gradient_threshold * f64::from(1 << level)) as f32,
-        min_seen: config.min_slot_visits,
-        level,
-        step: round.step,
-        seed: fold(round.seed),
-        inverse_size,
-    };
-    rec.run(grow_candidates::Kernel, buffers, push, slots);
-    compact.record(&mut rec, &flags, &listed, &count, Count::Host(slots));
-    rec.submit()?.wait()?;
-    let found = gpu.read(&count)?[0];
-    let bounds = gpu.read(&bounds)?;
-    let beyond = bounds[6] as u32;
-    if found == 0 {
-        return Ok((None, beyond));
-    }
     let [low, high]: [[i32; 3]; 2] = [0, 3].map(|at| std::array::from_fn(|i| bounds[at + i]));
     let bits: [u32; 3] = std::array::from_fn(|i| ((high[i] - low[i]) as u32).checked_ilog2().map_or(0, |top| top + 1));
 
-    // The list as short as it is: the long one goes before more memory is taken.
-    let candidates = gpu.buffer("candidates", found as usize)?;
-    let mut rec = gpu.recorder()?;
-    rec.copy(&listed, &candidates, found as usize);
-    rec.submit()?.wait()?;
-    drop((listed, flags, compact));
-
-    let mut rec = gpu.recorder()?;
     let keys = gpu.buffer("cell_keys", found as usize)?;
     let words = gpu.buffer("cell_words", found as usize)?;
     let buffers = grow_keys::Buffers {
@@ -158,11 +169,11 @@ fn cells(
         let pairs = Pairs { keys: &words, values: &order };
         let range = 0..bits_left.min(32);
         let sorted = if word == 0 {
-            sort.record_indices(&mut rec, pairs, Count::Host(found), range)
+            sort.record_indices(rec, pairs, Count::Host(found), range)
         } else {
             let buffers = grow_words::Buffers { keys: &keys, order: &order, words: &words };
             rec.run(grow_words::Kernel, buffers, grow_words::Push { found, word }, found);
-            sort.record(&mut rec, pairs, Count::Host(found), range)
+            sort.record(rec, pairs, Count::Host(found), range)
         };
         if !std::ptr::eq(sorted.values, &order) {
             rec.copy(sorted.values, &order, found as usize);
@@ -179,7 +190,7 @@ fn cells(
     let cell_count = gpu.buffer("cell_count", 1)?;
     let buffers = grow_heads::Buffers { keys: &keys, order: &order, flags: &flags };
     rec.run(grow_heads::Kernel, buffers, grow_heads::Push { found }, found);
-    compact.record(&mut rec, &flags, &heads, &cell_count, Count::Host(found));
+    compact.record(rec, &flags, &heads, &cell_count, Count::Host(found));
     let cells = gpu.buffer("cells", found as usize)?;
     let buffers = grow_cells::Buffers {
         keys: &keys,
@@ -195,35 +206,40 @@ fn cells(
     rec.run(grow_occupied::Kernel, buffers, push, anchors.count);
     let free = gpu.buffer("free_cells", found as usize)?;
     let free_count = gpu.buffer("free_count", 1)?;
-    compact.record(&mut rec, &flags, &free, &free_count, Count::Device(&cell_count));
-    rec.submit()?.wait()?;
+    compact.record(rec, &flags, &free, &free_count, Count::Device(&cell_count));
+    let free_count = rec.read_back(&free_count)?;
+    rec.flush()?;
     let free_count = gpu.read(&free_count)?[0];
-    let cells = Cells { found, low, bits, candidates, order, heads, cells, cell_count, free, free_count };
-    Ok((Some(cells), beyond))
+    Ok(Cells { found, low, bits, candidates, order, heads, cells, cell_count, free, free_count })
 }
 
 /// The free cells in an order drawn by lot: the first of them are a fair choice.
-fn draw_lots(gpu: &Gpu, cells: &Cells, round: Round, level: u32) -> Result<Buffer<u32>, Error> {
+fn draw_lots(rec: &mut Recorder<'_>, cells: &Cells, round: Round, level: u32) -> Result<Buffer<u32>, Error> {
+    let gpu = rec.gpu();
     let lots = gpu.buffer("lots", cells.free_count as usize)?;
     let drawn = gpu.buffer("drawn_cells", cells.found as usize)?;
     let sort = Sort::new(gpu, cells.free_count)?;
-    let mut rec = gpu.recorder()?;
     let push = grow_lots::Push { cells: cells.free_count, level, step: round.step, seed: fold(round.seed) };
     rec.run(grow_lots::Kernel, grow_lots::Buffers { lots: &lots }, push, cells.free_count);
     let pairs = Pairs { keys: &lots, values: &cells.free };
-    let sorted = sort.record(&mut rec, pairs, Count::Host(cells.free_count), 0..32);
+    let sorted = sort.record(rec, pairs, Count::Host(cells.free_count), 0..32);
     rec.copy(sorted.values, &drawn, cells.free_count as usize);
-    rec.submit()?.wait()?;
     Ok(drawn)
 }
 
 /// Makes room for `count` anchors and a sixteenth more, at most `most`. Memory follows the anchors closely: a round comes
 /// every so many steps, and costs a copy of the model at most.
-fn reserve(gpu: &Gpu, anchors: &mut Anchors, statistics: &mut Statistics, count: u32, most: u32) -> Result<(), Error> {
+fn reserve(
+    rec: &mut Recorder<'_>,
+    anchors: &mut Anchors,
+    statistics: &mut Statistics,
+    count: u32,
+    most: u32,
+) -> Result<(), Error> {
     if count > anchors.capacity {
         let capacity = count.saturating_add(count / 16).min(most).max(count);
-        statistics.reserve(gpu, anchors.count, capacity)?;
-        anchors.reserve(gpu, capacity)?;
+        statistics.reserve(rec, anchors.count, capacity)?;
+        anchors.reserve(rec, capacity)?;
     }
     Ok(())
 }
@@ -263,22 +279,28 @@ fn run_levels(
         0 => Anchors::most(gpu, anchors.offsets),
         limit => limit.min(Anchors::most(gpu, anchors.offsets)),
     };
-    for level in 0..levels {
-        let (cells, beyond) = cells(gpu, anchors, statistics, judged, config, round, level)?;
-        grown.beyond += beyond;
-        let Some(mut cells) = cells else { continue };
+    let mut rec = gpu.recorder()?;
+    let listed = list(&mut rec, anchors, statistics, config, round, levels)?;
+    rec.flush()?;
+    for (level, Listed { candidates, count, bounds }) in (0..).zip(listed) {
+        let bounds = gpu.read(&bounds)?;
+        grown.beyond += bounds[6] as u32;
+        let found = gpu.read(&count)?[0];
+        if found == 0 {
+            continue;
+        }
+        let (size, inverse_size, log_size) = sizes(config, round.voxel, level);
+        let mut cells = cells(&mut rec, anchors, candidates, found, &bounds, inverse_size)?;
         let added = cells.free_count.min(most.saturating_sub(anchors.count));
         grown.refused += cells.free_count - added;
         if added == 0 {
             continue;
         }
         if added < cells.free_count {
-            cells.free = draw_lots(gpu, &cells, round, level)?;
+            cells.free = draw_lots(&mut rec, &cells, round, level)?;
         }
         let (first, offsets) = (anchors.count, anchors.offsets);
-        reserve(gpu, anchors, statistics, first + added, most)?;
-        let mut rec = gpu.recorder()?;
-        let (size, _, log_size) = sizes(config, round.voxel, level);
+        reserve(&mut rec, anchors, statistics, first + added, most)?;
         let buffers = grow_append::Buffers {
             free_cells: &cells.free,
             cells: &cells.cells,
@@ -306,11 +328,9 @@ fn run_levels(
         rec.zero_range(&statistics.seen, at * offsets as usize, len * offsets as usize);
         rec.zero_range(&statistics.opacity_sum, at, len);
         rec.zero_range(&statistics.visits, at, len);
-        rec.submit()?.wait()?;
         anchors.count += added;
         grown.added += added;
     }
-    let mut rec = gpu.recorder()?;
     let buffers = grow_reset::Buffers { gradient: &statistics.gradient, seen: &statistics.seen };
     let push = grow_reset::Push { slots: judged * anchors.offsets, min_seen: config.min_slot_visits };
     rec.run(grow_reset::Kernel, buffers, push, push.slots);
