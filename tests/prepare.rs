@@ -89,7 +89,7 @@ fn one_box_becomes_a_scene() {
     let given = VIEWS / 2;
     let around = bounds(&mask(&truth(&folder, given)), 4);
     let mut request = Request::new(folder.path().join("photos"), &out);
-    request.object = vec![(name(given), Evidence::Box(around))];
+    request.objects[0].evidence = vec![(name(given), Evidence::Box(around))];
     (request.fit_steps, request.fit_side) = (250, 112);
     // The view of which the built-in scene knows what is behind the object.
     request.reference = Some(name(given));

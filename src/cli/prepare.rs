@@ -8,7 +8,7 @@ use super::{next, signals};
 use crate::folder::Lock;
 use crate::prepare::click::MOST_POINTS;
 use crate::prepare::shadow::Answer;
-use crate::prepare::{self, Evidence, Request, Step, Watch, video};
+use crate::prepare::{self, Evidence, Object, Request, Step, Watch, video};
 use crate::signal::Signal;
 
 /// Make a scene of photographs and one mask: cameras, masks for all views, depth, a reference view without the object
@@ -28,6 +28,7 @@ use crate::signal::Signal;
   gscream-vk prepare clip.mp4 --out scene --box frame_0001=310,220,540,470
   gscream-vk prepare photos --out scene --click IMG_0012=430,340 --not IMG_0012=520,460
   gscream-vk prepare photos --out scene --mask IMG_0012=a.png --mask IMG_0040=b.png --reference IMG_0025
+  gscream-vk prepare photos --out scene --object pot --mask IMG_0012=a.png --object ball --box IMG_0005=310,220,540,470
   gscream-vk prepare photos --out scene --only masks --mask IMG_0012=better.png")]
 pub(super) struct Args {
     /// Folder of photographs, or a video
@@ -78,9 +79,18 @@ pub(super) struct Args {
     device: DeviceArgs,
 }
 
-/// The object, by files and numbers.
-#[derive(Debug, Clone, Default, clap::Args)]
-pub(super) struct ObjectArgs {
+/// Objects, by files and numbers: the one without a name first.
+#[derive(Debug, Clone, Default)]
+pub(super) struct ObjectArgs(pub Vec<Object>);
+
+/// See [`ObjectArgs`].
+#[derive(Debug, clap::Args)]
+struct Marks {
+    /// Name of another object, which the marks behind it are of, up to the next --object; those before the first are one object
+    ///
+    /// Each object is looked for by itself in the photographs where it has no mark, and all are removed.
+    #[arg(long, value_name = "OBJECT", value_parser = object_name)]
+    object: Vec<String>,
     /// Mask of one view: a picture that is not black on the object; may be given many times
     #[arg(long, value_name = "NAME=FILE", value_parser = mask)]
     mask: Vec<(String, Evidence)>,
@@ -152,11 +162,62 @@ impl ShadowArgs {
 }
 
 impl ObjectArgs {
-    /// All of it, by the name of a view.
-    pub fn evidence(&self) -> Vec<(String, Evidence)> {
-        let Self { mask, bounds, strokes, lasso, click, not } = self;
-        [mask, bounds, strokes, lasso, click, not].into_iter().flatten().cloned().collect()
+    /// Whether nothing is marked.
+    pub fn is_empty(&self) -> bool {
+        self.0.iter().all(|object| object.evidence.is_empty())
     }
+
+    /// Names of the views that have a mark.
+    pub fn views(&self) -> impl Iterator<Item = &String> {
+        self.0.iter().flat_map(|object| object.evidence.iter().map(|(view, _)| view))
+    }
+}
+
+impl clap::Args for ObjectArgs {
+    fn augment_args(command: clap::Command) -> clap::Command {
+        Marks::augment_args(command)
+    }
+    fn augment_args_for_update(command: clap::Command) -> clap::Command {
+        Marks::augment_args_for_update(command)
+    }
+}
+
+impl clap::FromArgMatches for ObjectArgs {
+    /// A mark is of the object that was named last before it.
+    fn from_arg_matches(matches: &clap::ArgMatches) -> Result<Self, clap::Error> {
+        let places = |id: &str| matches.indices_of(id).into_iter().flatten();
+        let begins: Vec<usize> = places("object").collect();
+        let last = |place: usize| begins.iter().filter(|begin| **begin < place).count();
+        let Marks { object, mask, bounds, strokes, lasso, click, not } = Marks::from_arg_matches(matches)?;
+        let mut all = vec![Object::default()];
+        for name in &object {
+            if all[1..].iter().all(|other| other.name != *name) {
+                all.push(Object { name: name.clone(), delivered: false, ..Object::default() });
+            }
+        }
+        let kinds = [("mask", mask), ("bounds", bounds), ("strokes", strokes), ("lasso", lasso), ("click", click)];
+        for (id, marks) in kinds.into_iter().chain([("not", not)]) {
+            for (place, mark) in places(id).zip(marks) {
+                let name = last(place).checked_sub(1).map_or("", |number| &object[number]);
+                all.iter_mut().filter(|object| object.name == name).for_each(|own| own.evidence.push(mark.clone()));
+            }
+        }
+        if let Some(bare) = all[1..].iter().find(|object| object.evidence.is_empty()) {
+            let why =
+                format!("--object {:?}: nothing marks it; put --mask, --box or another mark behind it\n", bare.name);
+            return Err(clap::Error::raw(clap::error::ErrorKind::ValueValidation, why));
+        }
+        Ok(Self(all))
+    }
+    fn update_from_arg_matches(&mut self, matches: &clap::ArgMatches) -> Result<(), clap::Error> {
+        *self = Self::from_arg_matches(matches)?;
+        Ok(())
+    }
+}
+
+fn object_name(text: &str) -> Result<String, String> {
+    let name = Object::checked_name(text).ok_or("a name is one line of 1 to 40 characters")?;
+    Ok(name.to_owned())
 }
 
 fn named(text: &str) -> Result<(String, String), String> {
@@ -238,7 +299,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         args.photographs.clone()
     };
     let request = Request {
-        object: args.object.evidence(),
+        objects: args.object.0.clone(),
         reference: args.reference.clone(),
         only: args.only.clone(),
         depth: !args.no_depth,
@@ -333,5 +394,33 @@ mod tests {
         assert_eq!(mask("x=not/there.png"), Ok(("x".into(), Evidence::Mask("not/there.png".into()))));
         assert_eq!(pixels("x=y=1,2"), Ok(("x=y".into(), vec![1, 2])));
         assert!(mask("x").is_err() && mask("=a.png").is_err() && pixels("x=").is_err());
+    }
+
+    /// Of whatever kind it is, and however often an object is named.
+    #[test]
+    fn a_mark_is_of_the_object_named_last_before_it() {
+        #[derive(clap::Parser)]
+        struct Line {
+            #[command(flatten)]
+            object: ObjectArgs,
+        }
+        let of = |line: &str| {
+            let parsed = <Line as clap::Parser>::try_parse_from(line.split(' '));
+            parsed.map(|line| {
+                line.object.0.into_iter().map(|own| (own.name, own.evidence.len(), own.delivered)).collect()
+            })
+        };
+        let objects = |all: &[(&str, usize)]| -> Vec<(String, usize, bool)> {
+            all.iter().map(|(name, marks)| ((*name).to_owned(), *marks, name.is_empty())).collect()
+        };
+        let read = |line: &str| -> Vec<(String, usize, bool)> { of(line).expect(line) };
+        assert_eq!(read("prepare --click a=1,2 --mask a:b=c.png"), objects(&[("", 2)]));
+        let line = "prepare --click a=1,2 --object pot --box b=1,2,3,4 --click b=2,3 --object=ball --click=a=3,4";
+        assert_eq!(read(line), objects(&[("", 1), ("pot", 2), ("ball", 1)]));
+        let again = format!("{line} --object pot --not b=1,1");
+        assert_eq!(read(&again), objects(&[("", 1), ("pot", 3), ("ball", 1)]));
+        let why = of("prepare --object pot --object ball --click a=1,2").unwrap_err().to_string();
+        assert!(why.contains("--object \"pot\": nothing marks it"), "{why}");
+        assert!(of("prepare --object= --click a=1,2").is_err());
     }
 }

@@ -1,5 +1,6 @@
 #![doc = include_str!("README.md")]
 
+pub mod carry;
 pub mod click;
 pub mod depth;
 pub mod fit;
@@ -26,21 +27,18 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use image::GrayImage;
-use rayon::prelude::*;
 
 use crate::gpu::{self, Gpu};
 use crate::multiview::{DepthGrid, Matched};
-use crate::scene::{self, Camera, PriorKind, Scene};
+use crate::scene::{self, PriorKind, Scene};
 use crate::sentence::one_line;
 use crate::signal::Signal;
 use crate::train::checkpoint::Fingerprint;
 
-use depth::DepthMap;
 use fit::Fit;
-use misplaced::Looks;
 use network::Inpainting;
-pub use object::Evidence;
-use object::{Given, USERS, corrected, given, no_such_view};
+pub use object::{Evidence, Object};
+use object::{Wanted, no_such_view};
 use poses::Capture;
 use record::{Batch, Folder, Inputs};
 use splats::Splats;
@@ -170,8 +168,8 @@ pub struct Request {
     pub photographs: PathBuf,
     /// Folder of the scene.
     pub out: PathBuf,
-    /// The object, by the name of a view.
-    pub object: Vec<(String, Evidence)>,
+    /// What is to be removed.
+    pub objects: Vec<Object>,
     /// Name of the reference view; otherwise the one whose hole is seen best by others.
     pub reference: Option<String>,
     /// The steps to run, whose inputs must be there; all if empty.
@@ -200,7 +198,7 @@ impl Request {
         Self {
             photographs: photographs.into(),
             out: out.into(),
-            object: vec![],
+            objects: vec![Object::default()],
             reference: None,
             only: vec![],
             ready: None,
@@ -282,7 +280,8 @@ pub struct Fitted {
 /// # Errors
 /// As [`prepare`].
 pub fn fitted(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Fitted, Error> {
-    let request = Request { only: vec![Step::Poses, Step::Fit], object: vec![], ..request.clone() };
+    let objects = vec![Object::default()];
+    let request = Request { only: vec![Step::Poses, Step::Fit], objects, ..request.clone() };
     let (scene, fit, matched) = steps(gpu, &request, watch)?.expect("a request for the fit makes one");
     let matched = matched.map_or_else(|| Matched::new(gpu, &scene), Ok)?;
     Ok(Fitted { grids: matched.depths(&scene), scene, fit })
@@ -299,7 +298,8 @@ fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(
     });
     // Mistakes in what the user named are found before anything is written.
     let networks = Networks::open(request)?;
-    let marked = |name: &str| request.object.iter().any(|(named, _)| scene::stem(named) == name);
+    let named = || request.objects.iter().flat_map(|object| &object.evidence);
+    let marked = |name: &str| named().any(|(named, _)| scene::stem(named) == name);
     for (name, path) in capture.photographs.iter().filter(|(name, _)| marked(name)) {
         if scene::is_turned(path)? {
             let [w, h] = picture_size(path)?;
@@ -309,12 +309,12 @@ fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(
             ));
         }
     }
-    let mut object = given(&capture, request)?;
+    let mut wanted = Wanted::given(&capture, &request.objects)?;
     let _lock = crate::folder::Lock::take(&request.out)?;
     let mut folder = Folder::open(&request.out)?;
     folder.sweep();
-    object.extend(corrected(&folder, &capture, &object)?);
-    if object.is_empty() && request.wants(Step::Masks) && request.only.is_empty() {
+    wanted.correct(&folder, &capture)?;
+    if wanted.objects.is_empty() && request.wants(Step::Masks) && request.only.is_empty() {
         return Err(Error::Request(
             "what is to be removed? name one view and its mask, --mask NAME=FILE.png, a box around the object, --box \
              NAME=x0,y0,x1,y1, or a pixel of it, --click NAME=x,y"
@@ -345,7 +345,7 @@ fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(
     let fit = preparation.fit(&scene)?;
     let mut splats = Splats::new(gpu, &fit.model, &fit.settings.render)?;
     if request.wants(Step::Masks) {
-        preparation.masks(&scene, &fit, &mut splats, &object)?;
+        preparation.masks(&scene, &fit, &mut splats, &wanted)?;
     }
     if request.wants(Step::Shadow) {
         let masks = preparation.masks_on_disk(&scene)?;
@@ -376,32 +376,6 @@ fn has_room(name: &str, path: &Path) -> Result<(), Error> {
         "its name has {own} bytes without extension, and what is named after it leaves room for at most {most}; rename it"
     );
     Err(Error::File { path: path.to_owned(), what })
-}
-
-/// Masks that were cut by colours alone, cut again by where in space pixels are.
-fn placed(
-    scene: &Scene,
-    grids: &[DepthGrid],
-    splats: &mut Splats,
-    given: &BTreeMap<String, Given>,
-    files: &BTreeMap<String, PathBuf>,
-) -> Result<BTreeMap<String, Given>, Error> {
-    let mut all = given.clone();
-    for (view, grid) in scene.train.iter().zip(grids) {
-        let Some(given) = all.get_mut(&view.name).filter(|given| !given.drawn.is_empty()) else { continue };
-        let depths = [DepthMap::of(splats, &view.camera)?, DepthMap::measured(grid, &view.camera)];
-        *given = given.placed(&files[&view.name], depths.each_ref())?;
-    }
-    Ok(all)
-}
-
-/// `[view][pixel]` of the fit's pictures: whether what is there is none of the object, by the given masks and the depth that is
-/// measured between the photographs.
-fn beside(scene: &Scene, grids: &[DepthGrid], given: &BTreeMap<String, Given>) -> Vec<Vec<bool>> {
-    let cameras: Vec<Camera> = scene.train.iter().map(|view| view.camera).collect();
-    let masks: Vec<Option<&GrayImage>> =
-        scene.train.iter().map(|view| given.get(&view.name).map(|given| &given.mask)).collect();
-    hole::ground::beside(grids, &cameras, &masks)
 }
 
 /// A preparation under way.
@@ -547,150 +521,6 @@ impl Preparation<'_> {
         self.folder.record().steps.get(Step::Fit.name()).map_or_else(String::new, |step| {
             step.files.values().map(|file| file.hash.as_str()).collect::<Vec<_>>().join(" ")
         })
-    }
-
-    fn masks(
-        &mut self,
-        scene: &Scene,
-        fit: &Fit,
-        splats: &mut Splats,
-        given: &BTreeMap<String, Given>,
-    ) -> Result<(), Error> {
-        let mut inputs = Inputs::default().with(self.fit_hash()).with(outline::METHOD);
-        for (name, Given { mask, from, .. }) in given {
-            inputs = inputs.with(name).with(mask.as_raw()).with(from);
-        }
-        let inputs = inputs.finish();
-        if self.skips(Step::Masks, &inputs)? {
-            return Ok(());
-        }
-        let posed = |name: &str| scene.train.iter().any(|view| view.name == name);
-        if let Some(name) = given.keys().find(|name| !posed(name)) {
-            return Err(Error::Request(format!(
-                "{name}: the model has no camera for this photograph; mask another one"
-            )));
-        }
-        if given.is_empty() {
-            return Err(Error::Request("no view has a mask yet: name one with --mask NAME=FILE.png".into()));
-        }
-        let files = scene::pictures(&self.folder.root().join(poses::IMAGES))?;
-        self.watch.begin(Step::Masks, (given.len() + scene.train.len()) as u64);
-        let all_given = scene.train.iter().all(|view| given.contains_key(&view.name));
-        let needs_depth = !all_given || given.values().any(|given| !given.drawn.is_empty());
-        let grids = if needs_depth { self.matched(scene)?.depths(scene) } else { vec![] };
-        let given = &placed(scene, &grids, splats, given, &files)?;
-        let wrong = misplaced::wrong(scene, &grids);
-        let (voters, misplaced) = misplaced::voters(scene, &wrong, given)?;
-        let mut votes = masks::Votes::new(splats);
-        let mut unit = 0;
-        for view in &voters {
-            votes.add(splats, &view.camera, &masks::parts(&given[&view.name].mask, view.camera.size))?;
-            unit += 1;
-            self.watch.turn(unit)?;
-        }
-        let colors = masks::colors(splats, &scene.train)?;
-        let mut shares = votes.count(fit.positions(), &colors);
-        let mut batch = Batch::default();
-        batch.notes.extend(misplaced);
-        let names: Vec<&str> = voters.iter().map(|view| view.name.as_str()).collect();
-        let from = format!("carried from {}", abridged(&names));
-        let others: Vec<&scene::View> = scene.train.iter().filter(|view| !given.contains_key(&view.name)).collect();
-        let beside = if all_given { vec![] } else { beside(scene, &grids, given) };
-        let carry = |shares: &masks::Shares, splats: &mut Splats| -> Result<Vec<masks::Carried>, Error> {
-            let views = scene.train.iter().enumerate().filter(|(_, view)| !given.contains_key(&view.name));
-            let carried = views.map(|(at, view)| {
-                let mut carried = shares.carry(splats, &view.camera)?;
-                for (part, _) in carried.object.iter_mut().zip(&beside[at]).filter(|(_, beside)| **beside) {
-                    *part = 0.0;
-                }
-                Ok(carried)
-            });
-            carried.collect()
-        };
-        let pictures: Vec<Result<_, scene::Error>> =
-            others.par_iter().map(|view| scene::photograph_within(&files[&view.name], outline::SIDE)).collect();
-        let pictures = pictures.into_iter().collect::<Result<Vec<_>, _>>()?;
-        let learnt: Vec<(image::RgbImage, &GrayImage)> = given
-            .iter()
-            .map(|(name, Given { mask, .. })| Ok((scene::photograph_within(&files[name], outline::SIDE)?, mask)))
-            .collect::<Result<_, scene::Error>>()?;
-        let looks = Looks::of(learnt.iter().map(|(picture, mask)| (picture, *mask)));
-        // A view's mask, and whether it was moved.
-        let refine = |carried: &masks::Carried, at: usize| -> (GrayImage, bool) {
-            let (size, picture) = (others[at].camera.size, &pictures[at]);
-            let rough = masks::threshold(&carried.object, size, size, masks::OBJECT);
-            let shift = looks.as_ref().and_then(|looks| looks.shift(picture, &rough));
-            let moved = shift.map(|shift| misplaced::moved(&carried.object, size, shift));
-            (outline::of(picture, moved.as_ref().unwrap_or(&carried.object), size), moved.is_some())
-        };
-        let mut carried = carry(&shares, splats)?;
-        let thin =
-            others.iter().zip(&carried).filter_map(|(view, carried)| Some((carried.thinness()?, view.name.as_str())));
-        let mut thin: Vec<(f64, &str)> = thin.collect();
-        // What the first views miss of the object's other sides the masks of more views have between them.
-        let every = others.len().div_ceil(outline::VOTERS).max(1);
-        for _ in 0..outline::ROUNDS {
-            let some = (0..others.len()).into_par_iter().step_by(every);
-            let outlines: Vec<_> = some.map(|at| (others[at], refine(&carried[at], at))).collect();
-            let given = voters.iter().map(|view| (*view, &given[&view.name].mask));
-            let sound = |view: &scene::View, moved: bool| !moved && !wrong.contains(view.name.as_str());
-            let found = outlines.iter().filter(|(view, (_, moved))| sound(view, *moved));
-            let found = found.map(|(view, (mask, _))| (*view, mask));
-            let mut votes = masks::Votes::new(splats);
-            for (view, mask) in given.chain(found) {
-                votes.add(splats, &view.camera, &masks::parts(mask, view.camera.size))?;
-                self.watch.go_on()?;
-            }
-            shares = votes.count(fit.positions(), &colors);
-            carried = carry(&shares, splats)?;
-        }
-        let outlines: Vec<(GrayImage, bool)> =
-            (0..others.len()).into_par_iter().map(|at| refine(&carried[at], at)).collect();
-        let mut shown = 0;
-        for (name, Given { mask, from, .. }) in given {
-            if from != USERS {
-                batch.gray(format!("masks/{name}.png"), mask, from.clone());
-            }
-            shown += usize::from(mask.as_raw().iter().any(|v| *v != 0));
-        }
-        for (view, (mask, _)) in others.iter().zip(&outlines) {
-            let size = picture_size(&files[&view.name])?;
-            let small = [mask.width(), mask.height()];
-            let mask = masks::threshold(&masks::parts(mask, small), small, size, 0.5);
-            shown += usize::from(mask.as_raw().iter().any(|v| *v != 0));
-            batch.gray(format!("masks/{}.png", view.name), &mask, from.clone());
-            unit += 1;
-            self.watch.turn(unit)?;
-        }
-        if shown < 3 {
-            batch.notes.push(format!(
-                "the object is in {shown} of {} views only: what is behind it is hardly seen from elsewhere",
-                scene.train.len()
-            ));
-        }
-        thin.sort_by(|a, b| b.0.total_cmp(&a.0));
-        let weak: Vec<&(f64, &str)> = thin.iter().filter(|(part, _)| *part > THIN).collect();
-        if let Some((part, name)) = weak.first() {
-            batch.notes.push(format!(
-                "{} views show sides of the object that the given masks do not; please mask {name} as well (--mask {name}=...): \
-                 {:.0} % of the object there were not seen",
-                weak.len(),
-                100.0 * part
-            ));
-        }
-        let moved = others.iter().zip(&outlines).filter(|(_, (_, moved))| *moved);
-        let moved: Vec<&str> = moved.map(|(view, _)| view.name.as_str()).collect();
-        if !moved.is_empty() {
-            batch.notes.push(format!(
-                "the object is not where the cameras of these photographs have it, and their masks are moved onto it: {}; \
-                 train --set 'scene.leave_out={moved:?}' leaves them out",
-                abridged(&moved)
-            ));
-        }
-        batch.figures.insert("views with the object".into(), shown as f64);
-        self.write(Step::Masks, inputs, batch)?;
-        self.watch.end();
-        Ok(())
     }
 
     /// Matches the photographs, once.
@@ -866,9 +696,6 @@ fn masked(scene: &Scene, masks: &[GrayImage]) -> Scene {
     }
     masked
 }
-
-/// A view shows a side of the object that no masked view shows if more than this part of the object there is unseen.
-const THIN: f64 = 0.3;
 
 /// Folders of depth priors.
 const PRIORS: [&str; 2] = ["depth", "disparity"];

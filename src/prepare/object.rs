@@ -9,7 +9,7 @@ use super::click::{self, Cues, Mark};
 use super::depth::DepthMap;
 use super::poses::Capture;
 use super::record::{self, Folder};
-use super::{Error, Request, graph_cut, masks, picture_size};
+use super::{Error, graph_cut, masks, picture_size};
 use crate::scene::{self, resample};
 
 /// How the user says what the object is in a view.
@@ -59,6 +59,74 @@ impl Evidence {
             Self::Not(point) => Some(Mark::Background { at: at(*point) }),
             Self::Mask(_) | Self::Strokes(_) | Self::Box(_) => None,
         }
+    }
+}
+
+/// What is to be removed, by what the user says of it in some views.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Object {
+    /// What it is called; the first one need not be called anything.
+    pub name: String,
+    /// What it is in a view, by the name of this.
+    pub evidence: Vec<(String, Evidence)>,
+    /// Whether masks that came with the photographs are its own.
+    pub delivered: bool,
+}
+
+impl Default for Object {
+    fn default() -> Self {
+        Self { name: String::new(), evidence: vec![], delivered: true }
+    }
+}
+
+/// Longest name of an object, characters.
+const LONGEST: usize = 40;
+
+impl Object {
+    /// A name as it may be given to an object, without what is around it; nothing for one that cannot be said in a line.
+    pub fn checked_name(text: &str) -> Option<&str> {
+        let name = text.trim();
+        (!name.is_empty() && name.chars().count() <= LONGEST && !name.chars().any(char::is_control)).then_some(name)
+    }
+}
+
+/// The masks that are known of what is to be removed.
+#[derive(Default)]
+pub(super) struct Wanted {
+    /// Objects that have one, by name, and theirs by view.
+    pub objects: Vec<(String, BTreeMap<String, Given>)>,
+    /// Of several objects together, by view: what the user has put or corrected in the scene's folder.
+    pub whole: BTreeMap<String, Given>,
+}
+
+impl Wanted {
+    /// What the user named of these objects.
+    pub fn given(capture: &Capture, objects: &[Object]) -> Result<Self, Error> {
+        let mut wanted = Self::default();
+        for (at, object) in objects.iter().enumerate() {
+            let name = if object.name.is_empty() { format!("object {}", at + 1) } else { object.name.clone() };
+            let masks = given(capture, object).map_err(|error| match error {
+                Error::Request(what) if objects.len() > 1 => Error::Request(format!("{name}: {what}")),
+                other => other,
+            })?;
+            if !masks.is_empty() {
+                wanted.objects.push((name, masks));
+            }
+        }
+        Ok(wanted)
+    }
+
+    /// Adds masks in the scene's folder that are not the program's own: one object has more of its own.
+    pub fn correct(&mut self, folder: &Folder, capture: &Capture) -> Result<(), Error> {
+        match self.objects.as_mut_slice() {
+            [] => {
+                let found = corrected(folder, capture, &BTreeMap::new())?;
+                self.objects.extend((!found.is_empty()).then(|| (String::new(), found)));
+            }
+            [(_, given)] => given.extend(corrected(folder, capture, given)?),
+            _ => self.whole = corrected(folder, capture, &BTreeMap::new())?,
+        }
+        Ok(())
     }
 }
 
@@ -121,7 +189,7 @@ impl Given {
 }
 
 /// Two masks of one size as one, of all that either covers.
-fn joined(mut one: GrayImage, other: GrayImage) -> GrayImage {
+pub(super) fn joined(mut one: GrayImage, other: GrayImage) -> GrayImage {
     one.iter_mut().zip(other.as_raw()).for_each(|(one, other)| *one = (*one).max(*other));
     one
 }
@@ -138,10 +206,10 @@ fn is_box([x0, y0, x1, y1]: [u32; 4], size: [u32; 2]) -> bool {
     x0 < x1 && y0 < y1 && x1 <= size[0] && y1 <= size[1]
 }
 
-/// The masks that the user named.
-pub(super) fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<String, Given>, Error> {
+/// The masks that the user named of an object.
+fn given(capture: &Capture, object: &Object) -> Result<BTreeMap<String, Given>, Error> {
     let mut all = BTreeMap::new();
-    for (name, (path, inverted)) in &capture.masks {
+    for (name, (path, inverted)) in capture.masks.iter().filter(|_| object.delivered) {
         // Masks of no photograph are not this scene's.
         let Some(photograph) = capture.photographs.get(name) else { continue };
         let size = picture_size(photograph)?;
@@ -154,15 +222,15 @@ pub(super) fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<Str
         all.insert(name.clone(), Given::fixed(mask, format!("{}", path.display())));
     }
     let on = |stem: &str, kind: &dyn Fn(&Evidence) -> bool| {
-        request
-            .object
+        object
+            .evidence
             .iter()
             .find(|(name, evidence)| scene::stem(name) == stem && kind(evidence))
             .map(|(_, evidence)| evidence)
     };
     // Views of which a mask or a box was named: of several the object is what any of them covers.
     let mut named: BTreeSet<String> = BTreeSet::new();
-    for (name, evidence) in &request.object {
+    for (name, evidence) in &object.evidence {
         let stem = scene::stem(name).to_owned();
         let option = evidence.option();
         let Some(photograph) = capture.photographs.get(&stem) else {
@@ -176,8 +244,8 @@ pub(super) fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<Str
             continue;
         }
         let given = match evidence {
-            Evidence::Lasso(_) | Evidence::Click(_) | Evidence::Not(_) => of_marks(request, &stem, photograph, size)?,
-            Evidence::Box(_) if marked => of_marks(request, &stem, photograph, size)?,
+            Evidence::Lasso(_) | Evidence::Click(_) | Evidence::Not(_) => of_marks(object, &stem, photograph, size)?,
+            Evidence::Box(_) if marked => of_marks(object, &stem, photograph, size)?,
             Evidence::Mask(path) => {
                 let mask = checked(path, read_mask(path, size)?, size, false)?;
                 Given::fixed(mask, format!("--mask {}", path.display()))
@@ -252,14 +320,14 @@ pub(super) fn given(capture: &Capture, request: &Request) -> Result<BTreeMap<Str
 }
 
 /// The mask of all marks in one view: boxes and lassos first, then the clicks on the object, then those beside it.
-fn of_marks(request: &Request, stem: &str, photograph: &Path, size: [u32; 2]) -> Result<Given, Error> {
+fn of_marks(object: &Object, stem: &str, photograph: &Path, size: [u32; 2]) -> Result<Given, Error> {
     let rank = |evidence: &Evidence| match evidence {
         Evidence::Box(_) | Evidence::Lasso(_) => 0,
         Evidence::Not(_) => 2,
         _ => 1,
     };
     let mut own: Vec<&Evidence> =
-        request.object.iter().filter(|(name, _)| scene::stem(name) == stem).map(|(_, evidence)| evidence).collect();
+        object.evidence.iter().filter(|(name, _)| scene::stem(name) == stem).map(|(_, evidence)| evidence).collect();
     own.sort_by_key(|evidence| rank(evidence));
     let mut marks = vec![];
     for evidence in own {
@@ -297,7 +365,7 @@ fn of_marks(request: &Request, stem: &str, photograph: &Path, size: [u32; 2]) ->
 }
 
 /// Masks in the scene's folder that are not the program's own: the user has put or corrected them there.
-pub(super) fn corrected(
+fn corrected(
     folder: &Folder,
     capture: &Capture,
     given: &BTreeMap<String, Given>,

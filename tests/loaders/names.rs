@@ -153,7 +153,7 @@ fn names_without_room_are_refused_first() {
     let long = "n".repeat(242);
     fs::rename(at.join("scene/images/train_000.png"), at.join(format!("scene/images/{long}.png"))).expect("a folder");
     let mut request = Request::new(at.join("scene"), at.join("out"));
-    request.object = vec![("train_001".into(), prepare::Evidence::Box([10, 10, 20, 20]))];
+    request.objects[0].evidence = vec![("train_001".into(), prepare::Evidence::Box([10, 10, 20, 20]))];
     let error = prepare::prepare(&testing::gpu(), &request, &mut Silent).expect_err("no room").to_string();
     assert!(error.contains("its name has 242 bytes without extension") && error.contains("at most 241"), "{error}");
     assert!(!at.join("out").exists());

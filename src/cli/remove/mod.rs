@@ -141,19 +141,20 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let capture = found.map_or_else(|| poses::find(&photographs), Ok)?;
     let time = Time::new(args.minutes, args.work(capture.photographs.len(), &places.root)?);
     let job = Job { args, places, photographs, splat, time };
-    if args.object.evidence().is_empty() && !args.yes {
+    if args.object.is_empty() && !args.yes {
         return page::run(&job, &capture);
     }
-    let mut object = args.object.evidence();
-    let named: Vec<String> = object.iter().map(|(name, _)| crate::scene::stem(name).to_owned()).collect();
+    let mut objects = args.object.0.clone();
+    let first = &mut objects[0].evidence;
+    let named: Vec<String> = first.iter().map(|(name, _)| crate::scene::stem(name).to_owned()).collect();
     let kept = objects::all(&job.places.objects, capture.photographs.iter().filter(|(name, _)| !named.contains(name)))?;
     if !kept.is_empty() {
         eprintln!("objects: {} masks in {} count as well", kept.len(), job.places.objects.display());
     }
-    object.extend(work::evidence(kept));
+    first.extend(work::evidence(kept));
     args.device.with_gpu(|gpu| {
         signals::listen()?;
-        job.work(gpu, object, args.yes, &work::Nobody, began)
+        job.work(gpu, objects, args.yes, &work::Nobody, began)
     })?;
     job.say();
     Ok(())

@@ -116,8 +116,7 @@ pub fn open(args: &Args, places: &Places) -> anyhow::Result<Source> {
 
 /// Cameras enough, evenly spread, and those that the user names.
 fn some(all: Vec<Posed>, args: &Args) -> Vec<Posed> {
-    let named: Vec<String> =
-        args.object.evidence().into_iter().map(|(name, _)| name).chain(args.reference.clone()).collect();
+    let named: Vec<&String> = args.object.views().chain(&args.reference).collect();
     let is_named = |posed: &Posed| named.iter().any(|name| crate::scene::stem(name) == posed.name);
     let most = args.views as usize;
     let count = all.len();

@@ -24,7 +24,7 @@ use crate::model::files::{POINT_CLOUD, WEIGHTS};
 use crate::prepare::fit::Ready;
 use crate::prepare::record::{self, Inputs};
 use crate::prepare::shadow::Answer;
-use crate::prepare::{self, Evidence, Request, Step, Watch};
+use crate::prepare::{self, Evidence, Object, Request, Step, Watch};
 use crate::scene::doctor::Report;
 use crate::signal::Signal;
 use crate::splat::read::Splat;
@@ -207,12 +207,12 @@ impl Observer for Watched<'_, export::Bars> {
 
 impl Job<'_> {
     /// The request to `prepare`.
-    pub fn request(&self, object: Vec<(String, Evidence)>) -> Request {
+    pub fn request(&self, objects: Vec<Object>) -> Request {
         let Args { reference, shadow, fit_steps, .. } = self.args;
         // A splat's own Gaussians keep their shadow: only the hole changes.
         let shadow = if self.splat.is_some() { Answer::Keep } else { shadow.answer() };
         Request {
-            object,
+            objects,
             ready: self.splat.as_ref().map(|splat| splat.ready.clone()),
             reference: reference.clone(),
             shadow,
@@ -226,7 +226,7 @@ impl Job<'_> {
     /// # Errors
     /// As [`prepare::fitted`].
     pub fn fitted(&self, gpu: &Gpu, audience: &dyn Audience) -> Result<prepare::Fitted, prepare::Error> {
-        prepare::fitted(gpu, &self.request(vec![]), &mut Watched::<Bars>::new(audience, self))
+        prepare::fitted(gpu, &self.request(vec![Object::default()]), &mut Watched::<Bars>::new(audience, self))
     }
 
     /// Everything, in the time since `began`. With `despite` also where doctor finds problems.
@@ -236,14 +236,14 @@ impl Job<'_> {
     pub fn work(
         &self,
         gpu: &Gpu,
-        object: Vec<(String, Evidence)>,
+        objects: Vec<Object>,
         despite: bool,
         audience: &dyn Audience,
         began: Instant,
     ) -> anyhow::Result<()> {
         let Places { root, scene, run, .. } = &self.places;
         self.time.start(began, scene)?;
-        prepare::prepare(gpu, &self.request(object), &mut Watched::<Bars>::new(audience, self))?;
+        prepare::prepare(gpu, &self.request(objects), &mut Watched::<Bars>::new(audience, self))?;
         let (report, _) = findings::examined(scene, None)?;
         eprint!("{}", findings::new_text(&report, scene));
         audience.examined(&report);

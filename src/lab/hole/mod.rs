@@ -25,7 +25,7 @@ use crate::atomic;
 use crate::evaluate;
 use crate::gpu::{self, Gpu};
 use crate::model;
-use crate::prepare::{self, Evidence, Request, Step, Watch};
+use crate::prepare::{self, Evidence, Object, Request, Step, Watch};
 use crate::scene::{self, doctor};
 use crate::signal::Signal;
 use truth::Truth;
@@ -152,8 +152,9 @@ pub(crate) fn prepared(
         copy(&set.join(part), &out.join(part))?;
     }
     let files = scene::pictures(&set.join("masks"))?;
-    let object = given.iter().map(|name| (name.clone(), Evidence::Mask(files[name].clone()))).collect();
-    let request = Request { object, ..Request::new(&out, &out) };
+    let evidence = given.iter().map(|name| (name.clone(), Evidence::Mask(files[name].clone()))).collect();
+    let objects = vec![Object { evidence, ..Object::default() }];
+    let request = Request { objects, ..Request::new(&out, &out) };
     let mut timed = Timed { watch, step: None, seconds: BTreeMap::new() };
     prepare::prepare(gpu, &request, &mut timed)?;
     let seconds = timed.seconds;

@@ -1,0 +1,301 @@
+//! The step masks: what is known of each object in some views, carried to all others, and the objects together.
+//!
+//! A mask says of every pixel whether it is of its object, so that each object's masks vote by themselves: who marks one object
+//! in one photograph and another one in the next does not say that the first is not there.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use image::{GrayImage, RgbImage};
+use rayon::prelude::*;
+
+use super::depth::DepthMap;
+use super::fit::Fit;
+use super::misplaced::{self, Looks};
+use super::object::{Given, USERS, Wanted, joined};
+use super::record::{Batch, Inputs};
+use super::splats::Splats;
+use super::{Error, Preparation, Step, Watch, abridged, hole, masks, outline, picture_size, poses};
+use crate::multiview::DepthGrid;
+use crate::scene::{self, Camera, Scene, View};
+
+/// A view shows a side of the object that no masked view shows if more than this part of the object there is unseen.
+const THIN: f64 = 0.3;
+
+/// What an object is carried with.
+struct Carrier<'a> {
+    scene: &'a Scene,
+    fit: &'a Fit,
+    /// Colours of the fit's anchors.
+    colors: Vec<[f32; 3]>,
+    /// `[view]` depth as it is measured; none where nothing needs it.
+    grids: Vec<DepthGrid>,
+    /// The photographs' files by name.
+    files: BTreeMap<String, PathBuf>,
+    /// `[view]` the photographs.
+    pictures: Vec<RgbImage>,
+    /// Units of the step that are done.
+    units: u64,
+}
+
+/// An object in all views.
+struct Carried {
+    /// `[view]` its mask, as large as the photograph, and what it was made from.
+    masks: Vec<(GrayImage, String)>,
+    /// Views that show it.
+    shown: usize,
+    /// What was found out.
+    notes: Vec<String>,
+}
+
+impl Preparation<'_> {
+    pub(super) fn masks(
+        &mut self,
+        scene: &Scene,
+        fit: &Fit,
+        splats: &mut Splats,
+        wanted: &Wanted,
+    ) -> Result<(), Error> {
+        let objects = &wanted.objects;
+        let several = objects.len() > 1;
+        let mut inputs = Inputs::default().with(self.fit_hash()).with(outline::METHOD);
+        for (object, given) in objects {
+            inputs = if several { inputs.with(object) } else { inputs };
+            for (name, Given { mask, from, .. }) in given {
+                inputs = inputs.with(name).with(mask.as_raw()).with(from);
+            }
+        }
+        let whole = wanted.whole.iter();
+        let inputs = whole.fold(inputs, |inputs, (name, given)| inputs.with(name).with(given.mask.as_raw())).finish();
+        if self.skips(Step::Masks, &inputs)? {
+            return Ok(());
+        }
+        let posed = |name: &str| scene.train.iter().any(|view| view.name == name);
+        if let Some(name) = objects.iter().flat_map(|(_, given)| given.keys()).find(|name| !posed(name)) {
+            return Err(Error::Request(format!(
+                "{name}: the model has no camera for this photograph; mask another one"
+            )));
+        }
+        if objects.is_empty() {
+            return Err(Error::Request("no view has a mask yet: name one with --mask NAME=FILE.png".into()));
+        }
+        let units: usize = objects.iter().map(|(_, given)| given.len() + scene.train.len()).sum();
+        self.watch.begin(Step::Masks, units as u64);
+        let needs_depth = |given: &BTreeMap<String, Given>| {
+            !is_in_all(scene, given) || given.values().any(|given| !given.drawn.is_empty())
+        };
+        let needed = objects.iter().any(|(_, given)| needs_depth(given));
+        let grids = if needed { self.matched(scene)?.depths(scene) } else { vec![] };
+        let files = scene::pictures(&self.folder.root().join(poses::IMAGES))?;
+        let mut carrier = Carrier::new(scene, fit, splats, grids, files)?;
+        let mut batch = Batch::default();
+        let mut union: Vec<Option<(GrayImage, String)>> = vec![None; scene.train.len()];
+        for (object, given) in objects {
+            let name = several.then_some(object.as_str());
+            let Carried { masks, shown, notes } = carrier.carry(splats, given, name, self.watch)?;
+            let [label, what] =
+                name.map_or(["".into(), "the object".into()], |name| [format!("{name}: "), name.into()]);
+            batch.notes.extend(notes.into_iter().map(|note| format!("{label}{note}")));
+            batch.figures.insert(format!("views with {what}"), shown as f64);
+            for (sum, (mask, from)) in union.iter_mut().zip(masks) {
+                *sum = Some(match sum.take() {
+                    Some((others, of)) => (joined(others, mask), format!("{of}; {label}{from}")),
+                    None => (mask, format!("{label}{from}")),
+                });
+            }
+        }
+        for (view, (mask, from)) in scene.train.iter().zip(union.into_iter().flatten()) {
+            if from != USERS && !wanted.whole.contains_key(&view.name) {
+                batch.gray(format!("masks/{}.png", view.name), &mask, from);
+            }
+        }
+        if !wanted.whole.is_empty() {
+            let names: Vec<&str> = wanted.whole.keys().map(String::as_str).collect();
+            batch.notes.push(format!(
+                "masks that were made by hand in the scene are of all objects together, and stay: {}; they say nothing of other \
+                 views",
+                abridged(&names)
+            ));
+        }
+        self.write(Step::Masks, inputs, batch)?;
+        self.watch.end();
+        Ok(())
+    }
+}
+
+/// Whether all views have a mask.
+fn is_in_all(scene: &Scene, given: &BTreeMap<String, Given>) -> bool {
+    scene.train.iter().all(|view| given.contains_key(&view.name))
+}
+
+impl<'a> Carrier<'a> {
+    fn new(
+        scene: &'a Scene,
+        fit: &'a Fit,
+        splats: &mut Splats,
+        grids: Vec<DepthGrid>,
+        files: BTreeMap<String, PathBuf>,
+    ) -> Result<Self, Error> {
+        let colors = masks::colors(splats, &scene.train)?;
+        let picture = |view: &View| scene::photograph_within(&files[&view.name], outline::SIDE);
+        let pictures: Vec<Result<_, scene::Error>> = scene.train.par_iter().map(picture).collect();
+        let pictures = pictures.into_iter().collect::<Result<_, _>>()?;
+        Ok(Self { scene, fit, colors, grids, files, pictures, units: 0 })
+    }
+
+    fn turn(&mut self, watch: &mut dyn Watch) -> Result<(), Error> {
+        self.units += 1;
+        watch.turn(self.units)
+    }
+
+    /// Masks that were cut by colours alone, cut again by where in space pixels are.
+    fn placed(&self, splats: &mut Splats, given: &BTreeMap<String, Given>) -> Result<BTreeMap<String, Given>, Error> {
+        let mut all = given.clone();
+        for (view, grid) in self.scene.train.iter().zip(&self.grids) {
+            let Some(given) = all.get_mut(&view.name).filter(|given| !given.drawn.is_empty()) else { continue };
+            let depths = [DepthMap::of(splats, &view.camera)?, DepthMap::measured(grid, &view.camera)];
+            *given = given.placed(&self.files[&view.name], depths.each_ref())?;
+        }
+        Ok(all)
+    }
+
+    /// `[view][pixel]` of the fit's pictures: whether what is there is none of the object, by the given masks and the depth that
+    /// is measured between the photographs.
+    fn beside(&self, given: &BTreeMap<String, Given>) -> Vec<Vec<bool>> {
+        let views = &self.scene.train;
+        let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
+        let mask = |view: &View| given.get(&view.name).map(|given| &given.mask);
+        hole::ground::beside(&self.grids, &cameras, &views.iter().map(mask).collect::<Vec<_>>())
+    }
+
+    /// An object to all views, of which it is said how one more is masked by the name of the object, where there are several.
+    fn carry(
+        &mut self,
+        splats: &mut Splats,
+        given: &BTreeMap<String, Given>,
+        object: Option<&str>,
+        watch: &mut dyn Watch,
+    ) -> Result<Carried, Error> {
+        let scene = self.scene;
+        let given = &self.placed(splats, given)?;
+        let wrong = misplaced::wrong(scene, &self.grids);
+        let (voters, misplaced) = misplaced::voters(scene, &wrong, given)?;
+        let mut votes = masks::Votes::new(splats);
+        for view in &voters {
+            votes.add(splats, &view.camera, &masks::parts(&given[&view.name].mask, view.camera.size))?;
+            self.turn(watch)?;
+        }
+        let mut shares = votes.count(self.fit.positions(), &self.colors);
+        let others: Vec<usize> =
+            (0..scene.train.len()).filter(|at| !given.contains_key(&scene.train[*at].name)).collect();
+        let beside = if others.is_empty() { vec![] } else { self.beside(given) };
+        let carry = |shares: &masks::Shares, splats: &mut Splats| -> Result<Vec<masks::Carried>, Error> {
+            let carried = others.iter().map(|at| {
+                let mut carried = shares.carry(splats, &scene.train[*at].camera)?;
+                for (part, _) in carried.object.iter_mut().zip(&beside[*at]).filter(|(_, beside)| **beside) {
+                    *part = 0.0;
+                }
+                Ok(carried)
+            });
+            carried.collect()
+        };
+        let at = |name: &String| scene.train.iter().position(|view| view.name == *name);
+        let learnt = given.iter().filter_map(|(name, given)| Some((&self.pictures[at(name)?], &given.mask)));
+        let looks = Looks::of(learnt);
+        // A view's mask, and whether it was moved.
+        let refine = |carried: &masks::Carried, at: usize| -> (GrayImage, bool) {
+            let (size, picture) = (scene.train[at].camera.size, &self.pictures[at]);
+            let rough = masks::threshold(&carried.object, size, size, masks::OBJECT);
+            let shift = looks.as_ref().and_then(|looks| looks.shift(picture, &rough));
+            let moved = shift.map(|shift| misplaced::moved(&carried.object, size, shift));
+            (outline::of(picture, moved.as_ref().unwrap_or(&carried.object), size), moved.is_some())
+        };
+        let mut carried = carry(&shares, splats)?;
+        let thin: Vec<(f64, usize)> =
+            others.iter().zip(&carried).filter_map(|(at, carried)| Some((carried.thinness()?, *at))).collect();
+        // What the first views miss of the object's other sides the masks of more views have between them.
+        let every = others.len().div_ceil(outline::VOTERS).max(1);
+        for _ in 0..outline::ROUNDS {
+            let some = (0..others.len()).into_par_iter().step_by(every);
+            let outlines: Vec<_> = some.map(|i| (&scene.train[others[i]], refine(&carried[i], others[i]))).collect();
+            let own = voters.iter().map(|view| (*view, &given[&view.name].mask));
+            let found = outlines.iter().filter(|(view, (_, moved))| !moved && !wrong.contains(view.name.as_str()));
+            let found = found.map(|(view, (mask, _))| (*view, mask));
+            let mut votes = masks::Votes::new(splats);
+            for (view, mask) in own.chain(found) {
+                votes.add(splats, &view.camera, &masks::parts(mask, view.camera.size))?;
+                watch.go_on()?;
+            }
+            shares = votes.count(self.fit.positions(), &self.colors);
+            carried = carry(&shares, splats)?;
+        }
+        let outlines: Vec<(GrayImage, bool)> =
+            others.par_iter().zip(&carried).map(|(at, carried)| refine(carried, *at)).collect();
+        let moved = others.iter().zip(&outlines).filter(|(_, (_, moved))| *moved).map(|(at, _)| *at);
+        let moved: Vec<usize> = moved.collect();
+        let names: Vec<&str> = voters.iter().map(|view| view.name.as_str()).collect();
+        let masks = self.large(given, &names, outlines, watch)?;
+        let shown = masks.iter().filter(|(mask, _)| mask.as_raw().iter().any(|v| *v != 0)).count();
+        let notes = misplaced.into_iter().chain(self.notes(shown, thin, &moved, object)).collect();
+        Ok(Carried { masks, shown, notes })
+    }
+
+    /// `[view]` the given masks and the outlines of all others, carried `from` some, as large as the photographs, and what they were made
+    /// from.
+    fn large(
+        &mut self,
+        given: &BTreeMap<String, Given>,
+        from: &[&str],
+        outlines: Vec<(GrayImage, bool)>,
+        watch: &mut dyn Watch,
+    ) -> Result<Vec<(GrayImage, String)>, Error> {
+        let carried = format!("carried from {}", abridged(from));
+        let mut outlines = outlines.into_iter();
+        let mut all = vec![];
+        for view in &self.scene.train {
+            if let Some(Given { mask, from, .. }) = given.get(&view.name) {
+                all.push((mask.clone(), from.clone()));
+                continue;
+            }
+            let (mask, _) = outlines.next().expect("an outline of each view that has no mask");
+            let small = [mask.width(), mask.height()];
+            let size = picture_size(&self.files[&view.name])?;
+            all.push((masks::threshold(&masks::parts(&mask, small), small, size, 0.5), carried.clone()));
+            self.turn(watch)?;
+        }
+        Ok(all)
+    }
+
+    /// What is to be said of an object: views that show it, how much of it was not seen in which, and where it was moved.
+    fn notes(&self, shown: usize, mut thin: Vec<(f64, usize)>, moved: &[usize], object: Option<&str>) -> Vec<String> {
+        let views = &self.scene.train;
+        let mut notes = vec![];
+        if shown < 3 {
+            notes.push(format!(
+                "the object is in {shown} of {} views only: what is behind it is hardly seen from elsewhere",
+                views.len()
+            ));
+        }
+        thin.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let weak: Vec<&(f64, usize)> = thin.iter().filter(|(part, _)| *part > THIN).collect();
+        if let Some((part, at)) = weak.first() {
+            let name = &views[*at].name;
+            let option = object.map_or_else(String::new, |object| format!("--object {object:?} "));
+            notes.push(format!(
+                "{} views show sides of the object that the given masks do not; please mask {name} as well \
+                 ({option}--mask {name}=...): {:.0} % of the object there were not seen",
+                weak.len(),
+                100.0 * part
+            ));
+        }
+        if !moved.is_empty() {
+            let moved: Vec<&str> = moved.iter().map(|at| views[*at].name.as_str()).collect();
+            notes.push(format!(
+                "the object is not where the cameras of these photographs have it, and their masks are moved onto it: {}; \
+                 train --set 'scene.leave_out={moved:?}' leaves them out",
+                abridged(&moved)
+            ));
+        }
+        notes
+    }
+}
