@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use gscream_vk::prepare::{Evidence, Object, Request, Step, poses};
 use gscream_vk::scene;
-use image::GrayImage;
+use image::{GrayImage, RgbImage};
 
 use crate::nerfstudio::{of_nerfstudio, transforms};
 use crate::prepare::{VIEWS, capture, ious, mask, name, prepared, truth};
@@ -188,14 +188,16 @@ fn turned_photographs_are_named() {
     }
 }
 
-/// The pixels of a mask that are on the ball of the built-in scene, which is blue, or on its stand.
-fn parts(folder: &Path, view: u32) -> [GrayImage; 2] {
-    let whole = mask(&folder.join("full/masks").join(name(view) + ".png"));
-    let picture = image::open(folder.join("full/images").join(name(view) + ".png")).expect("a picture").into_rgb8();
+/// The built-in scene's ball, which is blue, and below it its stand: the two parts of a photograph's true mask.
+pub(crate) fn parts(mask: &GrayImage, picture: &RgbImage) -> [GrayImage; 2] {
+    let blue = mask.enumerate_pixels().filter(|(x, y, on)| {
+        let [r, _, b] = picture.get_pixel(*x, *y).0;
+        on.0[0] != 0 && b > r.saturating_add(20)
+    });
+    let lowest = blue.map(|(_, y, _)| y).max().expect("the ball is in the picture");
     [true, false].map(|ball| {
-        let mut part = whole.clone();
-        let is_blue = |x, y| picture.get_pixel(x, y).0[2] > picture.get_pixel(x, y).0[0];
-        part.enumerate_pixels_mut().filter(|(x, y, _)| is_blue(*x, *y) != ball).for_each(|(.., v)| v.0[0] = 0);
+        let mut part = mask.clone();
+        part.enumerate_pixels_mut().filter(|(_, y, _)| (*y <= lowest) != ball).for_each(|(.., v)| v.0[0] = 0);
         part
     })
 }
@@ -206,17 +208,18 @@ fn parts(folder: &Path, view: u32) -> [GrayImage; 2] {
 fn objects_are_marked_in_different_photographs() {
     let folder = capture();
     let root = folder.path();
+    let parts = |view: u32| {
+        let picture = image::open(root.join("full/images").join(name(view) + ".png")).expect("a picture");
+        parts(&mask(&truth(&folder, view)), &picture.into_rgb8())
+    };
     let evidence = |view: u32, part: usize| {
         let path = root.join(format!("part-{part}.png"));
-        parts(root, view)[part].save(&path).expect("writable");
+        parts(view)[part].save(&path).expect("writable");
         (name(view), Evidence::Mask(path))
     };
     let [ball, stand] = [evidence(2, 0), evidence(7, 1)];
-    let object = |name: &str, evidence: &[(String, Evidence)]| Object {
-        name: name.into(),
-        evidence: evidence.to_vec(),
-        ..Object::default()
-    };
+    let object =
+        |name: &str, evidence: Vec<(String, Evidence)>| Object { name: name.into(), evidence, ..Object::default() };
     let mut request = Request::new(root.join("photos"), root.join("scene"));
     (request.fit_steps, request.fit_side) = (150, 112);
     request.only = vec![Step::Poses, Step::Fit, Step::Masks];
@@ -229,20 +232,20 @@ fn objects_are_marked_in_different_photographs() {
             .collect();
         (said, ious.iter().sum::<f64>() / ious.len() as f64, ious.into_iter().fold(1.0, f64::min), masks)
     };
-    let (_, as_one, ..) = made(vec![object("", &[ball.clone(), stand.clone()])]);
-    let (said, mean, least, masks) = made(vec![object("ball", &[ball.clone()]), object("stand", &[stand.clone()])]);
+    let (_, as_one, ..) = made(vec![object("", vec![ball.clone(), stand.clone()])]);
+    let (said, mean, least, masks) = made(vec![object("ball", vec![ball.clone()]), object("stand", vec![stand])]);
     println!("masks' mean IoU {mean:.3}, least {least:.3}; as one object {as_one:.3}; {said:?}");
     assert!(mean > 0.8 && least > 0.7 && as_one < mean - 0.1, "{mean}, {least}, as one object {as_one}");
     // What is given counts, and what the other object has there is beside it.
     for (view, part) in [(2, 0), (7, 1)] {
         let union = image::load_from_memory(&masks[view as usize]).expect("a mask").into_luma8();
-        let own = parts(root, view);
+        let own = parts(view);
         assert!(own[part].pixels().zip(union.pixels()).all(|(own, union)| own.0[0] <= union.0[0]), "{view}");
         let on = |mask: &GrayImage| mask.pixels().filter(|v| v.0[0] != 0).count() as f64;
         assert!(on(&union) > on(&own[part]) + 0.6 * on(&own[1 - part]), "{view}");
     }
-    let (.., alone) = made(vec![object("ball", &[ball.clone()])]);
-    let (said, .., unnamed) = made(vec![object("", &[ball])]);
+    let (.., alone) = made(vec![object("ball", vec![ball.clone()])]);
+    let (said, .., unnamed) = made(vec![object("", vec![ball])]);
     assert!(
         alone == unnamed && alone != masks && said.iter().any(|line| line == "masks: nothing has changed"),
         "{said:?}"

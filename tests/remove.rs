@@ -154,15 +154,15 @@ fn clicks(folder: &Path) -> Vec<String> {
     [down(0.3), down(0.9), down(0.7)].map(|[x, y]| format!("{x:.4},{y:.4}")).to_vec()
 }
 
-#[test]
-fn an_object_is_removed_on_the_page() {
+/// What a script of `tests/viewer` says that visits the page of photographs in this folder, with what is made in `out`; nothing
+/// where there is no browser.
+fn visited(folder: &Path, script: &str, arguments: &[String]) -> Option<Value> {
     let there = Path::new(VIEWER).join("node_modules/puppeteer-core").is_dir();
     if !there {
-        return skip(Lack::Node, "puppeteer-core is not installed: run `npm ci --ignore-scripts` in tests/viewer");
+        skip(Lack::Node, "puppeteer-core is not installed: run `npm ci --ignore-scripts` in tests/viewer");
+        return None;
     }
-    let Some(chromium) = chromium() else { return };
-    let folder = photographs();
-    let folder = folder.path();
+    let chromium = chromium()?;
     let mut server = program(folder, &format!("remove photos --out out --no-open --port 0 {SHORT}"))
         .stdout(Stdio::piped())
         .spawn()
@@ -173,10 +173,10 @@ fn an_object_is_removed_on_the_page() {
     said.read_line(&mut line).expect("its first line");
     let url = line.split_whitespace().next().expect("an address").to_owned();
     let pictures = std::env::var_os("GSCREAM_KEEP").map_or_else(|| folder.to_owned(), PathBuf::from);
-    let arguments = [chromium.to_string_lossy().into_owned(), url, pictures.to_string_lossy().into_owned()];
     let output = Command::new("node")
-        .arg("remove.mjs")
-        .args(arguments.into_iter().chain(clicks(folder)))
+        .arg(script)
+        .args([chromium.to_string_lossy().into_owned(), url, pictures.to_string_lossy().into_owned()])
+        .args(arguments)
         .current_dir(VIEWER)
         .output()
         .expect("node starts");
@@ -184,7 +184,14 @@ fn an_object_is_removed_on_the_page() {
     server.wait().expect("it is gone");
     drop(said);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let found: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    Some(serde_json::from_slice(&output.stdout).expect("JSON"))
+}
+
+#[test]
+fn an_object_is_removed_on_the_page() {
+    let folder = photographs();
+    let folder = folder.path();
+    let Some(found) = visited(folder, "remove.mjs", &clicks(folder)) else { return };
     println!("{}, {}", found["shares"], found["files"]);
     let truth = |name: &Value| {
         let name = name.as_str().expect("a name");
@@ -217,4 +224,72 @@ fn an_object_is_removed_on_the_page() {
     }
     // What was clicked is there for the form without a browser.
     assert_eq!(names(&folder.join("out/objects")).len(), 2);
+}
+
+/// Of the built-in scene's ball and of its stand, where they are in a photograph.
+fn parts(folder: &Path, view: &str) -> [Vec<bool>; 2] {
+    let open = |path: String| image::open(folder.join(path)).expect("a picture");
+    let [mask, picture] = [format!("truth/{view}.png"), format!("photos/images/{view}.png")].map(open);
+    let parts = crate::photographs::parts(&mask.to_luma8(), &picture.to_rgb8());
+    parts.map(|part| part.as_raw().iter().map(|v| *v != 0).collect())
+}
+
+/// The ball is marked in one photograph and its stand in another, each as an object: the stand goes, and then both.
+#[test]
+fn objects_are_removed_one_by_one_on_the_page() {
+    let folder = photographs();
+    let folder = folder.path();
+    let views: Vec<String> = names(&folder.join("truth"))
+        .iter()
+        .map(|path| path.file_stem().expect("a name").to_string_lossy().into_owned())
+        .collect();
+    // The box around a part, of the photograph's sides.
+    let around = |view: &str, part: usize| {
+        let on = &parts(folder, view)[part];
+        let all = || (0..on.len()).filter(|i| on[*i]).map(|i| [i % 160, i / 160]);
+        let least = |axis: usize| all().map(|at| at[axis]).min().expect("a part of the object");
+        let most = |axis: usize| all().map(|at| at[axis] + 1).max().expect("a part of the object");
+        let sides = [(least(0), 160.0), (least(1), 120.0), (most(0), 160.0), (most(1), 120.0)];
+        sides.map(|(at, side)| format!("{:.4}", at as f64 / side)).join(",")
+    };
+    let [ball, stand] = [&views[3], &views[6]];
+    let arguments = ["out/scene/masks".to_owned(), ball.clone(), around(ball, 0), stand.clone(), around(stand, 1)];
+    let scene = folder.join(&arguments[0]);
+    let arguments = [&[scene.to_string_lossy().into_owned()], &arguments[1..]].concat();
+    let Some(found) = visited(folder, "objects.mjs", &arguments) else { return };
+    let pictures = std::env::var_os("GSCREAM_KEEP").map_or_else(|| folder.to_owned(), PathBuf::from);
+    // Which parts of ball and stand the masks of a removal have, over all views.
+    let has = |masks: &Path| -> [f64; 2] {
+        let sums = views.iter().fold([[0.0; 2]; 2], |sums: [[f64; 2]; 2], view| {
+            let mask = image::open(masks.join(format!("{view}.png"))).expect("a mask").to_luma8();
+            let parts = parts(folder, view);
+            std::array::from_fn(|part| {
+                let on = parts[part].iter().zip(mask.pixels()).filter(|(on, _)| **on);
+                let [all, had] =
+                    on.fold([0.0, 0.0], |[all, had], (_, v)| [all + 1.0, had + f64::from(u8::from(v.0[0] != 0))]);
+                [sums[part][0] + all, sums[part][1] + had]
+            })
+        });
+        sums.map(|[all, had]| had / all)
+    };
+    let [one, both] = [has(&pictures.join("masks")), has(&scene)];
+    println!("the first removal has {one:.2?} of ball and stand, the second {both:.2?}; {found}");
+    assert!(one[0] < 0.3 && one[1] > 0.75 && both.iter().all(|part| *part > 0.8), "{one:?} {both:?}");
+    // Each was in its own colour in all photographs before.
+    for (view, shares) in found.as_object().expect("views") {
+        for (part, share) in parts(folder, view).iter().zip(shares.as_array().expect("objects")) {
+            let truth = part.iter().filter(|on| **on).count() as f64 / part.len() as f64;
+            let share = share.as_f64().unwrap_or(0.0);
+            assert!(share > 0.5 * truth && share < 1.7 * truth, "{view}: {share} of {truth}");
+        }
+    }
+    let list: Value =
+        serde_json::from_slice(&fs::read(folder.join("out/objects.json")).expect("a list")).expect("JSON");
+    assert_eq!(list[1], serde_json::json!({ "number": 2, "name": "stand", "remove": true }));
+    assert_eq!((names(&folder.join("out/objects")).len(), names(&folder.join("out/objects-2")).len()), (2, 2));
+    // The form without a browser takes both as well.
+    let output = program(folder, &format!("remove photos --out out --yes {SHORT}")).output().expect("it starts");
+    let [out, err] = [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
+    assert!(out.contains("out: Object 1 and stand are gone"), "{out}");
+    assert!(err.contains("masks: nothing has changed") && err.contains("train: nothing has changed"), "{err}");
 }

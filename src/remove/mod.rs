@@ -2,10 +2,11 @@
 //!
 //! The page's visitors and the worker, who has the device, meet at a [`Session`]. Marks become masks in the visitors' own
 //! threads ([`crate::prepare::click`]), with what the worker has laid down so far: the fit's depth, and the masks of other
-//! views as the fit carries them. All that is to be kept lies in a folder: `NAME.png`, the mask of a photograph, as `prepare
-//! --mask` takes it, and `NAME.json`, the marks it was made of ([`objects`]). The last of two writers wins, view by view; a
-//! revision counts the changes.
+//! views as the fit carries them. All that is to be kept lies in a folder for each object: `NAME.png`, the mask of a photograph, as
+//! `prepare --mask` takes it, and `NAME.json`, the marks it was made of ([`objects`]). The last of two writers wins, view by
+//! view; a revision counts the changes.
 
+mod list;
 pub mod objects;
 pub mod site;
 
@@ -24,6 +25,7 @@ use crate::prepare::masks::{self, Carried};
 use crate::scene::{self, resample};
 use crate::view::live::Board;
 use crate::view::server::{Refusal, Resource};
+use objects::Entry;
 
 /// Marks of a view at most.
 const MOST_MARKS: usize = 400;
@@ -62,7 +64,13 @@ pub enum Origin {
     File,
 }
 
-/// The state of a photograph.
+/// An object, and the state of each photograph of it.
+struct Own {
+    entry: Entry,
+    views: Vec<View>,
+}
+
+/// The state of a photograph of an object.
 #[derive(Clone, Default)]
 struct View {
     marks: Vec<Mark>,
@@ -119,7 +127,10 @@ pub struct Part {
 struct State {
     /// Counts changes of masks.
     revision: u64,
-    views: Vec<View>,
+    /// In the order of the list, and never none.
+    objects: Vec<Own>,
+    /// The object that was deleted last.
+    deleted: Option<list::Deleted>,
     /// What the page is told of the views; nothing where that has changed since.
     said: Option<Arc<site::Views>>,
     phase: Phase,
@@ -142,13 +153,16 @@ struct State {
 pub enum Wish {
     /// Nothing has changed for a while.
     Nothing,
-    /// Masks of this revision are to be carried to all views: view, version and mask.
-    Carry(u64, Vec<(usize, u64, Arc<GrayImage>)>),
-    /// The object is to be removed; whether in spite of what is found.
+    /// Masks of this revision are to be carried to all views: the objects by number, and view, version and mask of each.
+    Carry(u64, BTreeMap<usize, Vec<Masked>>),
+    /// What is ticked is to be removed; whether in spite of what is found.
     Remove(bool),
     /// This view is to be drawn without the object.
     Draw(usize),
 }
+
+/// A view, a version of its mask, and that.
+pub type Masked = (usize, u64, Arc<GrayImage>);
 
 /// The results of the work.
 #[derive(Default)]
@@ -171,6 +185,7 @@ impl Results {
 /// The state that the page and the worker share.
 pub struct Session {
     title: String,
+    /// That of the first object.
     folder: PathBuf,
     photos: Vec<Photo>,
     numbers: BTreeMap<String, usize>,
@@ -199,9 +214,57 @@ fn write<T>(lock: &RwLock<T>) -> std::sync::RwLockWriteGuard<'_, T> {
     lock.write().unwrap_or_else(PoisonError::into_inner)
 }
 
+impl View {
+    /// With what the folder has of a photograph, or with a mask that came with it.
+    fn open(photo: &Photo, folder: &Path, given: &BTreeMap<String, GrayImage>) -> Result<Self, scene::Error> {
+        let mut view = Self { version: 1, drawn: 1, ..Self::default() };
+        let kept = objects::read(folder, &photo.name, photo.size)?;
+        let own = given.get(&photo.name).map(|mask| (vec![], mask.clone()));
+        if let Some((marks, mask)) = kept.or(own) {
+            view.origin = if marks.is_empty() { Origin::File } else { Origin::Marks };
+            view.marks = marks;
+            let mask = Arc::new(resample::nearest(&mask, working(photo.size)));
+            view.share = share(&mask);
+            if !view.marks.is_empty() {
+                view.made.push((view.marks.clone(), None, mask.clone()));
+            }
+            view.mask = Some(mask);
+        }
+        Ok(view)
+    }
+
+    /// Whether it has a mask of something.
+    fn has_object(&self) -> bool {
+        self.mask.is_some() && self.share > 0.0
+    }
+}
+
+impl State {
+    /// The object of this number.
+    fn own(&mut self, object: usize) -> Result<&mut Own, Refused> {
+        let own = self.objects.iter_mut().find(|own| own.entry.number == object);
+        own.ok_or_else(|| (Refusal::NotFound, format!("there is no object {object}; it may have been deleted")))
+    }
+
+    /// The objects that are to be removed.
+    fn ticked(&self) -> impl Iterator<Item = &Own> {
+        self.objects.iter().filter(|own| own.entry.remove || self.objects.len() == 1)
+    }
+
+    /// Refuses what cannot be changed while it is being removed.
+    fn may_change(&self) -> Result<(), Refused> {
+        match self.phase {
+            Phase::Working => {
+                Err((Refusal::Conflict, "the object is being removed; stop that first to change it".into()))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
 impl Session {
-    /// The session of these photographs, with what the folder has of earlier ones. `given` are masks that came with the
-    /// photographs, by name; those in the folder win.
+    /// The session of these photographs, with what the folder, and those of further objects beside it, have of earlier ones.
+    /// `given` are masks that came with the photographs, by name, of the first object; those in the folder win.
     ///
     /// # Errors
     /// A photograph or a mask that cannot be read.
@@ -216,21 +279,12 @@ impl Session {
         };
         let photos: Vec<Photo> = photographs.iter().map(photo).collect::<Result<_, scene::Error>>()?;
         let mut state = State { revision: 1, ..State::default() };
-        for photo in &photos {
-            let mut view = View { version: 1, drawn: 1, ..View::default() };
-            let kept = objects::read(folder, &photo.name, photo.size)?;
-            let own = given.get(&photo.name).map(|mask| (vec![], mask.clone()));
-            if let Some((marks, mask)) = kept.or(own) {
-                view.origin = if marks.is_empty() { Origin::File } else { Origin::Marks };
-                view.marks = marks;
-                let mask = Arc::new(resample::nearest(&mask, working(photo.size)));
-                view.share = share(&mask);
-                if !view.marks.is_empty() {
-                    view.made.push((view.marks.clone(), None, mask.clone()));
-                }
-                view.mask = Some(mask);
-            }
-            state.views.push(view);
+        for entry in objects::list(folder)? {
+            let none = BTreeMap::new();
+            let given = if entry.number == 1 { given } else { &none };
+            let views = photos.iter().map(|photo| View::open(photo, &entry.folder(folder), given));
+            let views = views.collect::<Result<_, _>>()?;
+            state.objects.push(Own { entry, views });
         }
         let numbers = photos.iter().enumerate().map(|(i, photo)| (photo.name.clone(), i)).collect();
         Ok(Arc::new(Self {
@@ -289,45 +343,50 @@ impl Session {
         Ok(picture)
     }
 
-    /// Replaces what is marked in a view, and makes its mask. No marks are none: the view gets what other views say.
+    /// Replaces what is marked of an object in a view, and makes its mask. No marks are none: the view gets what other views say.
     ///
     /// # Errors
     /// Marks that make no sense; a time at which nothing can be marked; files that cannot be read or written.
-    pub fn mark(&self, number: usize, marks: Vec<Mark>) -> Result<u64, Refused> {
+    pub fn mark(&self, object: usize, number: usize, marks: Vec<Mark>) -> Result<u64, Refused> {
         if marks.len() > MOST_MARKS || !marks.iter().all(Mark::is_sound) {
             let why = "a mark lies outside the photograph, or there are too many";
             return Err((Refusal::BadRequest, why.into()));
         }
-        self.cut(number, Some(marks))
+        self.cut(object, number, Some(marks))
     }
 
     /// Makes the masks of views with a few marks again, now that more is known than when they were made.
     pub fn again(&self) {
         let few = |view: &View| (1..=FEW).contains(&view.marks.len()) && view.version == view.drawn;
-        let numbers: Vec<usize> = (0..self.photos.len()).filter(|i| few(&self.lock().views[*i])).collect();
-        for number in numbers {
-            if let Err((_, why)) = self.cut(number, None) {
+        let those = |own: &Own| -> Vec<(usize, usize)> {
+            (0..own.views.len()).filter(|i| few(&own.views[*i])).map(|i| (own.entry.number, i)).collect()
+        };
+        let all: Vec<(usize, usize)> = self.lock().objects.iter().flat_map(those).collect();
+        for (object, number) in all {
+            if let Err((_, why)) = self.cut(object, number, None) {
                 log::info!("{}: {why}", self.photos[number].name);
             }
         }
     }
 
     /// Makes the mask of a view of these marks, or of those that it has. Marks and mask change together, or not at all.
-    fn cut(&self, number: usize, marks: Option<Vec<Mark>>) -> Result<u64, Refused> {
+    fn cut(&self, object: usize, number: usize, marks: Option<Vec<Mark>>) -> Result<u64, Refused> {
         let version = {
             let mut state = self.lock();
-            if state.phase == Phase::Working {
-                return Err((Refusal::Conflict, "the object is being removed; stop that first to change it".into()));
-            }
+            state.may_change()?;
+            let view = &mut state.own(object)?.views[number];
+            view.version += 1;
+            let version = view.version;
             state.said = None;
-            state.views[number].version += 1;
-            state.views[number].version
+            version
         };
-        // The object is not removed meanwhile: that waits for its turn, too.
+        // The object is not removed meanwhile, nor deleted: that waits for its turn, too.
         let _turn = self.cutting.lock().unwrap_or_else(PoisonError::into_inner);
-        let (view, revision) = {
-            let state = self.lock();
-            (state.views[number].clone(), state.revision)
+        let (view, revision, folder) = {
+            let mut state = self.lock();
+            let revision = state.revision;
+            let own = state.own(object)?;
+            (own.views[number].clone(), revision, own.entry.folder(&self.folder))
         };
         // Somebody was faster: the last one wins.
         if view.version != version {
@@ -335,12 +394,12 @@ impl Session {
         }
         let depth = read(&self.depths).get(&number).cloned();
         let marks = marks.unwrap_or_else(|| view.marks.clone());
-        let made = self.made(number, &view, &marks, depth.as_deref());
+        let made = self.made((&folder, number), &view, &marks, depth.as_deref());
         let mut state = self.lock();
         state.said = None;
+        let own = &mut state.own(object)?.views[number];
         // A later one goes on with what was there before.
-        let drawn = state.views[number].version == version;
-        let own = &mut state.views[number];
+        let drawn = own.version == version;
         match made {
             Ok(mask) => {
                 own.origin = if mask.is_some() { Origin::Marks } else { Origin::None };
@@ -370,7 +429,7 @@ impl Session {
     /// The mask that marks make of a view, on disk as well. Where that fails, what was on disk stays or is put back.
     fn made(
         &self,
-        number: usize,
+        (folder, number): (&Path, usize),
         view: &View,
         marks: &[Mark],
         depth: Option<&[DepthMap; 2]>,
@@ -393,30 +452,29 @@ impl Session {
             })
         };
         let Photo { name, size, .. } = &self.photos[number];
-        if let Err(error) = objects::write(&self.folder, name, *size, marks, mask.as_deref()) {
+        if let Err(error) = objects::write(folder, name, *size, marks, mask.as_deref()) {
             if view.origin == Origin::Marks {
                 // The mask may have been written and its marks not. The error that is told is the first one.
-                let _ = objects::write(&self.folder, name, *size, &view.marks, view.mask.as_deref());
+                let _ = objects::write(folder, name, *size, &view.marks, view.mask.as_deref());
             }
-            return Err((Refusal::Busy, format!("{}: cannot be written: {error}", self.folder.display())));
+            return Err((Refusal::Busy, format!("{}: cannot be written: {error}", folder.display())));
         }
         Ok(mask)
     }
 
-    /// Whether some view has a mask of something.
-    fn has_object(state: &State) -> bool {
-        state.views.iter().any(|view| view.mask.is_some() && view.share > 0.0)
-    }
-
-    /// Asks for the object to be removed, also in spite of what was found.
+    /// Asks for what is ticked to be removed, also in spite of what was found.
     ///
     /// # Errors
     /// Nothing is marked; it is being done already.
     pub fn remove(&self, despite: bool) -> Result<(), Refused> {
         let _turn = self.cutting.lock().unwrap_or_else(PoisonError::into_inner);
         let mut state = self.lock();
-        if !Self::has_object(&state) {
-            return Err((Refusal::Conflict, "nothing is marked yet; draw around what is to be removed".into()));
+        if !state.ticked().any(|own| own.views.iter().any(View::has_object)) {
+            let why = match state.objects.len() {
+                1 => "nothing is marked yet; draw around what is to be removed",
+                _ => "no object that is ticked is marked yet; tick one, or draw around it",
+            };
+            return Err((Refusal::Conflict, why.into()));
         }
         if state.phase == Phase::Working {
             return Err((Refusal::Conflict, "the object is being removed already".into()));
@@ -539,8 +597,8 @@ impl Session {
         write(&self.depths).insert(number, Arc::new(depths));
     }
 
-    /// Keeps what the masks of this revision make of a view; nothing of it is kept where they have changed since.
-    pub fn carry(&self, revision: u64, number: usize, carried: Carried, size: [u32; 2]) -> bool {
+    /// Keeps what an object's masks of this revision make of a view; nothing of it is kept where they have changed since.
+    pub fn carry(&self, revision: u64, object: usize, number: usize, carried: Carried, size: [u32; 2]) -> bool {
         let mask = masks::threshold(&carried.object, size, working(self.photos[number].size), masks::OBJECT);
         let doubt = carried.thinness().unwrap_or(0.0);
         let mask = masks::without_specks(&mask, SPECK);
@@ -549,9 +607,10 @@ impl Session {
         if state.revision != revision || state.phase == Phase::Working {
             return false;
         }
+        let Ok(own) = state.own(object) else { return true };
         let shown = Shown { parts: carried.object, size, mask, share, doubt, revision };
+        own.views[number].carried = Some(Arc::new(shown));
         state.said = None;
-        state.views[number].carried = Some(Arc::new(shown));
         true
     }
 
@@ -559,9 +618,12 @@ impl Session {
     pub fn carried(&self, revision: u64) {
         let mut state = self.lock();
         state.carried = revision;
-        if state.revision == revision && !Self::has_object(&state) {
-            state.said = None;
-            state.views.iter_mut().for_each(|view| view.carried = None);
+        if state.revision != revision {
+            return;
+        }
+        state.said = None;
+        for own in state.objects.iter_mut().filter(|own| !own.views.iter().any(View::has_object)) {
+            own.views.iter_mut().for_each(|view| view.carried = None);
         }
     }
 
@@ -589,7 +651,8 @@ impl Session {
             return Wish::Nothing;
         }
         let of = |(i, view): (usize, &View)| Some((i, view.drawn, view.mask.clone()?));
-        Wish::Carry(state.revision, state.views.iter().enumerate().filter_map(of).collect())
+        let masks = |own: &Own| (own.entry.number, own.views.iter().enumerate().filter_map(of).collect());
+        Wish::Carry(state.revision, state.objects.iter().map(masks).collect())
     }
 }
 

@@ -1,5 +1,8 @@
 //! The files that keep what is marked: `NAME.png`, a mask as `prepare --mask` takes it, and `NAME.json`, the marks it was made
 //! of and the hash of the mask they made. A mask that has another hash was changed by hand, and counts as it is.
+//!
+//! They lie in a folder for each object: `objects/` is the first one's, `objects-2/` that of the next. `objects.json` beside them
+//! lists the objects; it is not there for one that has never had another beside it.
 
 use std::io::{self, Cursor};
 use std::path::{Path, PathBuf};
@@ -9,8 +12,93 @@ use serde::{Deserialize, Serialize};
 
 use crate::atomic;
 use crate::prepare::click::Mark;
-use crate::prepare::masks;
+use crate::prepare::{Evidence, Object, masks};
 use crate::scene;
+
+/// An object of the list.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Entry {
+    /// Tells it from the others for as long as it is there, and says which folder is its own.
+    pub number: usize,
+    /// What it is called.
+    pub name: String,
+    /// Whether it is to be removed, where it is not the only one.
+    pub remove: bool,
+}
+
+impl Entry {
+    /// One that has no name of its own yet.
+    pub fn new(number: usize) -> Self {
+        Self { number, name: format!("Object {number}"), remove: true }
+    }
+
+    /// The folder of its files, where that of the first object is this one.
+    pub fn folder(&self, first: &Path) -> PathBuf {
+        let own = first.file_name().map(|name| name.to_string_lossy());
+        match (self.number, own) {
+            (2.., Some(own)) => first.with_file_name(format!("{own}-{}", self.number)),
+            _ => first.to_owned(),
+        }
+    }
+}
+
+/// The objects of the folder of the first one: that alone where there is no list.
+///
+/// # Errors
+/// A list that cannot be read, or that is none.
+pub fn list(first: &Path) -> Result<Vec<Entry>, scene::Error> {
+    let path = first.with_extension("json");
+    let text = match std::fs::read(&path) {
+        Ok(text) => text,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(vec![Entry::new(1)]),
+        Err(error) => return Err(scene::Error::File { path, what: error.to_string() }),
+    };
+    let is_sound = |list: &Vec<Entry>| {
+        let alone = |entry: &Entry| list.iter().filter(|other| other.number == entry.number).count() == 1;
+        let named = |entry: &Entry| Object::checked_name(&entry.name) == Some(entry.name.as_str());
+        !list.is_empty() && list.iter().all(|entry| entry.number > 0 && named(entry) && alone(entry))
+    };
+    let read = serde_json::from_slice::<Vec<Entry>>(&text).ok().filter(is_sound);
+    let what = "it is no list of objects; mend it, or remove it to go on with the first object alone";
+    read.ok_or_else(|| scene::Error::File { path, what: what.into() })
+}
+
+/// Keeps the list; that of one object as it begins is none.
+///
+/// # Errors
+/// A file that cannot be written.
+pub fn keep(first: &Path, list: &[Entry]) -> io::Result<()> {
+    let path = first.with_extension("json");
+    if *list == [Entry::new(1)] { gone(&path) } else { atomic::write_json(path, &list) }
+}
+
+/// Removes a file unless it is not there.
+fn gone(path: &Path) -> io::Result<()> {
+    match std::fs::remove_file(path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+        _ => Ok(()),
+    }
+}
+
+/// The objects of the list that are to be removed, as `prepare` takes them.
+///
+/// # Errors
+/// As [`list`] and [`read`].
+pub fn wanted<'a>(
+    first: &Path,
+    photographs: impl Iterator<Item = (&'a String, &'a PathBuf)> + Clone,
+) -> Result<Vec<Object>, scene::Error> {
+    let list = list(first)?;
+    let ticked = list.iter().filter(|entry| entry.remove || list.len() == 1);
+    let objects = ticked.map(|entry| {
+        // A name may have a dot in it, where an extension would begin.
+        let masks = all(&entry.folder(first), photographs.clone())?.into_iter();
+        let evidence = masks.map(|(name, path)| (format!("{name}.png"), Evidence::Mask(path))).collect();
+        Ok(Object { name: entry.name.clone(), evidence, delivered: entry.number == 1 })
+    });
+    objects.collect()
+}
 
 /// The contents of `NAME.json`.
 #[derive(Debug, Serialize, Deserialize)]
@@ -53,13 +141,7 @@ pub fn read(folder: &Path, name: &str, size: [u32; 2]) -> Result<Option<(Vec<Mar
 pub fn write(folder: &Path, name: &str, size: [u32; 2], marks: &[Mark], mask: Option<&GrayImage>) -> io::Result<()> {
     let [mask_path, marks_path] = paths(folder, name);
     let Some(mask) = mask else {
-        for path in [marks_path, mask_path] {
-            match std::fs::remove_file(path) {
-                Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
-                _ => {}
-            }
-        }
-        return Ok(());
+        return gone(&marks_path).and_then(|()| gone(&mask_path));
     };
     let own = [mask.width(), mask.height()];
     let large = if own == size { mask.clone() } else { masks::threshold(&masks::parts(mask, own), own, size, 0.5) };
@@ -76,6 +158,15 @@ pub fn write(folder: &Path, name: &str, size: [u32; 2], marks: &[Mark], mask: Op
         atomic::write(&path, &bytes)?;
     }
     Ok(())
+}
+
+/// The files that keep what is marked of an object, with what is in them: those of these photographs.
+///
+/// # Errors
+/// A file that cannot be read.
+pub fn files<'a>(folder: &Path, names: impl Iterator<Item = &'a String>) -> io::Result<Vec<(PathBuf, Vec<u8>)>> {
+    let there = names.flat_map(|name| paths(folder, name)).filter(|path| path.is_file());
+    there.map(|path| std::fs::read(&path).map(|bytes| (path, bytes))).collect()
 }
 
 /// The masks of these photographs that the folder has and that show something.

@@ -17,16 +17,24 @@ const PARTS = {
   export: 'Writing the files',
   page: 'Making the page',
 };
-// What the server says, and what was marked here and is not there yet: marks by view.
-let state, current, sorted = true, order = [];
+// What the server says, and what was marked here and is not there yet: marks by object and view.
+let state, current, object, sorted = true, order = [];
 const waiting = new Map(), sending = new Set();
-// Marks of a view before and after each change.
+// How often something was said to the server.
+let posted = 0;
+// Object, view, and its marks before and after each change.
 let past = [], future = [];
 // The photograph's place on the stage: zoom is 1 when all of it is shown.
 let zoom = 1, shift = [0, 0], cross, corner, corners = [], changing = false;
 
 const view = (name = current) => state?.views.find((v) => v.name === name);
-const marksOf = (name = current) => waiting.get(name) ?? view(name)?.marks ?? [];
+const several = () => state.objects.length > 1;
+const placeOf = (number) => state.objects.findIndex((o) => o.number === number);
+const named = (number = object) => state.objects[placeOf(number)]?.name;
+// The state of a photograph of an object.
+const own = (name = current, number = object) => view(name)?.objects[placeOf(number)];
+const keyOf = (name, number) => `${number} ${name}`;
+const marksOf = (name = current, number = object) => waiting.get(keyOf(name, number)) ?? own(name, number)?.marks ?? [];
 const percent = (v) => `${Math.round(100 * v)} %`;
 const clock = (s) => s < 90 ? `${Math.max(1, Math.round(s))} s` : s < 5400 ? `${Math.round(s / 60)} min` : `${(s / 3600).toFixed(1)} h`;
 const size = (bytes) => bytes > 1e6 ? `${(bytes / 1e6).toFixed(1)} MB` : `${Math.ceil(bytes / 1e3)} kB`;
@@ -39,7 +47,9 @@ async function post(path, body) {
     method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify(body),
   });
   if (!answer.ok) throw new Error((await answer.text()).trim());
-  take(await answer.json());
+  const said = await answer.json();
+  posted += 1;
+  take(said);
 }
 
 function say(error) {
@@ -47,36 +57,37 @@ function say(error) {
   $('error').hidden = !error;
 }
 
-async function send(name) {
-  if (sending.has(name)) return;
-  sending.add(name);
-  while (waiting.has(name)) {
-    const marks = waiting.get(name);
+async function send(name, number) {
+  const key = keyOf(name, number);
+  if (sending.has(key)) return;
+  sending.add(key);
+  while (waiting.has(key)) {
+    const marks = waiting.get(key);
     try {
-      await post('api/marks', { view: name, marks });
+      await post('api/marks', { object: number, view: name, marks });
       say('');
     } catch (error) {
       // What was marked before counts, here as well.
       say(`This could not be marked, and nothing was changed: ${error.message}`);
-      past = past.filter((change) => change[2] !== marks);
+      past = past.filter((change) => change[3] !== marks);
       try {
         take(await (await fetch('api/state')).json());
       } catch { /* The next poll says so. */ }
     }
-    if (waiting.get(name) === marks) waiting.delete(name);
+    if (waiting.get(key) === marks) waiting.delete(key);
   }
-  sending.delete(name);
+  sending.delete(key);
   draw();
 }
 
-function mark(marks, name = current, remember = true) {
+function mark(marks, name = current, number = object, remember = true) {
   if (!state || state.phase === 'working') return;
   if (remember) {
-    past.push([name, marksOf(name), marks]);
+    past.push([number, name, marksOf(name, number), marks]);
     future = [];
   }
-  waiting.set(name, marks);
-  send(name);
+  waiting.set(keyOf(name, number), marks);
+  send(name, number);
   draw();
 }
 
@@ -90,26 +101,142 @@ function resize(by) {
   mark([...marks.slice(0, -1), scale ? { ...last, scale } : { kind: 'object', at: last.at }]);
 }
 
+// The last change of an object that is there.
+function last(changes) {
+  while (changes.length && placeOf(changes.at(-1)[0]) < 0) changes.pop();
+  return changes.pop();
+}
+
 function undo() {
-  const change = past.pop();
+  const change = last(past);
   if (change) {
     future.push(change);
-    show(change[0]);
-    mark(change[1], change[0], false);
+    choose(change[0]);
+    show(change[1]);
+    mark(change[2], change[1], change[0], false);
   } else if (marksOf().length) {
     // Marks of an earlier visit.
-    future.push([current, marksOf().slice(0, -1), marksOf()]);
-    mark(marksOf().slice(0, -1), current, false);
+    future.push([object, current, marksOf().slice(0, -1), marksOf()]);
+    mark(marksOf().slice(0, -1), current, object, false);
   }
 }
 
 function redo() {
-  const change = future.pop();
+  const change = last(future);
   if (!change) return;
   past.push(change);
-  show(change[0]);
-  mark(change[2], change[0], false);
+  choose(change[0]);
+  show(change[1]);
+  mark(change[3], change[1], change[0], false);
 }
+
+// ---------------------------------------------------------------- the objects
+
+const rows = new Map();
+// The object whose name is being written.
+let editing;
+
+const change = (what) => post('api/objects', what).then(() => say(''), (error) => say(error.message));
+
+function choose(number) {
+  if (number === object) return;
+  object = number;
+  corner = undefined;
+  corners = [];
+  crosshair();
+  draw();
+}
+
+async function another() {
+  const before = state.objects.map((o) => o.number);
+  await change({ add: {} });
+  const added = state.objects.find((o) => !before.includes(o.number));
+  if (!added) return;
+  // Its number may have been that of one that is gone.
+  [past, future] = [past, future].map((changes) => changes.filter(([number]) => number !== added.number));
+  changing = true;
+  choose(added.number);
+  stage.focus();
+}
+
+function rename(number, name) {
+  if (editing !== number) return;
+  editing = undefined;
+  if (name.trim() && name.trim() !== named(number)) change({ rename: { object: number, name } });
+  draw();
+}
+
+function row({ number }) {
+  const item = $('row').content.firstElementChild.cloneNode(true);
+  const [tick, radio, text] = item.querySelectorAll('input');
+  const [edit, away] = item.querySelectorAll('button');
+  tick.onchange = () => { changing = true; change({ tick: { object: number, remove: tick.checked } }); };
+  radio.onchange = () => choose(number);
+  edit.onclick = () => {
+    editing = number;
+    text.value = named(number);
+    draw();
+    text.select();
+  };
+  item.querySelector('label').ondblclick = edit.onclick;
+  text.onblur = () => rename(number, text.value);
+  text.onkeydown = (e) => {
+    if (!['Enter', 'Escape'].includes(e.key)) return;
+    // Enter is not that of the button, too.
+    e.preventDefault();
+    rename(number, e.key === 'Enter' ? text.value : '');
+    edit.focus();
+  };
+  away.onclick = async () => {
+    await change({ delete: { object: number } });
+    if (placeOf(number) < 0) $('restore').focus();
+  };
+  return { item, tick, radio, text, edit, away, label: item.querySelector('label') };
+}
+
+// Those of the list that go.
+const ticked = () => state.objects.filter((o) => o.remove || !several());
+const sought = () => ticked().filter((o) => o.marked || [...waiting].some(([key, marks]) => marks.length && key.startsWith(`${o.number} `)));
+
+function drawObjects(working, done, marked) {
+  for (const [number, { item }] of rows) {
+    if (placeOf(number) >= 0) continue;
+    item.remove();
+    rows.delete(number);
+  }
+  state.objects.forEach((o, i) => {
+    if (!rows.has(o.number)) rows.set(o.number, row(o));
+    const { item, tick, radio, text, edit, away, label } = rows.get(o.number);
+    if ($('list').children[i] !== item) $('list').insertBefore(item, $('list').children[i] ?? null);
+    item.style.setProperty('--color', o.color);
+    item.className = o.number === object && !done ? 'current' : '';
+    tick.checked = o.remove;
+    radio.checked = o.number === object;
+    radio.disabled = done;
+    text.hidden = editing !== o.number;
+    label.hidden = !text.hidden;
+    label.children[2].textContent = label.title = o.name;
+    label.children[3].textContent = o.marked ? `${o.marked} marked` : 'not marked';
+    for (const [element, what] of [[tick, 'Remove'], [edit, 'Rename'], [away, 'Delete']]) element.setAttribute('aria-label', `${what} ${o.name}`);
+    tick.title = `Remove ${o.name}`;
+    edit.hidden = away.hidden = done || !text.hidden;
+  });
+  $('list').hidden = working || !several();
+  $('another').hidden = working || done || !(several() || marked);
+  $('restore').hidden = working || done || !state.deleted;
+  $('deleted').textContent = $('restore').hidden ? '' : `${state.deleted} was deleted.`;
+  document.body.style.setProperty('--own', several() ? state.objects[placeOf(object)].color : '#ff503c');
+}
+
+$('another').onclick = another;
+$('restore').onclick = async () => {
+  const before = state.objects.map((o) => o.number);
+  await change({ restore: {} });
+  const back = state.objects.find((o) => !before.includes(o.number));
+  if (!back) return;
+  choose(back.number);
+  rows.get(back.number).radio.focus();
+};
 
 // ---------------------------------------------------------------- the photograph
 
@@ -409,7 +536,10 @@ addEventListener('keydown', (e) => {
     corners = e.shiftKey ? [] : [...corners, cross];
     crosshair();
   } else if (e.key.toLowerCase() === 'p' && cross) stroke(e.shiftKey ? 'erase' : 'brush', [cross]);
-  else if (e.key === '[' || e.key === ']') $('radius').value = Number($('radius').value) + (e.key === ']' ? 5 : -5);
+  else if (e.key.toLowerCase() === 'o' && !['working', 'done'].includes(document.body.dataset.phase)) {
+    if (e.shiftKey) another();
+    else choose(state.objects[(placeOf(object) + 1) % state.objects.length].number);
+  } else if (e.key === '[' || e.key === ']') $('radius').value = Number($('radius').value) + (e.key === ']' ? 5 : -5);
   else if (e.key === 'PageUp' || e.key === 'PageDown') resize(e.key === 'PageUp' ? 1 : -1);
   else if (e.key === 'Escape') { cross = corner = drag = undefined; corners = []; $('rubber').hidden = true; crosshair(); }
   else if (e.key === '+' || e.key === '=') magnify(1.4);
@@ -424,12 +554,16 @@ $('more').onclick = () => resize(1);
 for (const input of document.querySelectorAll('input[name=mode]')) input.onchange = () => { ring(); draw(); };
 $('undo').onclick = undo;
 $('redo').onclick = redo;
-$('clear').onclick = () => marksOf().length || view()?.origin === 'file' ? mark([]) : undefined;
+$('clear').onclick = () => marksOf().length || own()?.origin === 'file' ? mark([]) : undefined;
 $('in').onclick = () => magnify(1.4);
 $('out').onclick = () => magnify(1 / 1.4);
 $('fit').onclick = () => { zoom = 1; place(); };
 $('sort').onclick = () => { sorted = !sorted; arrange(); draw(); };
-$('next').onclick = () => state.next && show(state.next, true);
+$('next').onclick = () => {
+  if (!state.next) return;
+  choose(state.of);
+  show(state.next, true);
+};
 $('again').onclick = () => { changing = true; draw(); stage.focus(); };
 $('remove').onclick = async () => {
   changing = false;
@@ -512,15 +646,16 @@ function draw() {
   const v = view();
   const working = state.phase === 'working', done = state.phase === 'done' && !changing;
   document.body.dataset.phase = done ? 'done' : working ? 'working' : 'choosing';
-  $('title').textContent = done ? 'It is gone' : `Remove an object from ${state.title}`;
-  document.title = `${state.title}: ${done ? 'it is gone' : 'remove an object'}`;
-  const busy = waiting.has(current) || v?.busy;
+  const [gone, what] = [ticked().length > 1 ? 'They are gone' : 'It is gone', several() ? 'objects' : 'an object'];
+  $('title').textContent = done ? gone : `Remove ${what} from ${state.title}`;
+  document.title = `${state.title}: ${done ? gone.toLowerCase() : `remove ${what}`}`;
+  const busy = waiting.has(keyOf(current, object)) || v?.busy;
   const compared = done && state.compare.length > 0 && document.querySelector('input[name=look]:checked').value === 'compare';
   const drawing = compare(compared);
   $('looks').hidden = !done || !state.compare.length;
   $('thinking').hidden = !(drawing || (busy && !working && !done));
   $('thinking').textContent = drawing ? 'drawing it without the object' : 'finding the outline';
-  $('name').textContent = current ?? '';
+  $('name').textContent = several() && !working && !done ? `${named()} in ${current}` : current ?? '';
   $('name').hidden = done && !compared;
   if (v) {
     const key = v.overlay ? `${v.name} ${v.overlay}` : '';
@@ -545,23 +680,29 @@ function draw() {
   $('hint').textContent = HINTS[mode()];
   $('undo').disabled = !past.length && !marksOf().length;
   $('redo').disabled = !future.length;
-  $('clear').disabled = !marksOf().length && v?.origin !== 'file';
+  $('clear').disabled = !marksOf().length && own()?.origin !== 'file';
 
-  const marked = state.views.some((o) => o.origin !== 'none') || waiting.size > 0;
-  const empty = marksOf().length && !busy && !(v?.share > 0);
+  const marked = state.marked > 0 || waiting.size > 0;
+  const goes = sought();
+  const empty = marksOf().length && !busy && !(own()?.share > 0);
+  drawObjects(working, done, marked);
+  const kept = state.objects.filter((o) => o.marked && !ticked().includes(o)).map((o) => o.name);
+  const more = kept.length ? ` What is not ticked is still there: tick ${kept.join(' or ')} to remove that as well.` : '';
   const advice = working ? 'You can leave this page open or close it: the work goes on, and this page finds it again.'
     : compared ? 'The photograph is on the left, the scene without the object on the right: drag across the picture or use the slider. Arrow keys and the pictures below show it from elsewhere.'
-    : done ? 'Look around: drag turns, the wheel goes nearer, the slider shows the photograph.'
+    : done ? `Look around: drag turns, the wheel goes nearer, the slider shows the photograph.${more}`
     : state.problems.length ? 'Something speaks against going on. Mend what is named, or go on anyway.'
     : empty ? `Nothing was found there. Draw a line around the object, or ${click} in the middle of it.`
     : !marked ? `What is to be removed? Draw a rough line around it, or ${click} on it.`
+    : several() && !ticked().length ? 'Nothing is ticked: all objects stay. Tick what is to be removed.'
+    : several() && !state.objects[placeOf(object)].marked && !marksOf().length ? `Where is ${named()}? Draw a rough line around it, or ${click} on it, in any photograph.`
     : !state.ready ? `Where the outline is wrong, ${click} on what is missing, or ${much}, or paint it. Soon the object will be looked for in the other photographs as well.`
-    : state.carrying ? 'The object is being looked for in the other photographs.'
-    : state.next ? `${percent(state.doubt)} of the object in ${state.next} is not known from what is marked so far. Draw around it there, too.`
+    : state.carrying ? `The ${several() ? 'objects are' : 'object is'} being looked for in the other photographs.`
+    : state.next ? `${percent(state.doubt)} of ${several() ? named(state.of) : 'the object'} in ${state.next} is not known from what is marked so far. Draw around it there, too.`
     : `Look through the photographs. Where an outline is wrong, ${click} on what is missing, or ${much}, or paint it.`;
   $('advice').textContent = advice;
-  $('next').hidden = working || done || !state.next || state.carrying || state.next === current;
-  $('next').textContent = `Show ${state.next}`;
+  $('next').hidden = working || done || !state.next || state.carrying || (state.next === current && state.of === object);
+  $('next').textContent = `Show ${several() ? `${named(state.of)} in ` : ''}${state.next}`;
   $('problems').hidden = working || done || !state.problems.length;
   $('problems').replaceChildren(...state.problems.map((text) => {
     const item = document.createElement('li');
@@ -570,8 +711,9 @@ function draw() {
   }));
   if (state.error) say(state.error);
   $('remove').hidden = working || done;
-  $('remove').disabled = !marked || waiting.size > 0;
-  $('remove').textContent = state.problems.length ? 'Remove anyway' : 'Remove';
+  $('remove').disabled = !goes.length || waiting.size > 0;
+  const those = goes.length > 2 ? ` ${goes.length} objects` : several() ? goes.map((o, i) => `${i ? ' and' : ''} ${o.name}`).join('') : '';
+  $('remove').textContent = `Remove${those}${state.problems.length ? ' anyway' : ''}`;
   $('remove').classList.add('primary');
   $('stop').hidden = !working;
   $('again').hidden = !done;
@@ -619,8 +761,20 @@ function draw() {
     }
     const doubtful = o.doubt != null && o.doubt > 0.15;
     thumb.button.classList.toggle('doubtful', doubtful);
-    thumb.badge.textContent = o.origin !== 'none' ? 'marked' : doubtful ? `? ${percent(o.doubt)}` : '';
-    thumb.badge.hidden = !thumb.badge.textContent;
+    const dots = several() ? state.objects.filter((_, i) => o.objects[i].origin !== 'none') : [];
+    const doubt = doubtful ? `? ${percent(o.doubt)}` : '';
+    const words = several() ? doubt : o.marked ? 'marked' : doubt;
+    const said = [...dots.map((one) => one.name), words].join(', ');
+    if (thumb.said !== said) {
+      thumb.said = said;
+      thumb.badge.replaceChildren(...dots.map((one) => {
+        const dot = document.createElement('i');
+        dot.style.setProperty('--color', one.color);
+        dot.append(Object.assign(document.createElement('span'), { className: 'unseen', textContent: `${one.name} marked` }));
+        return dot;
+      }), words);
+    }
+    thumb.badge.hidden = !dots.length && !words;
   }
 }
 
@@ -641,7 +795,8 @@ function take(next) {
     arranged = key;
     arrange();
   }
-  if (!current) show(state.views.find((v) => v.origin !== 'none')?.name ?? state.views[Math.floor(state.views.length / 2)]?.name);
+  if (placeOf(object) < 0) object = state.objects[0].number;
+  if (!current) show(state.views.find((v) => v.marked)?.name ?? state.views[Math.floor(state.views.length / 2)]?.name);
   draw();
   document.documentElement.dataset.revision = state.revision;
 }
@@ -650,10 +805,11 @@ let lost = false;
 async function poll() {
   if (!document.hidden) {
     try {
+      const before = posted;
       const answer = await fetch('api/state', { signal: AbortSignal.timeout(15000) });
       const next = await answer.json();
       // What was posted meanwhile is newer.
-      if (!sending.size) take(next);
+      if (!sending.size && before === posted) take(next);
       if (lost) say('');
       lost = false;
     } catch {

@@ -9,7 +9,8 @@ use image::{GrayImage, ImageFormat, Rgba, RgbaImage};
 use serde::Deserialize;
 use serde_json::json;
 
-use super::{Origin, Phase, Photo, Refused, Session, THIN, View, read};
+use super::list::Change;
+use super::{Origin, Own, Phase, Photo, Refused, Session, Shown, State, THIN, View, read};
 use crate::prepare::click::{Mark, working};
 use crate::scene::{self, resample};
 use crate::view::server::{Answer, Body, Refusal, Resource, Site};
@@ -19,16 +20,35 @@ const STYLE: &str = include_str!("page.css");
 const PROGRAM: &str = include_str!("page.js");
 /// Width of a thumbnail, pixels.
 const THUMB: u32 = 240;
-/// Colours of a mask's inside and rim: of one that was marked, and of one that was carried.
-const COLORS: [[[u8; 4]; 2]; 2] =
-    [[[255, 80, 60, 105], [255, 240, 235, 255]], [[255, 170, 30, 95], [255, 235, 190, 235]]];
+/// Colours of a mask's inside and rim.
+type Paint = [[u8; 4]; 2];
+/// Of the mask of an object that is alone: of one that was marked, and of one that was carried.
+const ALONE: [Paint; 2] = [[[255, 80, 60, 105], [255, 240, 235, 255]], [[255, 170, 30, 95], [255, 235, 190, 235]]];
+/// Colours of several objects, by number, over and over.
+const COLORS: [[u8; 3]; 8] = [
+    [255, 80, 60],
+    [50, 130, 255],
+    [40, 185, 90],
+    [250, 180, 20],
+    [170, 90, 250],
+    [0, 190, 200],
+    [250, 90, 180],
+    [150, 115, 70],
+];
 
 /// The body of a POST to `/api/marks`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Marked {
+    #[serde(default = "first")]
+    object: usize,
     view: String,
     marks: Vec<Mark>,
+}
+
+/// The object of those who know of one.
+fn first() -> usize {
+    1
 }
 
 /// The body of a POST to `/api/remove`.
@@ -68,13 +88,13 @@ fn jpeg(picture: &image::RgbImage, quality: u8) -> Result<Vec<u8>, Refusal> {
 }
 
 /// A mask as a picture to lay over its photograph.
-fn overlay(mask: &GrayImage, [inside, rim]: [[u8; 4]; 2]) -> Result<Vec<u8>, Refusal> {
+fn painted(mask: &GrayImage, [inside, rim]: Paint) -> RgbaImage {
     let (w, h) = mask.dimensions();
     let on = |x: i64, y: i64| {
         let there = x >= 0 && y >= 0 && x < i64::from(w) && y < i64::from(h);
         !there || mask.get_pixel(x as u32, y as u32).0[0] != 0
     };
-    let picture = RgbaImage::from_fn(w, h, |x, y| {
+    RgbaImage::from_fn(w, h, |x, y| {
         let (x, y) = (i64::from(x), i64::from(y));
         if !on(x, y) {
             return Rgba([0; 4]);
@@ -83,7 +103,17 @@ fn overlay(mask: &GrayImage, [inside, rim]: [[u8; 4]; 2]) -> Result<Vec<u8>, Ref
         let reach = 1 + i64::from(w.max(h) > 600);
         let inner = on(x - reach, y) && on(x + reach, y) && on(x, y - reach) && on(x, y + reach);
         Rgba(if inner { inside } else { rim })
-    });
+    })
+}
+
+/// What is least transparent of either picture.
+fn laid_over(mut below: RgbaImage, above: &RgbaImage) -> RgbaImage {
+    let pixels = below.pixels_mut().zip(above.pixels()).filter(|(below, above)| above.0[3] > below.0[3]);
+    pixels.for_each(|(below, above)| *below = *above);
+    below
+}
+
+fn png(picture: &RgbaImage) -> Result<Vec<u8>, Refusal> {
     let mut bytes = Cursor::new(vec![]);
     picture.write_to(&mut bytes, ImageFormat::Png).map_err(|_| Refusal::Busy)?;
     Ok(bytes.into_inner())
@@ -99,16 +129,48 @@ impl View {
         }
     }
 
+    /// What is carried to it, where it has no mask of its own.
+    fn unmarked(&self) -> Option<&Shown> {
+        self.carried.as_deref().filter(|_| self.mask.is_none())
+    }
+
     /// As the page reads it.
-    fn status(&self, photo: &Photo) -> serde_json::Value {
-        let carried = self.carried.as_ref().filter(|_| self.mask.is_none());
-        let shown = self.mask.is_some() || carried.is_some();
+    fn status(&self) -> serde_json::Value {
+        let carried = self.unmarked();
+        let share = carried.map(|c| c.share).or(self.mask.is_some().then_some(self.share));
+        json!({ "marks": self.marks, "origin": self.origin, "doubt": carried.map(|c| c.doubt), "share": share })
+    }
+
+    /// Changes with what is shown of it; nothing where there is nothing.
+    fn key(&self) -> Option<String> {
+        let carried = self.unmarked().map_or(0, |c| c.revision);
+        self.shown().map(|_| format!("{}-{carried}", self.drawn))
+    }
+}
+
+impl Own {
+    fn color(&self) -> [u8; 3] {
+        COLORS[(self.entry.number - 1) % COLORS.len()]
+    }
+
+    /// The colours of its masks that were marked and carried, where it is one of several: of one that stays only rims are seen.
+    fn paint(&self) -> [Paint; 2] {
+        let color = self.color();
+        let with = |[r, g, b]: [u8; 3], alpha: u8| [r, g, b, alpha];
+        let light = |by: u16| color.map(|v| (u16::from(v) + (255 - u16::from(v)) * by / 100) as u8);
+        match self.entry.remove {
+            true => [[with(color, 115), with(light(80), 255)], [with(color, 80), with(light(35), 235)]],
+            false => [[[0; 4], with(light(40), 200)], [[0; 4], with(color, 150)]],
+        }
+    }
+
+    /// As the page reads it.
+    fn status(&self) -> serde_json::Value {
+        let [r, g, b] = self.color();
         json!({
-            "name": photo.name, "size": photo.size, "marks": self.marks, "origin": self.origin,
-            "busy": self.version != self.drawn,
-            // Changes with the overlay.
-            "overlay": shown.then(|| format!("{}-{}", self.drawn, carried.map_or(0, |c| c.revision))),
-            "doubt": carried.map(|c| c.doubt), "share": shown.then(|| carried.map_or(self.share, |c| c.share)),
+            "number": self.entry.number, "name": self.entry.name, "remove": self.entry.remove,
+            "color": format!("#{r:02x}{g:02x}{b:02x}"),
+            "marked": self.views.iter().filter(|view| view.origin != Origin::None).count(),
         })
     }
 }
@@ -119,21 +181,41 @@ pub(super) struct Views {
     text: String,
     /// How many have a mask of their own.
     marked: usize,
-    /// The one that is worth a look most, and how much of the object is not known there.
-    next: Option<(f64, String)>,
+    /// The one that is worth a look most, the object for which it is, and how much of this is not known there.
+    next: Option<(f64, String, usize)>,
 }
 
 impl Views {
-    fn of(photos: &[Photo], views: &[View]) -> Self {
-        let all: Vec<_> = photos.iter().zip(views).map(|(photo, view)| view.status(photo)).collect();
-        let unsure = |(photo, view): (&Photo, &View)| {
-            let carried = view.carried.as_ref().filter(|carried| view.mask.is_none() && carried.doubt > THIN)?;
-            Some((carried.doubt, photo.name.clone()))
+    fn of(photos: &[Photo], state: &State) -> Self {
+        let of = |number: usize| state.objects.iter().map(move |own| &own.views[number]);
+        let is_marked = |number: &usize| of(*number).any(|view| view.origin != Origin::None);
+        let doubts = |number: usize| {
+            state.ticked().filter_map(move |own| Some((own.views[number].unmarked()?.doubt, own.entry.number)))
+        };
+        let most = |number: usize| doubts(number).max_by(|a, b| a.0.total_cmp(&b.0));
+        let status = |(number, photo): (usize, &Photo)| {
+            // Of several objects all that changes their picture.
+            let keys = state.objects.iter().filter_map(|own| {
+                let key = own.views[number].key()?;
+                let several = || format!("{}.{key}.{}", own.entry.number, u8::from(own.entry.remove));
+                Some(if state.objects.len() > 1 { several() } else { key })
+            });
+            let keys: Vec<String> = keys.collect();
+            json!({
+                "name": photo.name, "size": photo.size, "busy": of(number).any(|view| view.version != view.drawn),
+                "overlay": (!keys.is_empty()).then(|| keys.join("_")), "marked": is_marked(&number),
+                "doubt": most(number).map(|(doubt, _)| doubt), "objects": of(number).map(View::status).collect::<Vec<_>>(),
+            })
+        };
+        let all: Vec<_> = photos.iter().enumerate().map(status).collect();
+        let unsure = |(number, photo): (usize, &Photo)| {
+            let (doubt, object) = most(number).filter(|(doubt, _)| *doubt > THIN)?;
+            Some((doubt, photo.name.clone(), object))
         };
         Self {
             text: serde_json::Value::from(all).to_string(),
-            marked: views.iter().filter(|view| view.origin != Origin::None).count(),
-            next: photos.iter().zip(views).filter_map(unsure).max_by(|a, b| a.0.total_cmp(&b.0)),
+            marked: (0..photos.len()).filter(is_marked).count(),
+            next: photos.iter().enumerate().filter_map(unsure).max_by(|a, b| a.0.total_cmp(&b.0)),
         }
     }
 }
@@ -162,12 +244,19 @@ impl Session {
     }
 
     fn overlaid(&self, number: usize, small: bool) -> Result<Vec<u8>, Refusal> {
-        let view = self.lock().views[number].clone();
-        let (mask, kind) = view.shown().ok_or(Refusal::NotFound)?;
-        if small {
-            return overlay(&resample::mask(mask, thumb(self.photos[number].size)), COLORS[kind]);
-        }
-        overlay(mask, COLORS[kind])
+        let size = thumb(self.photos[number].size);
+        let layers: Vec<(GrayImage, Paint)> = {
+            let state = self.lock();
+            let several = state.objects.len() > 1;
+            let layer = |own: &Own| {
+                let (mask, kind) = own.views[number].shown()?;
+                let paint = if several { own.paint() } else { ALONE };
+                Some((if small { resample::mask(mask, size) } else { mask.clone() }, paint[kind]))
+            };
+            state.objects.iter().filter_map(layer).collect()
+        };
+        let painted = layers.iter().map(|(mask, paint)| painted(mask, *paint));
+        png(&painted.reduce(|below, above| laid_over(below, &above)).ok_or(Refusal::NotFound)?)
     }
 
     /// The state as the page reads it. That of the views is made when it changes, not when it is asked for.
@@ -183,7 +272,7 @@ impl Session {
             let mut state = self.lock();
             let views = match &state.said {
                 Some(said) => said.clone(),
-                None => Arc::new(Views::of(&self.photos, &state.views)),
+                None => Arc::new(Views::of(&self.photos, &state)),
             };
             state.said = Some(views.clone());
             let mut part = state.part.clone();
@@ -194,7 +283,10 @@ impl Session {
                 "title": self.title, "revision": state.revision, "phase": state.phase, "part": part,
                 "ready": state.ready, "carrying": state.ready && state.carried != state.revision,
                 "marked": views.marked,
-                "next": views.next.as_ref().map(|(_, name)| name), "doubt": views.next.as_ref().map(|(doubt, _)| doubt),
+                "objects": state.objects.iter().map(Own::status).collect::<Vec<_>>(),
+                "deleted": state.deleted.as_ref().map(|deleted| &deleted.own.entry.name),
+                "next": views.next.as_ref().map(|(_, name, _)| name), "doubt": views.next.as_ref().map(|(doubt, ..)| doubt),
+                "of": views.next.as_ref().map(|(.., object)| object),
                 "problems": state.problems, "error": state.error,
                 "live": steps.is_some() && state.phase == Phase::Working, "files": files,
                 "compare": compare, "removals": state.removals,
@@ -270,12 +362,13 @@ impl Site for Session {
         }
         match path {
             "/api/marks" => {
-                let Marked { view, marks } = parsed(body)?;
+                let Marked { object, view, marks } = parsed(body)?;
                 let number = self
                     .number(&view)
                     .ok_or_else(|| (Refusal::NotFound, format!("no photograph is called {view:?}")))?;
-                self.mark(number, marks)?;
+                self.mark(object, number, marks)?;
             }
+            "/api/objects" => self.change(parsed::<Change>(body)?)?,
             "/api/remove" => self.remove(parsed::<Removed>(body)?.despite)?,
             "/api/stop" => {
                 parsed::<serde_json::Map<String, serde_json::Value>>(body)?;

@@ -186,7 +186,7 @@ fn a_mark_that_fails_leaves_things_as_they_were() {
         let (status, why) = post(address, "/api/marks", &further.replace("\"a\"", &format!("\"{view}\"")));
         assert!(status == 503 && why.contains("objects: cannot be written"), "{status} {why}");
     }
-    assert_eq!(state(address)["views"][0]["marks"], before["views"][0]["marks"]);
+    assert_eq!(state(address)["views"][0]["objects"][0]["marks"], before["views"][0]["objects"][0]["marks"]);
     assert_eq!(state(address)["views"][1], before["views"][1]);
     std::fs::remove_file(place.objects()).unwrap();
     std::fs::rename(&aside, place.objects()).unwrap();
@@ -200,10 +200,10 @@ fn a_mark_that_fails_leaves_things_as_they_were() {
     // Nothing is waited for, and what was marked counts.
     let after = state(address);
     assert_eq!(
-        (&after["views"][0]["busy"], &after["views"][0]["marks"]),
-        (&json!(false), &before["views"][0]["marks"])
+        (&after["views"][0]["busy"], &after["views"][0]["objects"][0]["marks"]),
+        (&json!(false), &before["views"][0]["objects"][0]["marks"])
     );
-    assert_eq!(after["views"][0]["share"], before["views"][0]["share"]);
+    assert_eq!(after["views"][0]["objects"][0]["share"], before["views"][0]["objects"][0]["share"]);
     let gone = "c & <d>";
     std::fs::remove_file(&place.photographs[gone]).unwrap();
     let (status, why) = post(address, "/api/marks", &CLICK.replace("\"a\"", &format!("\"{gone}\"")));
@@ -222,13 +222,13 @@ fn a_cut_after_reopening_begins_with_the_mask_on_disk() {
     objects::write(&place.objects(), "a", SIZE, std::slice::from_ref(&click), Some(&own)).unwrap();
     let session = place.open();
     let brush = Mark::Brush { object: true, radius: 0.02, points: vec![[0.9, 0.9]] };
-    session.mark(0, vec![click.clone(), brush.clone()]).unwrap();
+    session.mark(1, 0, vec![click.clone(), brush.clone()]).unwrap();
     let mask = scene::mask(&place.objects().join("a.png"), 1).unwrap();
     let differs = |(x, y, v): (u32, u32, &Luma<u8>)| (x < 130 && v != own.get_pixel(x, y)).then_some([x, y]);
     assert_eq!(mask.enumerate_pixels().find_map(differs), None);
     assert_eq!(mask.get_pixel(144, 108).0, [255]);
     // One that is known to be made of other marks is not.
-    session.mark(0, vec![brush]).unwrap();
+    session.mark(1, 0, vec![brush]).unwrap();
     assert_eq!(scene::mask(&place.objects().join("a.png"), 1).unwrap().get_pixel(10, 10).0, [0]);
 }
 
@@ -237,16 +237,16 @@ fn a_cut_after_reopening_begins_with_the_mask_on_disk() {
 fn what_is_said_of_views_is_made_once() {
     let place = Place::new();
     let session = place.open();
-    session.mark(0, vec![Mark::Object { at: [0.44, 0.5], scale: 0 }]).unwrap();
+    session.mark(1, 0, vec![Mark::Object { at: [0.44, 0.5], scale: 0 }]).unwrap();
     let said = || session.status();
     let first = said();
     let kept = session.lock().said.clone().unwrap();
     assert!(first == said() && Arc::ptr_eq(&kept, session.lock().said.as_ref().unwrap()));
-    let share = serde_json::from_str::<Value>(&first).unwrap()["views"][0]["share"].as_f64().unwrap();
+    let share = serde_json::from_str::<Value>(&first).unwrap()["views"][0]["objects"][0]["share"].as_f64().unwrap();
     let truth = truth().as_raw().iter().filter(|v| **v != 0).count() as f64 / f64::from(SIZE[0] * SIZE[1]);
     assert!((share / truth - 1.0).abs() < 0.1, "{share} {truth}");
-    session.mark(0, vec![]).unwrap();
-    assert!(serde_json::from_str::<Value>(&said()).unwrap()["views"][0]["share"].is_null());
+    session.mark(1, 0, vec![]).unwrap();
+    assert!(serde_json::from_str::<Value>(&said()).unwrap()["views"][0]["objects"][0]["share"].is_null());
 }
 
 #[test]
@@ -289,7 +289,7 @@ fn what_is_marked_is_kept_and_found_again() {
     let address = serve(&session);
     let (status, said) = post(address, "/api/marks", CLICK);
     let said: Value = serde_json::from_str(&said).unwrap();
-    assert_eq!((status, &said["views"][0]["origin"]), (200, &json!("marks")), "{said}");
+    assert_eq!((status, &said["views"][0]["objects"][0]["origin"]), (200, &json!("marks")), "{said}");
     let [png, kept] = ["a.png", "a.json"].map(|name| place.objects().join(name));
     let mask = scene::mask(&png, 1).unwrap();
     assert!(iou(&mask, &truth()) > 0.9, "{}", iou(&mask, &truth()));
@@ -297,12 +297,12 @@ fn what_is_marked_is_kept_and_found_again() {
     assert_eq!(objects::all(&place.objects(), place.photographs.iter()).unwrap(), [("a".to_owned(), png.clone())]);
 
     let again = place.open();
-    let view = again.lock().views[0].clone();
+    let view = again.lock().objects[0].views[0].clone();
     assert_eq!((view.marks.len(), view.origin), (1, Origin::Marks));
     assert!(view.mask.is_some_and(|kept| *kept == mask));
     // Changed by hand: the marks are of another mask.
     GrayImage::from_fn(SIZE[0], SIZE[1], |x, y| Luma([if x < 40 && y < 30 { 255 } else { 0 }])).save(&png).unwrap();
-    let view = place.open().lock().views[0].clone();
+    let view = place.open().lock().objects[0].views[0].clone();
     assert_eq!((view.marks.len(), view.origin), (0, Origin::File));
     GrayImage::new(3, 3).save(&png).unwrap();
     assert!(Session::open("place", &place.photographs, &place.objects(), &BTreeMap::new()).is_err());
@@ -330,7 +330,7 @@ fn the_last_of_two_pages_wins() {
             });
         }
     });
-    let view = session.lock().views[0].clone();
+    let view = session.lock().objects[0].views[0].clone();
     assert_eq!((view.version, view.drawn), (13, 13));
     let (marks, mask) = objects::read(&place.objects(), "a", SIZE).unwrap().unwrap();
     assert_eq!(marks, view.marks);
@@ -349,16 +349,16 @@ fn work_is_asked_for_once_and_can_be_stopped() {
     assert_eq!(send("/api/marks", CLICK), 200);
     session.ready();
     let Wish::Carry(2, given) = session.wish(Duration::ZERO) else { panic!("masks are carried") };
-    assert_eq!(given.iter().map(|(view, ..)| *view).collect::<Vec<_>>(), [0]);
+    assert_eq!(given[&1].iter().map(|(view, ..)| *view).collect::<Vec<_>>(), [0]);
     let carried = |part: f32| Carried { object: vec![part; 12], evidence: vec![0.2; 12] };
-    assert!(session.carry(2, 1, carried(0.9), [4, 3]));
+    assert!(session.carry(2, 1, 1, carried(0.9), [4, 3]));
     session.carried(2);
     assert!(matches!(session.wish(Duration::ZERO), Wish::Nothing));
     let said = state(address);
     assert_eq!((&said["next"], &said["views"][1]["doubt"]), (&json!("b"), &json!(1.0)));
     // Masks of before are not shown.
     assert_eq!(send("/api/marks", &CLICK.replace("0.44", "0.45")), 200);
-    assert!(!session.carry(2, 1, carried(0.1), [4, 3]));
+    assert!(!session.carry(2, 1, 1, carried(0.1), [4, 3]));
 
     assert_eq!(send("/api/remove", "{}"), 200);
     assert_eq!(send("/api/remove", "{}"), 409);
@@ -421,4 +421,119 @@ fn views_without_the_object_are_drawn_when_they_are_looked_at() {
     assert!(matches!(session.wish(Duration::ZERO), Wish::Remove(false)));
     assert_eq!(get(address, "/after.jpg?view=b").0, 404);
     assert!(matches!(session.wish(Duration::ZERO), Wish::Nothing));
+}
+
+/// The bytes of all files in a folder and the folders below it, by their path.
+fn all_files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut all = BTreeMap::new();
+    for path in std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
+        if path.is_dir() {
+            all.extend(all_files(&path));
+        } else {
+            all.insert(path.clone(), std::fs::read(path).unwrap());
+        }
+    }
+    all
+}
+
+/// Who removes one object has its files where they were and no others, after another one has come and gone as well.
+#[test]
+fn an_object_that_is_alone_has_no_list() {
+    let place = Place::new();
+    let own = || -> Vec<PathBuf> {
+        let photographs = place.photographs.values();
+        all_files(place.folder.path()).into_keys().filter(|path| photographs.clone().all(|own| own != path)).collect()
+    };
+    let address = serve(&place.open());
+    assert_eq!(post(address, "/api/marks", CLICK).0, 200);
+    let alone = all_files(place.folder.path());
+    assert_eq!(own(), ["a.json", "a.png"].map(|name| place.objects().join(name)));
+    let marks = String::from_utf8(alone[&place.objects().join("a.json")].clone()).unwrap();
+    let hash = blake3::hash(&alone[&place.objects().join("a.png")]).to_hex();
+    let written = "{\n  \"marks\": [\n    {\n      \"kind\": \"object\",\n      \"at\": [\n        0.44,\n        0.5\n      ]\n    }\n  ],\n  \"mask\": \"";
+    assert_eq!(marks, format!("{written}{hash}\"\n}}"));
+    let change = |what: &str| post(address, "/api/objects", what);
+    assert_eq!(change(r#"{"add":{}}"#).0, 200);
+    assert_eq!(post(address, "/api/marks", &CLICK.replacen('{', "{\"object\":2,", 1)).0, 200);
+    assert_eq!(own().len(), 5);
+    assert_eq!(change(r#"{"delete":{"object":2}}"#).0, 200);
+    assert!(all_files(place.folder.path()) == alone);
+    let (status, why) = change(r#"{"delete":{"object":1}}"#);
+    assert_eq!((status, why.as_str()), (409, "the only object cannot be deleted; clear its marks\n"));
+}
+
+/// Objects are marked, named, left in the scene, deleted and brought back, and another session finds what this one had.
+#[test]
+fn objects_are_kept_in_a_list() {
+    let place = Place::new();
+    let session = place.open();
+    let address = serve(&session);
+    let change = |what: Value| post(address, "/api/objects", &what.to_string());
+    let mark = |object: usize, view: &str, at: [f64; 2]| {
+        let body = json!({ "object": object, "view": view, "marks": [{ "kind": "object", "at": at }] });
+        post(address, "/api/marks", &body.to_string())
+    };
+    assert_eq!(change(json!({ "add": {} })).0, 200);
+    assert_eq!(change(json!({ "rename": { "object": 2, "name": " the ball " } })).0, 200);
+    assert_eq!((mark(1, "a", [0.44, 0.5]).0, mark(2, "b", [0.05, 0.05]).0), (200, 200));
+    let said = state(address);
+    let told = |said: &Value| -> Vec<(String, bool, u64)> {
+        let of = |o: &Value| (o["name"].as_str().unwrap().into(), o["remove"] == true, o["marked"].as_u64().unwrap());
+        said["objects"].as_array().unwrap().iter().map(of).collect()
+    };
+    let both = [("Object 1".to_owned(), true, 1), ("the ball".to_owned(), true, 1)];
+    assert_eq!((told(&said), &said["marked"]), (both.to_vec(), &json!(2)));
+    let origins = |view: usize| [0, 1].map(|object| said["views"][view]["objects"][object]["origin"].clone());
+    assert_eq!([origins(0), origins(1)], [["marks", "none"], ["none", "marks"]]);
+    // A picture has all objects, each in its colour.
+    let color = |view: &str, at: [u32; 2]| {
+        let (status, png) = get(address, &format!("/overlay.png?view={view}"));
+        assert_eq!(status, 200);
+        image::load_from_memory(&png).unwrap().into_rgba8().get_pixel(at[0], at[1]).0
+    };
+    let [first, second] = [color("a", [70, 60]), color("b", [8, 6])];
+    assert!(first[..3] != second[..3] && first[3] > 0 && second[3] > 0, "{first:?} {second:?}");
+    session.ready();
+    let Wish::Carry(_, given) = session.wish(Duration::ZERO) else { panic!("masks are carried") };
+    let views = |object: usize| given[&object].iter().map(|(view, ..)| *view).collect::<Vec<_>>();
+    assert_eq!((views(1), views(2)), (vec![0], vec![1]));
+    // What is not ticked stays in the scene, with its marks.
+    let wanted = || objects::wanted(&place.objects(), place.photographs.iter()).unwrap();
+    let names = || wanted().into_iter().map(|object| (object.name, object.evidence[0].0.clone())).collect::<Vec<_>>();
+    let [one, ball] = [("Object 1".to_owned(), "a.png".to_owned()), ("the ball".to_owned(), "b.png".to_owned())];
+    assert_eq!(names(), [one.clone(), ball.clone()]);
+    assert_eq!(change(json!({ "tick": { "object": 1, "remove": false } })).0, 200);
+    assert_eq!((names(), wanted()[0].delivered), (vec![ball.clone()], false));
+    assert_eq!(told(&state(address))[0], ("Object 1".to_owned(), false, 1));
+    assert_eq!(post(address, "/api/marks", r#"{"object":2,"view":"b","marks":[]}"#).0, 200);
+    let (status, why) = post(address, "/api/remove", "{}");
+    assert_eq!((status, why.as_str()), (409, "no object that is ticked is marked yet; tick one, or draw around it\n"));
+    // The only one that is left goes, whatever was ticked.
+    let before = all_files(place.folder.path());
+    assert_eq!(change(json!({ "delete": { "object": 2 } })).0, 200);
+    assert_eq!((names(), &state(address)["deleted"]), (vec![one], &json!("the ball")));
+    assert_eq!(mark(2, "b", [0.05, 0.05]).0, 404);
+    assert_eq!(change(json!({ "restore": {} })).0, 200);
+    assert!(all_files(place.folder.path()) == before);
+    assert_eq!((change(json!({ "restore": {} })).0, mark(2, "b", [0.05, 0.05]).0), (409, 200));
+
+    let again = place.open();
+    let entries = |session: &Session| session.lock().objects.iter().map(|own| own.entry.clone()).collect::<Vec<_>>();
+    assert_eq!(entries(&again), entries(&session));
+    assert_eq!(again.lock().objects[1].views[1].marks.len(), 1);
+    for nonsense in ["", "{", "{}", r#"{"add":{"x":1}}"#, r#"{"rename":{"object":1,"name":" "}}"#, r#"{"other":{}}"#] {
+        let (status, said) = post(address, "/api/objects", nonsense);
+        assert!(status == 400 && said.lines().count() == 1, "{nonsense}: {status} {said}");
+    }
+    assert_eq!(change(json!({ "tick": { "object": 7, "remove": true } })).0, 404);
+    // While it is being removed the list stays; one that was changed by hand and is none is refused.
+    session.remove(false).unwrap();
+    assert_eq!(change(json!({ "add": {} })).0, 409);
+    let list = place.objects().with_extension("json");
+    for text in ["[]", "{", r#"[{"number":0,"name":"a","remove":true}]"#, r#"[{"number":2,"name":"","remove":true}]"#] {
+        std::fs::write(&list, text).unwrap();
+        let why =
+            Session::open("place", &place.photographs, &place.objects(), &BTreeMap::new()).err().unwrap().to_string();
+        assert!(why.contains("objects.json: it is no list of objects"), "{why}");
+    }
 }

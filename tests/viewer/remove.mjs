@@ -2,47 +2,14 @@
 // remove.mjs CHROMIUM URL PICTURES X,Y X,Y,... where the positions, 0 to 1, are clicked in the photograph that is shown; what
 // it sees goes into the folder PICTURES. Prints JSON: the masks' shares of two photographs, the files' sizes, and pictures of
 // two views without the object.
-import puppeteer from 'puppeteer-core';
+import { visit } from './visit.mjs';
 
-const [executablePath, url, pictures, ...clicks] = process.argv.slice(2);
-const browser = await puppeteer.launch({
-  executablePath,
-  args: ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist'],
-});
+const [chromium, url, pictures, ...clicks] = process.argv.slice(2);
+const { browser, page, problems, shoot, until, server, click, carried, remove, fail } = await visit(chromium, url, pictures);
 try {
-  const page = await browser.newPage();
-  const problems = [];
-  page.on('pageerror', (error) => problems.push(error.message));
-  page.on('request', (request) => {
-    const { protocol, host } = new URL(request.url());
-    if (!['data:', 'blob:'].includes(protocol) && host !== new URL(url).host) problems.push(request.url());
-  });
-  await page.evaluateOnNewDocument(() => {
-    globalThis.violations = [];
-    addEventListener('securitypolicyviolation', (event) => globalThis.violations.push(`${event.violatedDirective} ${event.blockedURI}`));
-  });
-  const sizes = { wide: { width: 1280, height: 800 }, phone: { width: 390, height: 844 } };
-  const shoot = async (name) => {
-    for (const [size, viewport] of Object.entries(sizes).reverse()) {
-      await page.setViewport(viewport);
-      for (const scheme of ['dark', 'light']) {
-        await page.emulateMediaFeatures([{ name: 'prefers-color-scheme', value: scheme }]);
-        await new Promise((resolve) => setTimeout(resolve, 300));
-        await page.screenshot({ path: `${pictures}/${name}-${size}-${scheme}.png` });
-      }
-    }
-  };
-  await page.setViewport(sizes.wide);
-  await page.goto(url);
-  const until = (what, timeout = 100_000) => page.waitForFunction(what, { timeout, polling: 200 });
-  await until(() => document.getElementById('photo').naturalWidth > 0);
   await shoot('open');
-  const server = () => page.evaluate(async () => (await fetch('api/state')).json());
-  for (const [i, click] of clicks.entries()) {
-    const [x, y] = click.split(',').map(Number);
-    const box = await (await page.$('#picture')).boundingBox();
-    await page.mouse.click(box.x + x * box.width, box.y + y * box.height);
-    await until(() => document.getElementById('thinking').hidden && !document.getElementById('overlay').hidden);
+  for (const [i, place] of clicks.entries()) {
+    await click(place.split(',').map(Number));
     // One by the keys, undone and done again.
     if (i === 0) {
       await page.keyboard.press('b');
@@ -58,31 +25,17 @@ try {
     }
   }
   const marked = await page.evaluate(() => document.getElementById('name').textContent);
-  // Until the fit is there and the mask is in all other photographs.
-  await page.waitForFunction(async () => {
-    const state = await (await fetch('api/state')).json();
-    return state.ready && !state.carrying;
-  }, { timeout: 100_000, polling: 500 });
-  await until(() => !document.querySelector('#progress').checkVisibility());
+  await carried();
   await shoot('carried');
   const before = await server();
   await page.focus('#stage');
   await page.keyboard.press('ArrowRight');
   await until(() => !document.getElementById('overlay').hidden);
   const other = await page.evaluate(() => document.getElementById('name').textContent);
-  await page.click('#remove');
-  await until(() => document.body.dataset.phase === 'working');
-  await until(() => document.body.dataset.phase === 'done' || !document.getElementById('drawn').hidden || !document.getElementById('error').hidden);
-  await shoot('working');
-  await until(() => document.body.dataset.phase === 'done' || !document.getElementById('error').hidden || !document.getElementById('problems').hidden);
-  if (await page.evaluate(() => !document.getElementById('problems').hidden)) {
-    await shoot('problems');
-    await page.click('#remove');
-    await until(() => document.body.dataset.phase === 'working');
-    await until(() => document.body.dataset.phase !== 'working');
-  }
-  const error = await page.evaluate(() => document.getElementById('error').textContent);
-  if (error) throw new Error(error);
+  await remove(async () => {
+    await until(() => document.body.dataset.phase === 'done' || !document.getElementById('drawn').hidden || !document.getElementById('error').hidden);
+    await shoot('working');
+  });
   const frame = await (await page.waitForSelector('#viewer:not([hidden])')).contentFrame();
   await frame.waitForFunction(() => document.documentElement.dataset.state, { timeout: 60_000 });
   await new Promise((resolve) => setTimeout(resolve, 1500));
@@ -125,9 +78,8 @@ try {
     const bytes = await (await fetch(link.href)).arrayBuffer();
     return [link.download, bytes.byteLength];
   })));
-  problems.push(...await page.evaluate(() => globalThis.violations));
-  if (problems.length) throw new Error(problems.join('; '));
-  const share = (name) => before.views.find((view) => view.name === name).share;
+  await fail();
+  const share = (name) => before.views.find((view) => view.name === name).objects[0].share;
   console.log(JSON.stringify({ marked, other, shares: [share(marked), share(other)], files, compared }));
 } finally {
   await browser.close();

@@ -16,8 +16,10 @@ use super::{next, preset, signals, train};
 use crate::config::SettingsArgs;
 use crate::export;
 use crate::folder::Lock;
-use crate::prepare::poses;
+use crate::prepare::Object;
+use crate::prepare::poses::{self, Capture};
 use crate::remove::objects;
+use crate::scene::stem;
 use crate::splat::read;
 use time::{Time, Work};
 use work::{Job, Places};
@@ -32,6 +34,10 @@ use work::{Job, Places};
 /// into one folder: the masks that were clicked (objects/NAME.png), the scene (scene/), the run (run/), and the files for
 /// viewers. The same command again goes on where it was cut off, and makes again only what has changed.
 ///
+/// Several objects are listed on the page, each with its name and colour, and what is ticked is removed: at once, or one by one, with
+/// Remove pressed again. Their masks lie in objects/, objects-2/ and so on, the list in objects.json. Without a browser --object
+/// begins another one.
+///
 /// A splat of any program (PLY of 3D Gaussian Splatting, SuperSplat's compressed PLY, SPZ, SOG, .splat, or
 /// GLB with KHR_gaussian_splatting) stands for photographs as well: it is drawn from --cameras, the object's Gaussians are taken out,
 /// new ones are trained in the hole, and every other Gaussian stays as it is.
@@ -44,6 +50,7 @@ use work::{Job, Places};
   gscream-vk remove photos --out garden --mask IMG_0012=mask.png
   gscream-vk remove photos --out garden --box IMG_0012=310,220,540,470 --yes
   gscream-vk remove photos --out garden --click IMG_0012=430,340 --yes
+  gscream-vk remove photos --out garden --object pot --click IMG_0012=430,340 --object ball --click IMG_0005=90,80 --yes
   gscream-vk remove photos --out garden --yes      # with the masks in garden/objects")]
 pub(super) struct Args {
     /// Folder of photographs, a video, or a splat (PLY, SPZ, SOG, .splat or GLB)
@@ -144,27 +151,60 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     if args.object.is_empty() && !args.yes {
         return page::run(&job, &capture);
     }
-    let mut objects = args.object.0.clone();
-    let first = &mut objects[0].evidence;
-    let named: Vec<String> = first.iter().map(|(name, _)| crate::scene::stem(name).to_owned()).collect();
-    let kept = objects::all(&job.places.objects, capture.photographs.iter().filter(|(name, _)| !named.contains(name)))?;
-    if !kept.is_empty() {
-        eprintln!("objects: {} masks in {} count as well", kept.len(), job.places.objects.display());
-    }
-    first.extend(work::evidence(kept));
+    let objects = job.objects(&capture)?;
+    let names = job.names(&objects);
     args.device.with_gpu(|gpu| {
         signals::listen()?;
         job.work(gpu, objects, args.yes, &work::Nobody, began)
     })?;
-    job.say();
+    job.say(&names);
     Ok(())
 }
 
 impl Job<'_> {
+    /// The objects of the command, and what was marked of those before in photographs where they have no mark here: what has no
+    /// name here is the first one of the list, unless that is to stay.
+    fn objects(&self, capture: &Capture) -> anyhow::Result<Vec<Object>> {
+        let folder = &self.places.objects;
+        let mut all = self.args.object.0.clone();
+        let mut kept = 0;
+        let listed = objects::wanted(folder, capture.photographs.iter())?;
+        let first = listed.iter().any(|object| object.delivered);
+        for object in listed {
+            let same = all.iter().position(|own| own.name == object.name || own.name.is_empty() && object.delivered);
+            let at = same.unwrap_or(all.len());
+            if same.is_none() {
+                all.push(Object { name: object.name.clone(), evidence: vec![], delivered: object.delivered });
+            }
+            let own = &mut all[at];
+            own.name = object.name;
+            let named: Vec<String> = own.evidence.iter().map(|(name, _)| stem(name).to_owned()).collect();
+            let more = object.evidence.into_iter().filter(|(name, _)| !named.iter().any(|named| named == stem(name)));
+            let before = own.evidence.len();
+            own.evidence.extend(more);
+            kept += own.evidence.len() - before;
+        }
+        if kept > 0 {
+            eprintln!("objects: {kept} masks in {} count as well", folder.display());
+        }
+        all[0].delivered &= first || !all[0].evidence.is_empty();
+        Ok(all)
+    }
+
+    /// What is to be gone, in words.
+    fn names(&self, objects: &[Object]) -> String {
+        let marked: Vec<&str> =
+            objects.iter().filter(|object| !object.evidence.is_empty()).map(|object| object.name.as_str()).collect();
+        match marked.as_slice() {
+            [rest @ .., last] if !rest.is_empty() => format!("{} and {last} are", rest.join(", ")),
+            _ => "the object is".into(),
+        }
+    }
+
     /// Says what there is now, and what can be done with it.
-    fn say(&self) {
+    fn say(&self, names: &str) {
         let Places { root, run, .. } = &self.places;
-        println!("{}: the object is gone", root.display());
+        println!("{}: {names} gone", root.display());
         for (name, path) in self.places.files() {
             let bytes = std::fs::metadata(&path).map_or(0, |file| file.len());
             println!("  {name:10} {:8.1} MB", bytes as f64 / 1e6);

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use anyhow::Context as _;
 use image::GrayImage;
 
-use super::work::{self, Audience, Job, Places};
+use super::work::{Audience, Job, Places};
 use super::{open_browser, signals};
 use crate::cli::export::{Cameras, FIGURES};
 use crate::cli::folders::Origin;
@@ -18,13 +18,13 @@ use crate::cli::train::{self, Stop};
 use crate::cli::{shared, view};
 use crate::gpu::Gpu;
 use crate::model::stored::Stored;
+use crate::prepare::Fitted;
 use crate::prepare::depth::DepthMap;
 use crate::prepare::fit::Fit;
 use crate::prepare::masks::{self, Shares, Votes};
 use crate::prepare::poses::Capture;
 use crate::prepare::splats::Splats;
-use crate::prepare::{Fitted, Object};
-use crate::remove::{Results, Session, Wish, objects};
+use crate::remove::{Masked, Results, Session, Wish, objects};
 use crate::render::view::Renderer;
 use crate::scene::doctor::{Finding, Report, Severity};
 use crate::scene::{self, Camera, Scene};
@@ -162,13 +162,13 @@ fn attend(job: &Job<'_>, gpu: &Gpu, session: &Arc<Session>, capture: &Capture) -
 fn remove(job: &Job<'_>, gpu: &Gpu, session: &Session, capture: &Capture, despite: bool) -> anyhow::Result<()> {
     let began = Instant::now();
     session.begin("masks", 0);
-    let masks = objects::all(&job.places.objects, capture.photographs.iter())?;
-    let objects = vec![Object { evidence: work::evidence(masks).collect(), ..Object::default() }];
+    let objects = objects::wanted(&job.places.objects, capture.photographs.iter())?;
+    let names = job.names(&objects);
     job.work(gpu, objects, despite, &Visitors(session), began)?;
     session.begin("page", 0);
     let page = view::page_of(&job.places.root).context("the object is gone, but it cannot be shown")?;
     session.done(Results::new(page.resources(), job.places.files(), before(job, session)?));
-    job.say();
+    job.say(&names);
     Ok(())
 }
 
@@ -211,6 +211,15 @@ fn draw(
     Ok(scene::jpeg(&renderer.render(camera)?.to_rgb8(), QUALITY)?)
 }
 
+/// The votes of an object's masks.
+#[derive(Default)]
+struct Ballot {
+    /// By photograph: those of its mask, and the mask's version.
+    votes: BTreeMap<usize, (u64, Votes)>,
+    /// Whether they were carried to all views.
+    carried: bool,
+}
+
 /// Carries masks to all views, by the fit.
 struct Carrier {
     scene: Scene,
@@ -219,8 +228,8 @@ struct Carrier {
     colors: Vec<[f32; 3]>,
     /// Numbers of the scene's views among the photographs.
     numbers: Vec<Option<usize>>,
-    /// Votes of a photograph's mask, and the mask's version.
-    votes: BTreeMap<usize, (u64, Votes)>,
+    /// By object: the photographs' votes.
+    votes: BTreeMap<usize, Ballot>,
 }
 
 impl Carrier {
@@ -245,54 +254,73 @@ impl Carrier {
         Ok(Self { scene, fit, splats, colors, numbers, votes: BTreeMap::new() })
     }
 
-    /// Until they change or something else is to be done.
-    fn carry(
-        &mut self,
-        session: &Session,
-        revision: u64,
-        given: &[(usize, u64, Arc<GrayImage>)],
-    ) -> anyhow::Result<()> {
-        self.votes.retain(|of, (version, _)| given.iter().any(|(number, v, _)| number == of && v == version));
-        for (number, version, mask) in given {
-            let view = self.numbers.iter().position(|own| *own == Some(*number)).map(|i| &self.scene.train[i]);
-            let Some(view) = view.filter(|_| !self.votes.contains_key(number)) else { continue };
-            let mut votes = Votes::new(&self.splats);
-            votes.add(&mut self.splats, &view.camera, &masks::parts(mask, view.camera.size))?;
-            self.votes.insert(*number, (*version, votes));
+    /// Until they change or something else is to be done, object by object: those whose masks have changed.
+    fn carry(&mut self, session: &Session, revision: u64, given: &BTreeMap<usize, Vec<Masked>>) -> anyhow::Result<()> {
+        self.votes.retain(|object, _| given.contains_key(object));
+        for (object, given) in given {
+            self.count(*object, given)?;
         }
-        let count = |without: Option<usize>| {
-            let mut sum = Votes::new(&self.splats);
-            let others = self.votes.iter().filter(|(number, _)| Some(**number) != without);
-            others.for_each(|(_, (_, votes))| sum.join(votes));
-            sum.count(self.fit.positions(), &self.colors)
-        };
-        if self.votes.is_empty() {
-            session.carried(revision);
-            return Ok(());
-        }
-        let all = count(None);
-        // What is marked in a view is no evidence of what others say of it.
-        let others: BTreeMap<usize, Shares> = match self.votes.len() {
-            1 => BTreeMap::new(),
-            _ => self.votes.keys().map(|number| (*number, count(Some(*number)))).collect(),
-        };
-        session.begin("carry", self.scene.train.len() as u64);
-        for (i, number) in self.numbers.iter().enumerate() {
-            let Some(number) = number else { continue };
-            if session.is_stale(revision) || signals::caught().is_some() {
+        let stale: Vec<usize> = self.votes.iter().filter(|(_, own)| !own.carried).map(|(object, _)| *object).collect();
+        session.begin("carry", (stale.len() * self.scene.train.len()) as u64);
+        for (turn, object) in stale.iter().enumerate() {
+            if !self.carry_one(session, revision, *object, turn * self.scene.train.len())? {
                 session.end();
                 return Ok(());
             }
-            let camera = self.scene.train[i].camera;
-            let of_others = others.get(number);
-            if of_others.is_some() || !self.votes.contains_key(number) {
-                let carried = of_others.unwrap_or(&all).carry(&mut self.splats, &camera)?;
-                session.carry(revision, *number, carried, camera.size);
-            }
-            session.at(i as u64 + 1);
         }
         session.carried(revision);
         session.end();
         Ok(())
+    }
+
+    /// The votes of an object's masks, those that are there already excepted.
+    fn count(&mut self, object: usize, given: &[Masked]) -> anyhow::Result<()> {
+        let own = self.votes.entry(object).or_default();
+        let before = own.votes.len();
+        own.votes.retain(|of, (version, _)| given.iter().any(|(number, v, _)| number == of && v == version));
+        own.carried &= own.votes.len() == before;
+        for (number, version, mask) in given {
+            let view = self.numbers.iter().position(|own| *own == Some(*number)).map(|i| &self.scene.train[i]);
+            let Some(view) = view.filter(|_| !own.votes.contains_key(number)) else { continue };
+            let mut votes = Votes::new(&self.splats);
+            votes.add(&mut self.splats, &view.camera, &masks::parts(mask, view.camera.size))?;
+            own.votes.insert(*number, (*version, votes));
+            own.carried = false;
+        }
+        Ok(())
+    }
+
+    /// Carries an object to all views; whether it came to the end.
+    fn carry_one(&mut self, session: &Session, revision: u64, object: usize, done: usize) -> anyhow::Result<bool> {
+        let Some(own) = self.votes.get_mut(&object).filter(|own| !own.votes.is_empty()) else { return Ok(true) };
+        let count = |without: Option<usize>| {
+            let mut sum = Votes::new(&self.splats);
+            let others = own.votes.iter().filter(|(number, _)| Some(**number) != without);
+            others.for_each(|(_, (_, votes))| sum.join(votes));
+            sum.count(self.fit.positions(), &self.colors)
+        };
+        let all = count(None);
+        // What is marked in a view is no evidence of what others say of it.
+        let others: BTreeMap<usize, Shares> = match own.votes.len() {
+            1 => BTreeMap::new(),
+            _ => own.votes.keys().map(|number| (*number, count(Some(*number)))).collect(),
+        };
+        for (i, number) in self.numbers.iter().enumerate() {
+            let Some(number) = number else { continue };
+            if session.is_stale(revision) || signals::caught().is_some() {
+                return Ok(false);
+            }
+            let camera = self.scene.train[i].camera;
+            let of_others = others.get(number);
+            if of_others.is_some() || !own.votes.contains_key(number) {
+                let carried = of_others.unwrap_or(&all).carry(&mut self.splats, &camera)?;
+                if !session.carry(revision, object, *number, carried, camera.size) {
+                    return Ok(false);
+                }
+            }
+            session.at((done + i + 1) as u64);
+        }
+        own.carried = true;
+        Ok(true)
     }
 }

@@ -24,7 +24,7 @@ use crate::model::files::{POINT_CLOUD, WEIGHTS};
 use crate::prepare::fit::Ready;
 use crate::prepare::record::{self, Inputs};
 use crate::prepare::shadow::Answer;
-use crate::prepare::{self, Evidence, Object, Request, Step, Watch};
+use crate::prepare::{self, Object, Request, Step, Watch};
 use crate::scene::doctor::Report;
 use crate::signal::Signal;
 use crate::splat::read::Splat;
@@ -41,7 +41,7 @@ pub struct Places {
     pub scene: PathBuf,
     /// The run.
     pub run: PathBuf,
-    /// The masks that were clicked.
+    /// The masks that were clicked of the first object; those of others lie beside it.
     pub objects: PathBuf,
 }
 
@@ -131,12 +131,6 @@ impl Record {
         let path = root.join(RECORD);
         atomic::write_json(&path, self).with_context(|| format!("{}: cannot be written", path.display()))
     }
-}
-
-/// Masks in files as `prepare` takes them.
-pub fn evidence(masks: Vec<(String, PathBuf)>) -> impl Iterator<Item = (String, Evidence)> {
-    // A name may have a dot in it, where an extension would begin.
-    masks.into_iter().map(|(name, path)| (format!("{name}.png"), Evidence::Mask(path)))
 }
 
 /// Bars on the terminal, an audience, and a clock.
