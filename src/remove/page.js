@@ -135,6 +135,9 @@ function redo() {
 const rows = new Map();
 // The object whose name is being written.
 let editing;
+// What was ticked when the first tick was changed after a removal: with the same ticks its result is shown again.
+let taken;
+const ticks = () => state.objects.map((o) => [o.number, o.remove]).join();
 
 const change = (what) => post('api/objects', what).then(() => say(''), (error) => say(error.message));
 
@@ -170,7 +173,13 @@ function row({ number }) {
   const item = $('row').content.firstElementChild.cloneNode(true);
   const [tick, radio, text] = item.querySelectorAll('input');
   const [edit, away] = item.querySelectorAll('button');
-  tick.onchange = () => { changing = true; change({ tick: { object: number, remove: tick.checked } }); };
+  tick.onchange = async () => {
+    if (!changing) taken = ticks();
+    changing = true;
+    await change({ tick: { object: number, remove: tick.checked } });
+    changing = ticks() !== taken;
+    draw();
+  };
   radio.onchange = () => choose(number);
   edit.onclick = () => {
     editing = number;
@@ -564,7 +573,7 @@ $('next').onclick = () => {
   choose(state.of);
   show(state.next, true);
 };
-$('again').onclick = () => { changing = true; draw(); stage.focus(); };
+$('again').onclick = () => { changing = true; taken = undefined; draw(); stage.focus(); };
 $('remove').onclick = async () => {
   changing = false;
   $('remove').disabled = true;
