@@ -25,11 +25,31 @@ const END: f64 = 0.98;
 /// Shortest way into the hole, as a part of that through it, after which a surface ends.
 const LEAST: f64 = 0.05;
 
+/// The end of a surface in a hole.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Cut {
+    /// Number of the surface.
+    surface: usize,
+    /// Where it ends at the straight border along its side, and on its far side, sites.
+    end: [DVec2; 2],
+    /// Where the border would come out of the hole.
+    out: DVec2,
+}
+
+impl Cut {
+    /// Whether a surface is not at a place, being beyond this end of it.
+    pub fn bars(&self, surface: usize, place: DVec2) -> bool {
+        let [foot, corner] = self.end;
+        let side = |at: DVec2| (corner - foot).perp_dot(at - foot);
+        surface == self.surface && side(place) * side(self.out) > 0.0
+    }
+}
+
 impl Sight {
-    /// The straight borders that go into the hole of a view that is solved. One along which a surface lies that ends on its far side ends
-    /// there, too, and a border at right angles to it is added.
-    pub fn cut_off(&self) -> Vec<[DVec2; 2]> {
-        let mut borders = self.borders.clone();
+    /// The straight borders that go into the hole of a view that is solved, and the ends of surfaces there. A border along which a surface
+    /// lies that ends on its far side ends there, too, and one at right angles to it is added.
+    pub fn cut_off(&self) -> (Vec<[DVec2; 2]>, Vec<Cut>) {
+        let (mut borders, mut cuts) = (self.borders.clone(), vec![]);
         for k in 0..borders.len() {
             let [from, to] = borders[k];
             let way = (to - from).normalize();
@@ -37,16 +57,19 @@ impl Sight {
             if self.borders.iter().any(is_one) {
                 continue;
             }
-            if let Some([foot, corner]) = [ASIDE, -ASIDE].iter().find_map(|side| self.end([from, to], *side)) {
+            if let Some((surface, end @ [foot, corner])) =
+                [ASIDE, -ASIDE].iter().find_map(|side| self.end([from, to], *side))
+            {
                 borders[k][1] = foot;
                 borders.push([corner, foot]);
+                cuts.push(Cut { surface, end, out: to });
             }
         }
-        borders
+        (borders, cuts)
     }
 
-    /// Where the surface ends that lies to a side of a border, at the border and on its far side.
-    fn end(&self, [from, to]: [DVec2; 2], side: f64) -> Option<[DVec2; 2]> {
+    /// The surface that lies to a side of a border, and where it ends at the border and on its far side.
+    fn end(&self, [from, to]: [DVec2; 2], side: f64) -> Option<(usize, [DVec2; 2])> {
         let way = (to - from).normalize();
         let beside = from + way.perp() * side;
         let label = |at: DVec2| self.label(at);
@@ -62,12 +85,11 @@ impl Sight {
         let along = (point(to) - origin) / length;
         let across = DVec3::from(*plane).cross(along).normalize();
         let across = across * across.dot(point(beside) - origin).signum();
-        let columns = self.grid.columns as usize;
         // How far along the border each of its sites is, and how far from it; and whether that is in the hole.
         let sites = (0..self.surface.len()).filter(|site| self.surface[*site] == own);
         let places: Vec<(bool, f64, f64)> = sites
             .map(|site| {
-                let off = point(DVec2::new((site % columns) as f64, (site / columns) as f64) + 0.5) - origin;
+                let off = point(self.middle(site)) - origin;
                 (self.hole[site], off.dot(along), off.dot(across))
             })
             .collect();
@@ -81,7 +103,7 @@ impl Sight {
         let foot = origin + along * far;
         let seen = |point: DVec3| DVec2::from(self.grid.place([point.x / point.z, point.y / point.z]));
         let ends = far > LEAST * length && far < near.min(length);
-        ends.then(|| [seen(foot), seen(foot + across * wide)])
+        ends.then(|| (usize::from(own), [seen(foot), seen(foot + across * wide)]))
     }
 
     /// Beside a straight border that goes on in the hole the place on the same side of it that is so far from it that its site is of what is
@@ -95,6 +117,12 @@ impl Sight {
             let [own, other] = [ASIDE, -ASIDE].map(|off| at + way.perp() * (off.copysign(off * aside) - aside));
             (self.label(own)? != self.label(other)?).then_some(own.to_array())
         })
+    }
+
+    /// The middle of a site.
+    pub(super) fn middle(&self, site: usize) -> DVec2 {
+        let columns = self.grid.columns as usize;
+        DVec2::new((site % columns) as f64, (site / columns) as f64) + 0.5
     }
 
     /// The surface of the site at a place.
@@ -124,13 +152,18 @@ mod tests {
         }
         let edge = [DVec2::new(20.0, 10.0), DVec2::new(40.0, 10.0)];
         sight.borders = vec![edge];
-        let found = sight.cut_off();
+        let (found, cuts) = sight.cut_off();
         assert_eq!(found.len(), 2, "{found:?}");
         let [foot, corner] = [found[0][1], found[1][0]];
         assert!(foot.distance(DVec2::new(30.0, 10.0)) < 1.0 && found[1][1] == foot, "{foot}");
         assert!(corner.distance(DVec2::new(30.0, 24.0)) < 2.0, "{corner}");
+        let barred = |x: f64| cuts.iter().any(|cut| cut.bars(0, DVec2::new(x, 18.0)));
+        assert!(
+            cuts.len() == 1 && barred(34.0) && !barred(26.0) && !cuts[0].bars(1, DVec2::new(34.0, 18.0)),
+            "{cuts:?}"
+        );
         // It comes out again.
         sight.borders = vec![edge, [edge[1], edge[0]]];
-        assert_eq!(sight.cut_off(), sight.borders);
+        assert_eq!(sight.cut_off(), (sight.borders.clone(), vec![]));
     }
 }

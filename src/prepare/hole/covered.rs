@@ -8,13 +8,13 @@ use rand_pcg::Pcg64;
 use rayon::prelude::*;
 
 use super::flat::{self, Common, Measured};
-use super::material::{MATERIAL, materials, nearest, of_another};
+use super::material::{Look, MATERIAL, materials, nearest, of_another};
 use super::surface::{SAME, Sight, Sights};
 use crate::prepare::planes::{self, Plane};
 
 /// Least part of the points around all holes that makes a surface.
 const LEAST: f64 = 0.04;
-/// Sites to each side whose mean says what a site is covered with.
+/// Sites to each side among which is what a site is covered with.
 const REACH: i64 = 2;
 /// Cost of a site for each [`MATERIAL`] that its colour is from its surface's, and at most.
 const COST: f64 = 2.0;
@@ -38,14 +38,14 @@ const BEFORE: f64 = 0.3;
 pub struct Covered {
     /// Inverse depth by x/z, y/z and 1 of the view's camera.
     pub plane: Plane,
-    /// The mean colour of surroundings on it, 0 to 1.
-    pub color: [f32; 3],
+    /// Surroundings on it.
+    pub look: Look,
 }
 
 impl Covered {
-    /// A plane of this colour as a view sees it; nothing where its camera stands in it.
-    pub(super) fn seen_by(plane: &Common, color: [f32; 3], sight: &Sight) -> Option<Self> {
-        plane.seen_by(sight).map(|plane| Self { plane, color })
+    /// A plane of this look as a view sees it; nothing where its camera stands in it.
+    pub(super) fn seen_by(plane: &Common, look: Look, sight: &Sight) -> Option<Self> {
+        plane.seen_by(sight).map(|plane| Self { plane, look })
     }
 }
 
@@ -142,16 +142,35 @@ impl Sight {
         self.grid.colors[site].map(|v| f32::from(v) / 255.0)
     }
 
-    /// The mean colour around a site, 0 to 1, without the object; NaN in the middle of it.
-    pub fn color_around(&self, site: usize) -> [f32; 3] {
-        let near: Vec<usize> = self.grid.around(site, REACH).filter(|at| !self.hole[*at]).collect();
-        let sum = |c: usize| near.iter().map(|at| f32::from(self.grid.colors[*at][c])).sum::<f32>();
-        std::array::from_fn(|c| sum(c) / (255.0 * near.len() as f32))
+    /// What is around a site, without the object; NaN in the middle of it. Of the four squares with the site in a corner the one that
+    /// varies least (Kuwahara 1976): the others may reach over a border.
+    pub fn look_around(&self, site: usize) -> Look {
+        let at = |dx: i64, dy: i64| {
+            let [column, row] =
+                [site % self.grid.columns as usize, site / self.grid.columns as usize].map(|v| v as i64);
+            self.grid.site(column + dx, row + dy).filter(|at| !self.hole[*at])
+        };
+        let look = |[x, y]: [i64; 2]| {
+            let near: Vec<[f32; 3]> = (0..=REACH)
+                .flat_map(|u| (0..=REACH).filter_map(move |v| at(x * u, y * v)))
+                .map(|at| self.color(at))
+                .collect();
+            let mean = |of: &dyn Fn(&[f32; 3]) -> f32| near.iter().map(of).sum::<f32>() / near.len() as f32;
+            let light = |color: &[f32; 3]| color.iter().sum::<f32>() / 3.0;
+            let middle = mean(&light);
+            [mean(&|c| c[0]), mean(&|c| c[1]), mean(&|c| c[2]), mean(&|c| (light(c) - middle).powi(2)).sqrt()]
+        };
+        let looks = [[-1, -1], [1, -1], [-1, 1], [1, 1]].map(look);
+        looks
+            .into_iter()
+            .filter(|look| look[3].is_finite())
+            .min_by(|a, b| a[3].total_cmp(&b[3]))
+            .unwrap_or([f32::NAN; 4])
     }
 
     /// The material of the surface of this number, where that is known.
-    pub fn material(&self, surface: usize) -> Option<[f32; 3]> {
-        self.covered.get(surface).filter(|_| surface < self.planes.len()).map(|covered| covered.color)
+    pub fn material(&self, surface: usize) -> Option<Look> {
+        self.covered.get(surface).filter(|_| surface < self.planes.len()).map(|covered| covered.look)
     }
 
     /// `[cell]` what each covered plane costs there, and at last to be on none, by depth and colour; nothing in the hole. `known` is the
@@ -164,14 +183,14 @@ impl Sight {
     ) -> Vec<Option<Vec<f64>>> {
         let one = |cell: usize| -> Option<Vec<f64>> {
             let site = Some(sites[cell]).filter(|site| !self.hole[*site])?;
-            let (color, ray, d) = (self.color_around(site), self.ray(site), f64::from(known[cell]));
+            let (look, ray, d) = (self.look_around(site), self.ray(site), f64::from(known[cell]));
             let cost = |covered: &Covered| {
                 let surface = planes::on(&covered.plane, ray);
                 let off = match d > 0.0 && d.is_finite() {
                     true => ((surface - d).abs() / (planes::THICKNESS * d)).min(planes::OFF),
                     false => planes::IMPOSSIBLE * if surface > 0.0 { against(cell, surface) } else { 1.0 },
                 };
-                off + (COST * f64::from(of_another(color, covered.color) / MATERIAL)).min(MOST)
+                off + (COST * f64::from(of_another(look, covered.look) / MATERIAL)).min(MOST)
             };
             Some(self.covered.iter().map(cost).chain([BESIDE]).collect())
         };
@@ -180,23 +199,22 @@ impl Sight {
 }
 
 impl Sights {
-    /// The surfaces of one material around the holes, by what all views show: planes of the materials there, and their colours. The same
-    /// seed finds the same.
-    pub(super) fn covered(&self, seed: u64) -> Vec<(Common, [f32; 3])> {
-        let color = |(view, site): (usize, usize)| self.0[view].color_around(site);
-        let all: Vec<((usize, usize), [f32; 3])> =
-            self.around_holes(true).into_iter().map(|at| (at, color(at))).collect();
-        let colors = materials(&all.iter().map(|(_, color)| *color).collect::<Vec<_>>());
+    /// The surfaces of one material around the holes, by what all views show: planes of the materials there, and these. The same seed
+    /// finds the same.
+    pub(super) fn covered(&self, seed: u64) -> Vec<(Common, Look)> {
+        let look = |(view, site): (usize, usize)| self.0[view].look_around(site);
+        let all: Vec<((usize, usize), Look)> = self.around_holes(true).into_iter().map(|at| (at, look(at))).collect();
+        let looks = materials(&all.iter().map(|(_, look)| *look).collect::<Vec<_>>());
         let least = (LEAST * all.len() as f64).ceil() as usize;
         let mut rng = Pcg64::new(seed.into(), 44);
-        let colors = &colors;
-        let of = |k: usize| all.iter().filter(move |(_, color)| nearest(*color, colors) == Some(k)).map(|(at, _)| *at);
+        let looks = &looks;
+        let of = |k: usize| all.iter().filter(move |(_, look)| nearest(*look, looks) == Some(k)).map(|(at, _)| *at);
         let mut found = vec![];
-        for (k, color) in colors.iter().enumerate() {
+        for (k, look) in looks.iter().enumerate() {
             let points = of(k).map(|(view, site)| self.measured(view, site)).collect();
-            found.extend(flat::largest(points, least, &mut rng).into_iter().map(|plane| (plane, *color)));
+            found.extend(flat::largest(points, least, &mut rng).into_iter().map(|plane| (plane, *look)));
         }
-        log::debug!("covered: {} materials on {} surfaces", colors.len(), found.len());
+        log::debug!("covered: materials {looks:?} on {} surfaces", found.len());
         found
     }
 
@@ -215,6 +233,21 @@ impl Sights {
 mod tests {
     use super::super::surface::tests::{SIZE, views};
     use super::*;
+
+    /// Beside a border a site is of its own side, and so is its grain: smooth beside what is rough.
+    #[test]
+    fn a_site_at_a_border_is_of_its_own_side() {
+        let (mut grids, cameras, masks) = views(0.0);
+        let width = SIZE[0] as usize;
+        for (site, color) in grids[0].colors.iter_mut().enumerate() {
+            let [x, y] = [site % width, site / width];
+            *color = if x < 20 { [100; 3] } else { [if (x + y) % 2 == 0 { 60 } else { 220 }; 3] };
+        }
+        let sight = Sight::new(grids.swap_remove(0), &cameras[0], &masks[0]);
+        let [smooth, rough] = [19, 22].map(|x| sight.look_around(10 * width + x));
+        assert!((smooth[0] - 100.0 / 255.0).abs() < 1e-6 && smooth[3] < 1e-6, "{smooth:?}");
+        assert!(rough[3] > 0.2, "{rough:?}");
+    }
 
     /// A hedge above a bench is a hundredth farther away, so that one plane fits both: they are two surfaces by their colours, and each goes
     /// on in the hole up to where they meet on both sides.
@@ -244,7 +277,7 @@ mod tests {
         let wrong = (0..sight.hole.len()).filter(|site| sight.hole[*site]).filter(|site| {
             let hedge = (*site as u32 / SIZE[0]) < 17;
             let color = sight.material(usize::from(sight.surface[*site]));
-            color.is_none_or(|color| (color[1] > color[2]) != hedge)
+            color.is_none_or(|look| (look[1] > look[2]) != hedge)
         });
         let holes = sight.hole.iter().filter(|hole| **hole).count();
         let wrong = wrong.count();

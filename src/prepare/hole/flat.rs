@@ -214,7 +214,7 @@ impl Sights {
         for (sight, Flat { planes, cover, sites }) in self.0.iter_mut().zip(flat) {
             if planes.is_empty() {
                 sight.covered =
-                    covered.iter().filter_map(|(plane, color)| Covered::seen_by(plane, *color, sight)).collect();
+                    covered.iter().filter_map(|(plane, look)| Covered::seen_by(plane, *look, sight)).collect();
             }
             (sight.around, sight.cover) = (planes, cover);
             sites.into_iter().for_each(|(site, depth)| sight.depth[site] = depth);

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 
 use super::color::{Filling, Photograph, between};
 use super::holed::Texture;
-use super::material::{MATERIAL, of_another};
+use super::material::{Look, MATERIAL, of_another};
 use super::surface::{APART, SAME, Sight, Sights};
 use super::texture;
 use crate::prepare::planes::{self, Plane, membrane};
@@ -120,7 +120,7 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
         let one: Vec<bool> = (0..sight.planes.len())
             .map(|l| l == number || alike(sight, l, number) && nearly_one(sight, plane, rays(l)))
             .collect();
-        let materials: Vec<[f32; 3]> =
+        let materials: Vec<Look> =
             (0..one.len()).filter(|label| one[*label]).filter_map(|label| sight.material(label)).collect();
         let off = |label: u8| {
             let other = if usize::from(label) == number { SAME } else { APART };
@@ -224,7 +224,7 @@ struct Its<'a> {
     /// How far what lies on a surface may be off the plane, if it is one of these.
     off: &'a (dyn Fn(u8) -> Option<f64> + Sync),
     /// Materials that they are covered with; nothing where that is not known.
-    materials: Vec<[f32; 3]>,
+    materials: Vec<Look>,
 }
 
 /// Charts a plane with what is known of it; the hole is what is to be filled there. `its` are the
@@ -275,7 +275,7 @@ fn charted(
                     true => materials.is_empty() || its.is_some(),
                     false => {
                         let site = sight.grid.site(place[0].floor() as i64, place[1].floor() as i64);
-                        site.is_some_and(|site| one_of(materials, sight.color_around(site)))
+                        site.is_some_and(|site| one_of(materials, sight.look_around(site)))
                     }
                 };
                 if on_it && is_of() {
@@ -291,7 +291,7 @@ fn charted(
         }
         let shows = |k: &usize| {
             let sight = &sights.0[*k];
-            let site = sight.shows(world, SAME).filter(|site| one_of(materials, sight.color_around(*site)));
+            let site = sight.shows(world, SAME).filter(|site| one_of(materials, sight.look_around(*site)));
             site.and_then(|_| photographs[*k].color(world))
         };
         let seen = others.iter().filter_map(shows);
@@ -307,8 +307,8 @@ fn charted(
 }
 
 /// Whether surroundings are of one of these materials, or of any where none is known.
-fn one_of(materials: &[[f32; 3]], color: [f32; 3]) -> bool {
-    materials.is_empty() || materials.iter().any(|material| of_another(color, *material) <= MATERIAL)
+fn one_of(materials: &[Look], look: Look) -> bool {
+    materials.is_empty() || materials.iter().any(|material| of_another(look, *material) <= MATERIAL)
 }
 
 /// The first of the colours that several photographs show of one place that most of them come near: a highlight is elsewhere in

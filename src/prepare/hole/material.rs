@@ -10,30 +10,37 @@ pub const ENOUGH: f64 = 0.25;
 /// Colours among which materials are looked for at most, and the least part of them that makes one.
 const SAMPLES: usize = 300;
 const LEAST: f32 = 0.04;
+/// What a difference of grain counts beyond one that is within a material.
+const GRAIN: f32 = 4.0;
+const ROUGH: f32 = 0.02;
 
-/// How much the colours of two surroundings are those of different materials, summed over the channels.
-pub fn of_another(one: [f32; 3], other: [f32; 3]) -> f32 {
-    let off: [f32; 3] = std::array::from_fn(|c| one[c] - other[c]);
-    let light = off.iter().sum::<f32>() / 3.0;
+/// The mean colour of surroundings, 0 to 1, and their grain: the deviation of the mean of the channels.
+pub type Look = [f32; 4];
+
+/// How much two surroundings, colours or [`Look`]s, are of different materials, summed over the channels.
+pub fn of_another<const N: usize>(one: [f32; N], other: [f32; N]) -> f32 {
+    let off: [f32; N] = std::array::from_fn(|c| one[c] - other[c]);
+    let light = off[..3].iter().sum::<f32>() / 3.0;
     // Light is alike in all channels; the rest is another colour.
-    let color: f32 = off.iter().map(|off| (off - light).abs()).sum();
-    color + 3.0 * (light.abs() - LIGHT).max(0.0)
+    let color: f32 = off[..3].iter().map(|off| (off - light).abs()).sum();
+    let grain: f32 = off[3..].iter().map(|off| GRAIN * (off.abs() - ROUGH).max(0.0)).sum();
+    color + 3.0 * (light.abs() - LIGHT).max(0.0) + grain
 }
 
 /// The number of the material that a colour is nearest to, of these mean colours.
-pub fn nearest(color: [f32; 3], materials: &[[f32; 3]]) -> Option<usize> {
+pub fn nearest<const N: usize>(color: [f32; N], materials: &[[f32; N]]) -> Option<usize> {
     let apart = |k: &usize| of_another(color, materials[*k]);
     (0..materials.len()).min_by(|a, b| apart(a).total_cmp(&apart(b)))
 }
 
 /// The mean colours of the materials among the colours of surroundings, the most frequent first: the two that are least apart become one
 /// until all are of different materials.
-pub fn materials(colors: &[[f32; 3]]) -> Vec<[f32; 3]> {
+pub fn materials<const N: usize>(colors: &[[f32; N]]) -> Vec<[f32; N]> {
     let every = colors.len().div_ceil(SAMPLES).max(1);
-    let mut found: Vec<([f32; 3], f32)> = colors.iter().step_by(every).map(|color| (*color, 1.0)).collect();
+    let mut found: Vec<([f32; N], f32)> = colors.iter().step_by(every).map(|color| (*color, 1.0)).collect();
     let all = found.len() as f32;
     // The nearest earlier one of each.
-    let nearest = |found: &[([f32; 3], f32)], a: usize| {
+    let nearest = |found: &[([f32; N], f32)], a: usize| {
         let others = (0..a).map(|b| (of_another(found[a].0, found[b].0), b));
         others.reduce(|best, next| if next.0 < best.0 { next } else { best }).unwrap_or((f32::INFINITY, 0))
     };
@@ -79,5 +86,20 @@ mod tests {
         assert_eq!(found.len(), 2, "{found:?}");
         assert!(of_another(found[0], [0.24, 0.44, 0.24]) < 0.1 && of_another(found[1], [0.49, 0.69, 0.89]) < 0.1);
         assert_eq!(materials(&[]), Vec::<[f32; 3]>::new());
+    }
+
+    /// Gravel before a smooth stone of its mean colour is another material.
+    #[test]
+    fn grain_tells_materials_of_one_colour_apart() {
+        let look = |i: usize| -> Look {
+            [0.4, 0.42, 0.5, if i.is_multiple_of(2) { 0.02 } else { 0.06 } + 0.0001 * (i % 50) as f32]
+        };
+        let looks: Vec<Look> = (0..200).map(look).collect();
+        assert_eq!(materials(&looks[..1]).len(), 1);
+        assert_eq!(materials(&looks).len(), 1);
+        let rougher: Vec<Look> =
+            looks.iter().map(|[r, g, b, grain]| [*r, *g, *b, if *grain > 0.05 { 0.12 } else { *grain }]).collect();
+        assert_eq!(materials(&rougher).len(), 2);
+        assert_eq!(of_another([0.4, 0.42, 0.5], [0.4, 0.42, 0.5]), 0.0);
     }
 }

@@ -67,8 +67,8 @@ pub const METHOD: &str = "one surface with smooth ends, nothing where others loo
      lights joined, doubts left to training, nothing stands on what only crosses the floor, lines go on through holes, \
      what is nearly one plane is one, copies nearly keep their hue, ends are where the first view has them, \
      nothing from views with the object elsewhere, nothing stands where the first view looks through, surfaces by what they are covered with, \
-     straight borders go on, those that end in a hole too, surfaces end at right angles, grain is kept, floors end at their walls, and planes \
-     have their materials";
+     straight borders go on, those that end in a hole too, surfaces end at right angles, grain is kept, floors end at their walls, planes have \
+     their materials, which have grain, and what is bare of the object refutes nothing";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 
@@ -173,7 +173,7 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
         sights.0[of].borders = guess::ends(&sights.0[of], &photographs[of]);
         let mut solved = sights.clone();
         solved.solve(of, task.seed);
-        sights.0[of].borders = solved.0[of].cut_off();
+        (sights.0[of].borders, sights.0[of].cuts) = solved.0[of].cut_off();
     }
     sights.solve(of, task.seed);
     // After the reference those that show most of what is still unknown.

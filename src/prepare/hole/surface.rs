@@ -9,6 +9,7 @@ use glam::{DMat3, DVec2, DVec3};
 use image::GrayImage;
 use rayon::prelude::*;
 
+use super::corner::Cut;
 use super::covered::{Cover, Covered};
 use super::flat;
 use super::window::Window;
@@ -42,6 +43,8 @@ const UNSHOWN: f64 = 1.0;
 const UNSHOWN_BEHIND: f64 = 2.0;
 /// Part of the depth that a site was carried to before which no plane takes it: a bare surface is measured wrong, not so wrong.
 const NEARER: f64 = 0.5;
+/// Sites to each side among which the object's nearest depth counts.
+const BARE: i64 = 3;
 /// Sites of a hole that are filled from their neighbours where no more than these are unknown.
 const FEW: usize = 12;
 
@@ -52,6 +55,9 @@ pub struct Sight {
     pub grid: DepthGrid,
     /// `[site]` whether the object, or a margin around it, covers it.
     pub hole: Vec<bool>,
+    /// `[site of the hole]` depth z of the object as others confirm it, 0 where they do not. On what is bare single depths are wrong, and
+    /// within the object the nearest around counts.
+    pub(super) object: Vec<f64>,
     /// `[site]` depth z of what is there without the object, scene units; NaN where it is not known.
     pub depth: Vec<f64>,
     /// `[site]` whether another photograph shows it past the object.
@@ -71,6 +77,8 @@ pub struct Sight {
     /// Straight borders between what looks different that go into the hole, places in sites: from where they do to where they come out of
     /// it, or would.
     pub borders: Vec<[DVec2; 2]>,
+    /// Where surfaces end in the hole.
+    pub cuts: Vec<Cut>,
     /// Whether every site has its depth.
     pub solved: bool,
     /// How many views were solved before it.
@@ -170,6 +178,13 @@ impl Sight {
         let hole: Vec<bool> = (0..grid.depth.len()).map(|site| covers(mask, camera, &grid, site)).collect();
         let depth = grid.depth.iter().zip(&hole).map(|(z, hole)| if *hole { f64::NAN } else { *z }).collect();
         let sites = hole.len();
+        let object = |site: usize| {
+            let confirmed = |at: &usize| grid.confirmed[*at];
+            let within = grid.around(site, BARE).all(|at| hole[at]);
+            let near = grid.around(site, if within { BARE } else { 0 }).filter(confirmed).map(|at| grid.depth[at]);
+            if hole[site] && grid.confirmed[site] { near.fold(f64::INFINITY, f64::min) } else { 0.0 }
+        };
+        let object = (0..sites).map(object).collect();
         let [focal, principal] = [grid.camera.focal, grid.camera.principal]
             .map(|lengths| lengths.map(|length| f64::from(length) / f64::from(grid.stride)));
         let lens = DMat3::from_cols_array(&[focal[0], 0.0, 0.0, 0.0, focal[1], 0.0, principal[0], principal[1], 1.0]);
@@ -180,6 +195,7 @@ impl Sight {
             backward: (turn.transpose() * lens.inverse(), DVec3::from(grid.camera.center())),
             grid,
             hole,
+            object,
             depth,
             measured: vec![false; sites],
             surface: vec![0; sites],
@@ -188,6 +204,7 @@ impl Sight {
             cover: Cover::default(),
             covered: vec![],
             borders: vec![],
+            cuts: vec![],
             solved: false,
             rank: 0,
         }
@@ -487,7 +504,7 @@ impl Sights {
             let first = solved.map(|claim| self.0[claim.view].rank).min();
             near.retain(|claim| claim.photographed || Some(self.0[claim.view].rank) == first);
             near.sort_unstable_by(|a, b| a.depth.total_cmp(&b.depth));
-            let object = if own.grid.confirmed[site] { own.grid.depth[site] } else { 0.0 };
+            let object = own.object[site];
             let solved = first.is_some();
             let (mut last, mut votes, mut refuted) = (0, Votes::of(self.0.len()), f64::NAN);
             // Each cluster begins with the next claim.
@@ -627,13 +644,16 @@ impl Sights {
             depths.reduce(f64::min).filter(|_| own.hole[*site])
         };
         let under: Vec<Option<f64>> = sites.iter().map(under).collect();
+        let corner = own.middle(sites[0]) - 0.5;
         let against = |cell: usize, d: f64| {
             let site = sites[cell];
-            let object = own.hole[site] && own.grid.confirmed[site];
-            if d.is_nan() || d <= 0.0 || object && 1.0 / d < (1.0 - APART) * own.grid.depth[site] {
+            if d.is_nan() || d <= 0.0 || own.hole[site] && 1.0 / d < (1.0 - APART) * own.object[site] {
                 return 1.0;
             }
             let is = planes.iter().position(|plane| planes::on(plane, own.ray(site)) == d);
+            if is.is_some_and(|plane| own.cuts.iter().any(|cut| cut.bars(plane, own.middle(site)))) {
+                return 1.0;
+            }
             let hidden = under[cell].is_some_and(|z| 1.0 / d > (1.0 + SAME) * z)
                 || is.is_some_and(|plane| own.cover.has_ended(plane, &planes, own.ray(site)));
             self.against(of, own.point(site, 1.0 / d)).max(if hidden { BELOW } else { 0.0 })
@@ -644,8 +664,6 @@ impl Sights {
             (false, false) => own.material_costs(&sites, &known, &against),
             (false, true) => vec![],
         };
-        let corner = [sites[0] % own.grid.columns as usize, sites[0] / own.grid.columns as usize];
-        let corner = DVec2::from(corner.map(|v| v as f64));
         let borders: Vec<[DVec2; 2]> = own.borders.iter().map(|ends| ends.map(|end| end - corner)).collect();
         let hole = planes::Hole {
             told,

@@ -59,9 +59,9 @@ impl Sights {
         let Some((site, z)) = sight.see(point).filter(|_| sight.grid.trusted) else { return Witness::Silent };
         let hole = sight.hole[site];
         // The object hides what is behind it, and shows that nothing else is before it.
-        let known = if hole && !sight.solved { sight.grid.depth[site] } else { sight.depth[site] };
         let object = hole && !sight.solved;
-        if !known.is_finite() || object && !sight.grid.confirmed[site] {
+        let known = if object { sight.object[site] } else { sight.depth[site] };
+        if !known.is_finite() || known == 0.0 {
             Witness::Silent
         } else if z < (1.0 - APART) * known {
             Witness::Through
@@ -223,5 +223,23 @@ mod tests {
         let site = |x: usize| 16 * SIZE[0] as usize + x;
         assert!(sights.barred(0, site(24), 14.0) && sights.barred(0, site(28), 14.0));
         assert!(!sights.barred(0, site(24), 3.0) && !sights.barred(0, site(42), 14.0));
+    }
+
+    /// On a bare square the views measure the wall's depth and more here and there: that proves nothing of what is behind it.
+    #[test]
+    fn what_is_bare_of_the_object_refutes_nothing() {
+        let (mut grids, cameras, masks) = views(0.4);
+        for (grid, mask) in grids.iter_mut().zip(&masks) {
+            for (site, depth) in grid.depth.iter_mut().enumerate() {
+                let [x, y] = [site as u32 % SIZE[0], site as u32 / SIZE[0]];
+                let wrong = mask.as_raw()[site] != 0 && (x / 4) % 2 == 0 && (y / 4) % 2 == 0;
+                *depth = if wrong { 4.6 } else { *depth };
+            }
+        }
+        let sights = Sights::new(grids, &cameras, &masks, &masks);
+        let middle = (SIZE[1] / 2 * SIZE[0] + SIZE[0] / 2) as usize;
+        let deep: Vec<usize> = sights.0[2].around(middle).collect();
+        assert!(deep.iter().all(|site| sights.0[2].hole[*site] && sights.0[2].object[*site] == 2.0));
+        assert!(deep.iter().all(|site| sights.against(2, sights.0[2].point(*site, 4.0)) < 1.0));
     }
 }
