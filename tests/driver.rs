@@ -23,8 +23,8 @@ const MAP: i32 = -5;
 const FRAGMENTED_POOL: i32 = -12;
 const POOL_MEMORY: i32 = -1_000_069_000;
 
-const ALLOCATE: &str = "vkAllocateMemory";
-/// Allocations of a round of growth that fail.
+const CREATE: &str = "vkCreateBuffer";
+/// Buffers of a round of growth that cannot be made.
 const MOMENTS: usize = 8;
 
 /// What the first, the middle and the last call of a name are answered with.
@@ -256,27 +256,31 @@ fn a_training_at_each_call_that_fails() {
 }
 
 #[test]
-fn a_round_of_growth_at_allocations_that_fail() {
+fn a_round_of_growth_at_buffers_that_cannot_be_made() {
     let Some(driver) = Driver::new() else { return };
     let (Ended { trace, .. }, whole) = driver.whole(true);
-    let allocations = |trace: &[String]| trace.iter().filter(|name| *name == ALLOCATE).count();
+    let count = |trace: &[String], call: &str| trace.iter().filter(|name| *name == call).count();
     let grows = |name: &String| name.starts_with("densify/grow");
     let first = trace.iter().position(grows).expect("anchors grow");
     let last = trace.iter().rposition(grows).expect("anchors grow");
     let next = last + trace[last..].iter().position(|name| name.starts_with("render/")).expect("a step follows");
-    let (before, within) = (allocations(&trace[..first]), allocations(&trace[first..next]));
-    assert!(within > 100, "{within} allocations");
+    let round = &trace[first..next];
+    let (before, within) = (count(&trace[..first], CREATE), count(round, CREATE));
+    assert!(within > 100, "{within} buffers");
+    // Those of the device have memory that others have left; what the host writes and reads is small, and shares blocks
+    // where not every buffer is alone.
+    let allocations = count(round, "vkAllocateMemory");
+    assert!(allocations <= 30, "{allocations} allocations for {within} buffers");
     // The candidates of all levels, the free cells of each of three, what grows, who is pruned, and what is left.
-    let submissions = trace[first..next].iter().filter(|name| *name == "vkQueueSubmit2").count();
+    let submissions = count(round, "vkQueueSubmit2");
     assert!(submissions <= 7, "{submissions} submissions");
     let fault = |moment: usize| {
         let at = before + 1 + moment * (within - 1) / (MOMENTS - 1);
         let result = [DEVICE_MEMORY, HOST_MEMORY][moment % 2];
-        Fault { call: ALLOCATE.to_owned(), at, result, alone: true, ..Fault::default() }
+        Fault { call: CREATE.to_owned(), at, result, alone: true, ..Fault::default() }
     };
     let early = (0..MOMENTS).into_par_iter().filter(|&moment| driver.survives(&fault(moment), &whole, true)).count();
-    // What is copied from the host finds other memory where the device's own is full.
-    assert!(early > MOMENTS / 2, "{early} of {MOMENTS} failures end the training");
+    assert_eq!(early, MOMENTS, "each failure ends the training");
 }
 
 /// A recording that runs pass by pass goes through the rest of the step when one of its submissions has failed.

@@ -1,6 +1,7 @@
 //! What a recording is made in, used again and again.
 
 use ash::vk;
+use gpu_allocator::MemoryLocation;
 use gpu_allocator::vulkan::Allocation;
 
 use super::descriptors::Sets;
@@ -89,7 +90,7 @@ impl Context {
             inner.device.destroy_query_pool(self.queries, None);
             inner.device.destroy_fence(self.fence, None);
             if let Some((markers, allocation)) = self.markers {
-                inner.discard(markers, allocation);
+                inner.discard(markers, allocation, MemoryLocation::GpuToCpu);
             }
         }
     }

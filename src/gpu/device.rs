@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 use ash::vk;
+use gpu_allocator::MemoryLocation;
 use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, Allocator, AllocatorCreateDesc};
 use rayon::iter::{IntoParallelIterator as _, ParallelIterator as _};
 
@@ -17,6 +18,7 @@ use super::instance::{Instance, has};
 use super::kernel::Interface;
 use super::ledger::{Ledger, Rehearsal};
 use super::physical::{self, DeviceInfo, Found};
+use super::spares::{self, Spares};
 use super::statistics::{self, Compiled, Statistic};
 use super::witness::Case;
 
@@ -121,7 +123,8 @@ pub(super) struct Inner {
     /// Dispatches that were kept.
     pub cases: Mutex<Vec<Case>>,
     in_flight: Mutex<u32>,
-    trash: Mutex<Vec<(vk::Buffer, Allocation)>>,
+    trash: Mutex<Vec<(vk::Buffer, Allocation, MemoryLocation)>>,
+    spares: Mutex<Spares>,
     pipelines: Mutex<HashMap<PipelineKey, Arc<Pipeline>>>,
     allocator: Mutex<Option<Allocator>>,
     physical: vk::PhysicalDevice,
@@ -228,6 +231,7 @@ impl Gpu {
             cases: Mutex::default(),
             in_flight: Mutex::new(0),
             trash: Mutex::default(),
+            spares: Mutex::default(),
             pipelines: Mutex::default(),
             allocator: Mutex::new(Some(allocator)),
             device,
@@ -262,7 +266,7 @@ impl Gpu {
         let mut memory = vk::PhysicalDeviceMemoryProperties2::default().push_next(&mut budget);
         // SAFETY: a plain query of a live instance; `memory_budget` says that the device lists the extension of the chained structure.
         unsafe { instance.raw.get_physical_device_memory_properties2(*physical, &mut memory) };
-        free_bytes(&memory.memory_properties, &budget)
+        free_bytes(&memory.memory_properties, &budget) + lock(&self.inner.spares).bytes()
     }
 
     /// Names of the kernels of all pipelines made so far, each once; in a rehearsal, of those that a device would make.
@@ -305,6 +309,17 @@ impl Gpu {
 
     pub(super) fn inner(&self) -> &Arc<Inner> {
         &self.inner
+    }
+}
+
+/// Whether another buffer can have the memory of one that goes: it belongs to no block.
+fn is_spare(bytes: u64, location: MemoryLocation) -> bool {
+    location == MemoryLocation::GpuOnly && bytes > DEVICE_BLOCK
+}
+
+fn free(allocator: &mut Allocator, allocation: Allocation) {
+    if let Err(error) = allocator.free(allocation) {
+        log::error!("freeing device memory: {error}");
     }
 }
 
@@ -403,14 +418,39 @@ impl Inner {
     ) -> Result<Allocation, gpu_allocator::AllocationError> {
         let mut allocator = lock(&self.allocator);
         let allocator = allocator.as_mut().expect("the allocator lives until the device is dropped");
-        let allocation = allocator.allocate(description)?;
+        let mut spares = lock(&self.spares);
+        let bytes = description.requirements.size;
+        let spare = if is_spare(bytes, description.location) { spares.take(bytes) } else { None };
+        let allocation = match spare {
+            Some(spare) => spare,
+            None => {
+                // What nobody uses is no reason for more memory than there ever was.
+                let (now, peak) = self.ledger.memory();
+                spares.beyond(peak.saturating_sub(now + bytes)).into_iter().for_each(|spare| free(allocator, spare));
+                match allocator.allocate(description) {
+                    Err(_) if spares.bytes() > 0 => {
+                        spares.beyond(0).into_iter().for_each(|spare| free(allocator, spare));
+                        allocator.allocate(description)
+                    }
+                    other => other,
+                }?
+            }
+        };
         self.ledger.take(allocation.size());
         Ok(allocation)
     }
 
+    /// Bytes that the memory of a buffer has that needs so many.
+    pub(super) fn memory_size(&self, bytes: u64, location: MemoryLocation) -> u64 {
+        match location {
+            MemoryLocation::GpuOnly => spares::size(bytes, DEVICE_BLOCK, self.info.max_binding_bytes),
+            _ => bytes,
+        }
+    }
+
     /// Frees a buffer once nothing in flight can use it.
-    pub(super) fn discard(&self, raw: vk::Buffer, allocation: Allocation) {
-        lock(&self.trash).push((raw, allocation));
+    pub(super) fn discard(&self, raw: vk::Buffer, allocation: Allocation, location: MemoryLocation) {
+        lock(&self.trash).push((raw, allocation, location));
         // Held until the trash is empty: a recording that began meanwhile could use a buffer and discard it, and that one
         // would be freed with the others.
         let in_flight = lock(&self.in_flight);
@@ -435,12 +475,14 @@ impl Inner {
     fn empty_trash(&self) {
         let mut allocator = lock(&self.allocator);
         let Some(allocator) = allocator.as_mut() else { return };
-        for (raw, allocation) in lock(&self.trash).drain(..) {
+        for (raw, allocation, location) in lock(&self.trash).drain(..) {
             self.ledger.give(allocation.size());
             // SAFETY: its owner discarded the buffer, nothing is in flight, and nothing begins while the caller holds the count.
             unsafe { self.device.destroy_buffer(raw, None) };
-            if let Err(error) = allocator.free(allocation) {
-                log::error!("freeing device memory: {error}");
+            if is_spare(allocation.size(), location) {
+                lock(&self.spares).keep(allocation);
+            } else {
+                free(allocator, allocation);
             }
         }
     }
@@ -629,7 +671,9 @@ impl Drop for Inner {
         for pipeline in lock(&self.pipelines).values() {
             self.destroy(pipeline);
         }
-        drop(lock(&self.allocator).take());
+        if let Some(mut allocator) = lock(&self.allocator).take() {
+            lock(&self.spares).beyond(0).into_iter().for_each(|spare| free(&mut allocator, spare));
+        }
     }
 }
 

@@ -34,7 +34,7 @@ struct Memory {
 /// What stands behind a buffer.
 enum Backing {
     /// Memory of the device, until the buffer is taken apart.
-    Real { allocation: Option<Allocation>, gpu: Arc<Inner> },
+    Real { allocation: Option<Allocation>, location: MemoryLocation, gpu: Arc<Inner> },
     /// Nothing but an entry in the books; `host` as if the host saw it.
     Counted { taken: u64, host: bool, rehearsal: Arc<Rehearsal> },
 }
@@ -119,10 +119,10 @@ impl<T: bytemuck::Pod> Buffer<T> {
 impl Drop for Memory {
     fn drop(&mut self) {
         match &mut self.backing {
-            Backing::Real { allocation, gpu } => {
+            Backing::Real { allocation, location, gpu } => {
                 if let Some(allocation) = allocation.take() {
                     gpu.ledger.close(self.raw.as_raw());
-                    gpu.discard(self.raw, allocation);
+                    gpu.discard(self.raw, allocation, *location);
                 }
             }
             Backing::Counted { taken, rehearsal, .. } => rehearsal.close(self.raw.as_raw(), *taken),
@@ -268,7 +268,7 @@ impl Gpu {
             let mut requirements = vk::MemoryRequirements2::default();
             // SAFETY: a plain query of a live device.
             unsafe { inner.device.get_device_buffer_memory_requirements(&create, &mut requirements) };
-            let taken = requirements.memory_requirements.size;
+            let taken = inner.memory_size(requirements.memory_requirements.size, location);
             let raw = vk::Buffer::from_raw(rehearsal.open(name, padded, taken));
             let host = location != MemoryLocation::GpuOnly;
             let backing = Backing::Counted { taken, host, rehearsal: rehearsal.clone() };
@@ -288,10 +288,11 @@ impl Gpu {
         };
         // SAFETY: the device outlives the buffer, which holds an Arc of it; the size is positive and below the limit of a binding
         // where kernels use it; memory is bound before anybody else sees it.
-        let (raw, requirements) = unsafe {
+        let (raw, mut requirements) = unsafe {
             let raw = inner.device.create_buffer(&info, None).map_err(refused)?;
             (raw, inner.device.get_buffer_memory_requirements(raw))
         };
+        requirements.size = inner.memory_size(requirements.size, location);
         let description = AllocationCreateDesc {
             name,
             requirements,
@@ -310,12 +311,12 @@ impl Gpu {
         // SAFETY: a fresh buffer; the allocator was given its size, alignment and memory types.
         let bound = unsafe { inner.device.bind_buffer_memory(raw, allocation.memory(), allocation.offset()) };
         if let Err(result) = bound {
-            inner.discard(raw, allocation);
+            inner.discard(raw, allocation, location);
             return Err(refused(result));
         }
         inner.name_object(raw, name);
         inner.ledger.open(raw.as_raw(), name, padded);
-        let backing = Backing::Real { allocation: Some(allocation), gpu: inner.clone() };
+        let backing = Backing::Real { allocation: Some(allocation), location, gpu: inner.clone() };
         let memory = Memory { raw, bytes: padded, name, stage: self.ledger().stage(), backing };
         let mut buffer = Buffer { memory: Arc::new(memory), bytes, len, element: PhantomData };
         if inner.options.poison {

@@ -19,6 +19,7 @@ pub mod ledger;
 pub mod memory;
 mod physical;
 pub mod recorder;
+mod spares;
 pub mod statistics;
 pub mod testing;
 pub mod timings;
