@@ -132,6 +132,8 @@ pub struct Scene {
     /// `[train view]` red, green and blue of its photograph over the usual ones, divided out by [`condition`]; empty where
     /// the photographs were left as they are.
     pub gains: Vec<[f64; 3]>,
+    /// Whether the object's shadow was taken out of photographs.
+    pub relit: bool,
     /// One line each: the layout found, scales worked out, what is absent and what follows.
     pub notes: Notes,
 }
@@ -162,7 +164,8 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     notes.append(&mut layout.notes);
 
     let shadowed = layout.train.iter().filter(|e| e.relight.is_some()).count();
-    if shadowed > 0 && config.relight {
+    let relit = shadowed > 0 && config.relight;
+    if relit {
         notes.push(format!("the object's shadow is taken out of {shadowed} photographs ({RELIGHT}/)"));
     } else if shadowed > 0 {
         layout.train.iter_mut().for_each(|e| e.relight = None);
@@ -336,6 +339,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
         radius: radius.unwrap_or(1.0),
         unit: 1.0,
         gains: vec![],
+        relit,
         notes,
     })
 }
@@ -660,12 +664,9 @@ impl Reader<'_> {
         if !same_proportions(picture, intrinsics.size) {
             return Err(Error::ImageSize { path: entry.image.clone(), size: picture, camera: intrinsics.size });
         }
-        let image = decode(&entry.image)?.into_rgb8();
         let size = reduced(picture, self.config.downscale);
-        let mut image = if size == picture { image } else { resample::photograph(&image, size) };
-        if let Some(map) = &entry.relight {
-            relight::apply(map, picture, &mut image)?;
-        }
+        let image = decode(&entry.image)?.into_rgb8();
+        let image = relight::reduced(entry.relight.as_deref(), &image, size)?;
         let mut stretched_mask = false;
         let mask = match &entry.mask {
             None => None,

@@ -473,6 +473,7 @@ fn resized(scene: &Scene, from: u32, to: u32) -> Scene {
         points: scene.points.clone(),
         dense: scene.dense.clone(),
         gains: scene.gains.clone(),
+        relit: scene.relit,
         radius: scene.radius,
         unit: scene.unit,
         notes: Notes::default(),

@@ -325,6 +325,17 @@ mod tests {
         }
     }
 
+    /// What is left of a shadow that was taken out around masks is none of the object.
+    #[test]
+    fn where_a_shadow_was_taken_out_nothing_is_judged() {
+        let [_, tight] = scenes(0);
+        for relit in [false, true] {
+            let mut scene = Scene { relit, ..tight.clone() };
+            super::super::condition(&mut scene, &Config::default());
+            assert_eq!(scene.notes.iter().any(|note| note.contains("too tight")), !relit);
+        }
+    }
+
     #[test]
     fn right_masks_stay() {
         for seed in [0, 1, 2] {

@@ -51,7 +51,8 @@ pub fn condition(scene: &mut Scene, config: &Config) {
         points::seed_holes(scene, &depths);
         points::seed_behind_edges(scene, &depths);
     }
-    let rims = config.judge_rim.then(|| judge::rims(scene));
+    // What is left of a shadow that was taken out is none of the object, and around it all views have a hole.
+    let rims = (config.judge_rim && !scene.relit).then(|| judge::rims(scene));
     rim::soften(scene, config.rim);
     if let Some(rims) = rims {
         rim::raise(scene, &rims);
