@@ -396,7 +396,7 @@ mod tests {
         assert!(mask("x").is_err() && mask("=a.png").is_err() && pixels("x=").is_err());
     }
 
-    /// Of whatever kind it is, and however often an object is named.
+    /// Marks of every kind are, however often an object is named.
     #[test]
     fn a_mark_is_of_the_object_named_last_before_it() {
         #[derive(clap::Parser)]

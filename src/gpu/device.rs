@@ -116,7 +116,7 @@ pub(super) struct Inner {
     pub info: DeviceInfo,
     pub options: Options,
     pub contexts: Mutex<Vec<Context>>,
-    /// Of submissions that could not be waited for, and may run still.
+    /// Contexts of submissions that could not be waited for, and may run still.
     pub stuck: Mutex<Vec<Context>>,
     pub debug: Option<ash::ext::debug_utils::Device>,
     pub ledger: Ledger,

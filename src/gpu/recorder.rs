@@ -460,7 +460,7 @@ impl<'g> Recorder<'g> {
         self.passes.push(name);
     }
 
-    /// What comes before the first pass.
+    /// Resets timestamps and markers, and records the barrier behind what earlier submissions wrote.
     fn begin(&mut self) {
         let inner = self.gpu.inner();
         let Some(Target::Device(context)) = &self.target else { return };

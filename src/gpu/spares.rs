@@ -29,7 +29,7 @@ impl Spares {
         Some(self.0.swap_remove(found))
     }
 
-    /// What has to go for no more than `most` bytes to stay.
+    /// Takes out allocations until no more than `most` bytes are left.
     pub fn beyond(&mut self, most: u64) -> Vec<Allocation> {
         let mut left = self.bytes();
         let goes = self.0.iter().take_while(|spare| {

@@ -191,7 +191,7 @@ impl Job<'_> {
         Ok(all)
     }
 
-    /// What is to be gone, in words.
+    /// Names of the marked objects, as the subject of a sentence.
     fn names(&self, objects: &[Object]) -> String {
         let marked: Vec<&str> =
             objects.iter().filter(|object| !object.evidence.is_empty()).map(|object| object.name.as_str()).collect();
