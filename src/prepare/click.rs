@@ -11,7 +11,6 @@
 //! view to which other views' masks were carried. What it may not change is in [`next`]. Who wants a larger or smaller
 //! part than a click takes by itself goes along the segments of several scales about it (`tree`).
 
-use std::cell::LazyCell;
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
@@ -22,7 +21,7 @@ use super::graph_cut::{self, COMPONENTS, Mixture, SMOOTHNESS, UNIT, some};
 use super::masks;
 use super::min_cut::{Grid, SHIFTS};
 use crate::scene::resample;
-use crate::statistics::median;
+use crate::statistics::{median, quantile};
 
 mod boxed;
 mod mark;
@@ -49,6 +48,8 @@ pub struct Cues<'a> {
     pub measured: Option<&'a DepthMap>,
     /// The votes of other views' masks: the object's part of each pixel, 0 to 1, and width and height.
     pub carried: Option<(&'a [f32], [u32; 2])>,
+    /// Whether where a pixel lies within an outline says nothing: leaves are anywhere in it.
+    pub anywhere: bool,
 }
 
 impl Cues<'_> {
@@ -66,6 +67,14 @@ const ROUNDS: [u32; 2] = [4, 2];
 const SIDES: [u32; 2] = [192, 288];
 /// The most that colours and that places may say of a pixel, in nats.
 const MOST: [f64; 2] = [8.0, 8.0];
+/// The most that being off where the background goes on may say of a pixel within an outline: the foot of a thing is where the ground
+/// goes on.
+const OUTLINED: f64 = 1.0;
+/// The weight of being elsewhere than what an outline is about, in nats: of what is farther behind the part of what the outline's middle
+/// shows that is this near, or before it, than these parts of the outline's width, none of it and all.
+const AWAY: f64 = 6.0;
+const NEARER_PART: f64 = 0.35;
+const AS_DEEP: [f64; 2] = [0.5, 0.75];
 /// The weight of being nearer to a click than to anything else, in nats.
 const NEAR: f64 = 4.0;
 /// The weight of being within the segment that a click means, in nats.
@@ -78,10 +87,6 @@ const ALONG: [f64; 2] = [0.5, 0.05];
 const NEARER: f64 = 0.33;
 /// A place so far from where the background is, squared and in its deviations, is as likely to be the object as not.
 const OFF: f64 = 9.0;
-/// A cut by colours of which this share of the inside lies behind has taken in what is behind the object.
-const BEHIND: f64 = 0.1;
-/// Pixels along a mask's border that tell nothing of what is behind.
-const SKIN: u32 = 3;
 /// Depth bleeds by so many pixels over what is beside something near, and over its own border by so many.
 const BLEEDS: [u32; 2] = [6, 3];
 /// Depth that changes by less than this part of a jump across an object's outline does not know the object.
@@ -191,7 +196,8 @@ fn further(picture: &RgbImage, marks: &[Mark], before: &GrayImage, cues: &Cues<'
     let cues = &Cues { depth: cues.depth.filter(|_| cues.knows(picture, before)), ..*cues };
     let afar = cues.depth.is_none() || is_afar(before, at, adds);
     let anew = (cues.carried.is_none() && marks.len() <= TOGETHER && afar).then(|| found(picture, marks, cues));
-    let agrees = |mask: &GrayImage| holds(mask, at) == adds;
+    // An empty one has run out of pixels: the click says nothing of the rest.
+    let agrees = |mask: &GrayImage| holds(mask, at) == adds && bounds_of(mask).is_some();
     anew.filter(agrees)
         .or_else(|| edited(picture, &clicks(marks), before, cues.depth))
         .unwrap_or_else(|| before.clone())
@@ -293,13 +299,10 @@ fn found(picture: &RgbImage, marks: &[Mark], cues: &Cues<'_>) -> GrayImage {
     };
     let cues = &Cues { depth: cues.measured.filter(|_| outlined).or(cues.depth), ..*cues };
     let alone = Cues { depth: None, ..*cues };
-    let by_colors = LazyCell::new(|| cut(picture, first, marks, &alone, None));
-    let keeps_to_itself = |mask: &GrayImage| behind_share(picture, first, marks, cues, mask) < BEHIND;
-    let places_decide = cues.depth.is_some() && !(outlined && by_colors.as_ref().is_some_and(keeps_to_itself));
-    let by_places = places_decide.then(|| cut(picture, first, marks, cues, None));
+    let by_places = cues.depth.is_some().then(|| cut(picture, first, marks, cues, None));
     let (found, cues) = match by_places {
         Some(found) if found.as_ref().is_none_or(|mask| cues.knows(picture, mask)) => (found, cues),
-        _ => ((*by_colors).clone(), &alone),
+        _ => (cut(picture, first, marks, &alone, None), &alone),
     };
     let Some(found) = found else { return empty };
     let Some(bounds) = bounds_of(&found) else { return empty };
@@ -309,22 +312,6 @@ fn found(picture: &RgbImage, marks: &[Mark], cues: &Cues<'_>) -> GrayImage {
         return found;
     }
     cut(picture, second, marks, cues, Some(&found)).unwrap_or(found)
-}
-
-/// The share of a mask's inside that lies where the surfaces that are outside all outlines go on, by places in space. What is
-/// within [`SKIN`] of its border is not looked at, since no depth is sharp.
-fn behind_share(picture: &RgbImage, window: Window, marks: &[Mark], cues: &Cues<'_>, mask: &GrayImage) -> f64 {
-    let pixels = Pixels::of(picture, window, SIDES[0], marks, cues);
-    let object = labels(mask, window, pixels.size.map(|n| n as u32));
-    let beside = pixels.picture(|i| !object[i]);
-    let outside = pixels.outside.iter().zip(&pixels.places).filter(|(outside, _)| **outside);
-    let Some(behind) = behind(&outside.filter_map(|(_, place)| Some(place.as_ref()?.0)).collect::<Vec<_>>()) else {
-        return 0.0;
-    };
-    let deep = resample::distances(&beside, SKIN + 1).into_iter().zip(&pixels.places).filter(|(far, _)| *far > SKIN);
-    let goes_on = deep.map(|(_, place)| place.is_some_and(|(place, _)| behind.distance(place) < OFF));
-    let (all, on) = goes_on.fold((0u32, 0u32), |(all, on), goes_on| (all + 1, on + u32::from(goes_on)));
-    f64::from(on) / f64::from(all.max(1))
 }
 
 /// x0, y0 and one past x1, y1 of what is not 0.
@@ -345,6 +332,8 @@ struct Pixels {
     touched: Vec<Option<bool>>,
     /// Outside all boxes, where there are any.
     outside: Vec<bool>,
+    /// By how much where it lies within boxes and lassos speaks for the object, in nats.
+    amid: Vec<f64>,
 }
 
 impl Pixels {
@@ -364,6 +353,18 @@ impl Pixels {
         let count = (to[0] * to[1]) as usize;
         let outlines: Vec<&Mark> = marks.iter().filter(|mark| mark.bounds().is_some()).collect();
         let outside = (0..count).map(|i| !outlines.is_empty() && !outlines.iter().any(|m| m.encloses(at(i)))).collect();
+        let mut amid = vec![0.0f64; count];
+        for (n, mark) in outlines.iter().enumerate().filter(|_| !cues.anywhere) {
+            let grid = GrayImage::from_fn(to[0], to[1], |x, y| {
+                image::Luma([if mark.encloses(at((y * to[0] + x) as usize)) { 0 } else { 255 }])
+            });
+            let inside = grid.as_raw().iter().filter(|v| **v == 0).count() as f64;
+            let far = resample::distances(&grid, to[0].max(to[1]));
+            for (i, amid) in amid.iter_mut().enumerate() {
+                let speaks = mark.amid(at(i), f64::from(far[i]) / inside.max(1.0).sqrt());
+                *amid = if n == 0 { speaks } else { amid.max(speaks) };
+            }
+        }
         let mut touched = vec![None; count];
         for mark in marks {
             let object = matches!(mark, Mark::Object { .. } | Mark::Brush { object: true, .. });
@@ -390,9 +391,33 @@ impl Pixels {
             places,
             touched,
             outside,
+            amid,
         };
+        pixels.part_places();
         pixels.scale_places();
         pixels
+    }
+
+    /// What is [`AWAY`]: an object is about as deep as it is wide.
+    fn part_places(&mut self) {
+        let inside = |i: &usize| !self.outside[*i] && self.outside.contains(&true);
+        let all = || (0..self.places.len()).filter(inside).filter_map(|i| Some((i, self.places[i]?.0)));
+        let Some(middle) =
+            quantile(all().filter(|(i, _)| self.amid[*i] >= 0.0).map(|(_, place)| place[2]), NEARER_PART)
+        else {
+            return;
+        };
+        let side = |k: usize| {
+            let slopes = all().map(|(_, place)| place[k] / place[2]);
+            slopes.clone().fold(f64::NEG_INFINITY, f64::max) - slopes.fold(f64::INFINITY, f64::min)
+        };
+        let wide = side(0).max(side(1)) * middle;
+        for (amid, place) in self.amid.iter_mut().zip(&self.places) {
+            if let Some((place, _)) = place {
+                let off = (place[2] - middle).abs() / wide;
+                *amid -= AWAY * ((off - AS_DEEP[0]) / (AS_DEEP[1] - AS_DEEP[0])).clamp(0.0, 1.0);
+            }
+        }
     }
 
     /// Brings places into units of the depth's roughness where the object is.
@@ -554,10 +579,11 @@ fn solve(
         .collect();
     for round in 0..rounds {
         let of = |side: bool| -> Vec<usize> { (0..count).filter(|i| object[*i] == side).collect() };
+        let most = if pixels.outside.contains(&true) { OUTLINED } else { MOST[1] };
         let behind = behind(&of(false).iter().filter_map(|i| Some(pixels.places[*i]?.0)).collect::<Vec<_>>());
         // By how much a pixel's place speaks for the object: how far it is from where the background goes on.
         let off = |i: usize| match (&behind, pixels.places[i]) {
-            (Some(behind), Some((place, _))) => (0.5 * (behind.distance(place) - OFF)).clamp(-MOST[1], MOST[1]),
+            (Some(behind), Some((place, _))) => (0.5 * (behind.distance(place) - OFF)).clamp(-most, most),
             _ => 0.0,
         };
         let mut off: Vec<f64> = (0..count).map(off).collect();
@@ -642,12 +668,12 @@ fn cut(
             (Some(before), ..) => before[i],
             (None, Some(within), _) => within[i],
             (None, None, Some(enclosed)) => enclosed[i] > 0.0,
-            _ if boxed => !pixels.outside[i],
+            _ if boxed => !pixels.outside[i] && pixels.amid[i] >= 0.0,
             _ => near.as_ref().is_some_and(|near| near[i] > NEARER),
         })
         .collect();
     let says = |of: &Option<Vec<f64>>, i: usize| of.as_ref().map_or(0.0, |of| of[i]);
-    let beside = |i: usize| NEAR * says(&near, i) + ENCLOSED * says(&enclosed, i);
+    let beside = |i: usize| NEAR * says(&near, i) + ENCLOSED * says(&enclosed, i) + pixels.amid[i];
     let object = solve(&pixels, object, ROUNDS[pass], beside, |_| true)?;
     whole(picture, window, small, joined(object, &pixels, boxed))
 }

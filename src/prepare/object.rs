@@ -180,7 +180,7 @@ impl Given {
     /// A photograph that cannot be read.
     pub fn placed(&self, photograph: &Path, [fit, measured]: [&DepthMap; 2]) -> Result<Self, Error> {
         let picture = scene::photograph(photograph, 1)?;
-        let cues = Cues { depth: Some(fit), measured: Some(measured), carried: None };
+        let cues = Cues { depth: Some(fit), measured: Some(measured), ..Cues::default() };
         let cuts = self.drawn.iter().map(|drawn| drawn.cut(&picture, &cues));
         let cuts: Option<Vec<GrayImage>> = cuts.collect();
         let Some(mask) = cuts.and_then(|cuts| cuts.into_iter().reduce(joined)) else { return Ok(self.clone()) };

@@ -440,7 +440,7 @@ impl Session {
             let picture = self.picture(number).map_err(|error| (Refusal::Busy, error.to_string()))?;
             let carried = view.carried.as_ref().map(|shown| (shown.parts.as_slice(), shown.size));
             let [fit, measured] = [0, 1].map(|which| depth.map(|depths| &depths[which]));
-            let cues = Cues { depth: fit, measured, carried };
+            let cues = Cues { depth: fit, measured, carried, ..Cues::default() };
             // From the longest beginning of the marks that was made already.
             let fits = |with: &Option<bool>| with.is_none_or(|with| with == depth.is_some());
             let begun = view.made.iter().filter(|(own, with, _)| fits(with) && marks.starts_with(own));

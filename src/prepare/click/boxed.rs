@@ -1,4 +1,4 @@
-//! A box on the command line: as on the page, and for what is thin by cuts whose borders are cheap.
+//! A box on the command line: for what is thin cuts whose borders are cheap, and for all else the page's cut.
 
 use image::{GrayImage, Luma, RgbImage};
 
@@ -6,7 +6,7 @@ use super::{Cues, Mark, bounds_of, found};
 use crate::prepare::graph_cut::{self, Known, SMOOTHNESS};
 use crate::scene::resample;
 
-/// A mask that covers less of its box than this, and does not reach over it, is a part of something thin.
+/// A cut by colours that covers less of its box than this, and does not reach over it, is a part of something thin.
 const SOLID: f64 = 0.25;
 /// An object reaches over this part of its box's width and height (Lempitsky et al. 2009: a box is drawn tightly).
 const FILLED: f64 = 0.8;
@@ -19,29 +19,25 @@ pub fn from_box(picture: &RgbImage, bounds: [u32; 4], cues: &Cues<'_>) -> Option
     let [x0, y0, x1, y1] = bounds;
     let sides = [picture.width(), picture.height()].map(f64::from);
     let mark = Mark::Box { bounds: std::array::from_fn(|k| f64::from(bounds[k]) / sides[k % 2]) };
-    let of_page = || Some(found(picture, &[mark], cues));
     let area = f64::from(x1 - x0) * f64::from(y1 - y0);
-    let mut first = None;
-    let cuts = std::iter::once_with(of_page).chain(SMOOTHNESS[1..].iter().map(|s| thin(picture, bounds, *s)));
-    for mut mask in cuts.flatten() {
+    let within = |mut mask: GrayImage| {
         // Where the reduced pixels of the box's border reach over it.
         for (x, y, v) in mask.enumerate_pixels_mut() {
             if x < x0 || y < y0 || x >= x1 || y >= y1 {
                 *v = Luma([0]);
             }
         }
-        let Some(part) = filled(&mask, bounds) else { continue };
         let share = mask.as_raw().iter().filter(|v| **v != 0).count() as f64 / area;
-        let taken = match &first {
-            None => part >= FILLED || share >= SOLID,
-            Some(_) => part >= FILLED && share <= THIN,
-        };
-        if taken {
-            return Some(mask);
-        }
-        first.get_or_insert(mask);
-    }
-    first
+        filled(&mask, bounds).map(|part| (mask, part, share))
+    };
+    let of_page = |cues: &Cues<'_>| within(found(picture, &[mark.clone()], cues));
+    let page = of_page(cues);
+    // What is solid is so wherever in its box it is likely.
+    let solid =
+        of_page(&Cues { anywhere: true, ..*cues }).is_some_and(|(_, part, share)| part >= FILLED || share >= SOLID);
+    let thin = SMOOTHNESS[1..].iter().filter(|_| !solid).filter_map(|s| within(thin(picture, bounds, *s)?));
+    let leaves = thin.into_iter().find(|(_, part, share)| *part >= FILLED && *share <= THIN);
+    leaves.or(page).map(|(mask, ..)| mask)
 }
 
 /// The cheapest cut where borders cost little.

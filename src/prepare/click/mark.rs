@@ -57,6 +57,16 @@ const MOST_RADIUS: f64 = 0.25;
 const TOUCH: f64 = 0.006;
 /// Likewise at least, in pixels: a click on a small picture touches those around its own.
 const LEAST_TOUCH: f64 = 1.5;
+/// The weight of being in the middle of a box, and far from a lasso's line, in nats.
+const AMID: [f64; 2] = [2.0, 5.0];
+/// The weight of being in a box's corner, in nats.
+const CORNER: f64 = 1.0;
+/// So far from a box's middle, in halves of its sides, is as likely the object as not.
+const ROUND: f64 = 0.95;
+/// So far from a lasso's line, in roots of what it encloses, is as likely the object as not.
+const MARGIN: f64 = 0.08;
+/// A box's side so near to the picture's is that.
+const EDGE: f64 = 0.005;
 /// Colours that differ by less, of 255, are touched by the same click.
 const ALIKE: f64 = 24.0;
 
@@ -114,6 +124,24 @@ impl Mark {
                 points.iter().zip(last).filter(|pair| crosses(*pair)).count() % 2 == 1
             }
             _ => false,
+        }
+    }
+
+    /// By how much being at a place within a box or a lasso speaks for the object, in nats; `deep` is how far it is from the line, in
+    /// roots of what that encloses.
+    pub(super) fn amid(&self, at: [f64; 2], deep: f64) -> f64 {
+        match self {
+            Self::Box { bounds: [x0, y0, x1, y1] } => {
+                // Where the picture ends the object may go on.
+                let off = |at: f64, low: f64, high: f64| {
+                    let off: f64 = (2.0 * at - low - high) / (high - low);
+                    if off < 0.0 && low <= EDGE || off > 0.0 && high >= 1.0 - EDGE { 0.0 } else { off }
+                };
+                let far = off(at[0], *x0, *x1).powi(2) + off(at[1], *y0, *y1).powi(2);
+                (AMID[0] * (1.0 - far / ROUND.powi(2))).max(-CORNER)
+            }
+            Self::Lasso { .. } => AMID[1] * (deep / MARGIN - 1.0).clamp(-1.0, 1.0),
+            _ => 0.0,
         }
     }
 

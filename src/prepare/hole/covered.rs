@@ -142,8 +142,8 @@ impl Sight {
         self.grid.colors[site].map(|v| f32::from(v) / 255.0)
     }
 
-    /// What is around a site, without the object; NaN in the middle of it. Of the four squares with the site in a corner the one that
-    /// varies least (Kuwahara 1976): the others may reach over a border.
+    /// What is around a site, without the object; NaN in the middle of it. Of the four squares with the site in a corner, those at least
+    /// half of which is there, the one that varies least (Kuwahara 1976): the others may reach over a border.
     pub fn look_around(&self, site: usize) -> Look {
         let at = |dx: i64, dy: i64| {
             let [column, row] =
@@ -158,14 +158,15 @@ impl Sight {
             let mean = |of: &dyn Fn(&[f32; 3]) -> f32| near.iter().map(of).sum::<f32>() / near.len() as f32;
             let light = |color: &[f32; 3]| color.iter().sum::<f32>() / 3.0;
             let middle = mean(&light);
-            [mean(&|c| c[0]), mean(&|c| c[1]), mean(&|c| c[2]), mean(&|c| (light(c) - middle).powi(2)).sqrt()]
+            let grain = mean(&|c| (light(c) - middle).powi(2)).sqrt();
+            (near.len(), [mean(&|c| c[0]), mean(&|c| c[1]), mean(&|c| c[2]), grain])
         };
         let looks = [[-1, -1], [1, -1], [-1, 1], [1, 1]].map(look);
-        looks
-            .into_iter()
-            .filter(|look| look[3].is_finite())
-            .min_by(|a, b| a[3].total_cmp(&b[3]))
-            .unwrap_or([f32::NAN; 4])
+        // Few sites vary little; where no square is half there, the fullest.
+        let half = ((REACH + 1).pow(2) as usize).div_ceil(2);
+        let least = looks.iter().map(|(count, _)| *count).fold(1, usize::max).min(half);
+        let full = looks.into_iter().filter(|(count, _)| *count >= least).map(|(_, look)| look);
+        full.min_by(|a, b| a[3].total_cmp(&b[3])).unwrap_or([f32::NAN; 4])
     }
 
     /// The material of the surface of this number, where that is known.
@@ -247,6 +248,11 @@ mod tests {
         let [smooth, rough] = [19, 22].map(|x| sight.look_around(10 * width + x));
         assert!((smooth[0] - 100.0 / 255.0).abs() < 1e-6 && smooth[3] < 1e-6, "{smooth:?}");
         assert!(rough[3] > 0.2, "{rough:?}");
+        // At the corner of a hole, which leaves one site alone of one square.
+        let mut sight = sight;
+        (0..sight.hole.len()).for_each(|site| sight.hole[site] = site / width > 10 || site % width > 30);
+        let corner = sight.look_around(10 * width + 30);
+        assert!(corner[3] > 0.2, "{corner:?}");
     }
 
     /// A hedge above a bench is a hundredth farther away, so that one plane fits both: they are two surfaces by their colours, and each goes
