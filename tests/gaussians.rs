@@ -169,9 +169,9 @@ fn an_export_is_the_model() {
     let (bytes, _) = train(&gpu, &scene, &settings, 1 << 16);
     let cloud = ply::decode(&bytes).expect("our own file");
     assert_eq!((cloud.len(), cloud.degree), (330, 2));
+    let model = Stored::Gaussians(cloud);
     let options = ExportOptions { upright: false, screen: 1, ..ExportOptions::default() };
-    let made =
-        |options| export::of_gaussians(&gpu, &cloud, &scene, &settings, &options, &mut Quiet).expect("an export");
+    let made = |options| export::make(&gpu, &model, &scene, &settings, &options, &mut Quiet).expect("an export");
     assert!(ply::encode(&made(options).cloud) == bytes);
     // Upright it is another file of the same pictures, but for roundings.
     let upright = made(ExportOptions { upright: true, screen: 1, ..options });

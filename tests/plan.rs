@@ -9,6 +9,7 @@ use gscream_vk::gpu::{Entry, Gpu, Options, Schedule, testing};
 use gscream_vk::losses::{depth_gradient, depth_l1};
 use gscream_vk::scene::Scene;
 use gscream_vk::stage;
+use gscream_vk::train::begin::Beginning;
 use gscream_vk::train::forecast::{self, Forecast, Question, Survey};
 use gscream_vk::train::plan::Plan;
 use gscream_vk::train::run::Run;
@@ -57,11 +58,10 @@ impl Wanted {
 }
 
 fn rehearsed(gpu: &Gpu, scene: &Scene, settings: &Settings) -> Forecast {
-    let initial = forecast::initial(scene, settings).expect("points");
-    let anchors = initial.anchors.position.len() as u32;
+    let initial = Beginning::of(scene, settings).expect("points");
+    let anchors = initial.count();
     // Numbers like those of the scene: which stages there are does not depend on them.
     let survey = Survey { anchors, visible: anchors, pairs: 4000 };
-    let initial = forecast::Beginning::Anchors(initial);
     forecast::rehearse(gpu, scene, settings, &initial, survey, anchors + anchors / 4, None).expect("a rehearsal")
 }
 

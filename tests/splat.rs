@@ -9,6 +9,7 @@ use gscream_vk::gpu::testing;
 use gscream_vk::math::harmonics::{ZEROTH, coefficients};
 use gscream_vk::model::config::Form;
 use gscream_vk::model::gaussians::{Cloud, sigmoid};
+use gscream_vk::model::parameter::Parameter;
 use gscream_vk::splat::cameras;
 use gscream_vk::splat::fill;
 use gscream_vk::splat::read::{Container, decode, of_degree};
@@ -551,11 +552,9 @@ fn frozen_gaussians_stay_and_the_others_learn() {
     settings.model.frozen = frozen as u32;
     settings.validate().expect("settings that make sense");
     let mut run = Run::new(&gpu, &scene, &settings).expect("the device has room");
-    let read = |run: &Run<'_>| match &run.step().learnt {
-        gscream_vk::model::learnt::Learnt::Gaussians(gaussians) => gaussians
-            .parameters()
-            .map(|parameter| (parameter.width as usize, parameter.read(&gpu, count as u32).expect("readable"))),
-        gscream_vk::model::learnt::Learnt::Anchors { .. } => panic!("plain Gaussians were asked for"),
+    let read = |run: &Run<'_>| -> Vec<_> {
+        let read = |row: &Parameter| (row.width as usize, row.read(&gpu, count as u32).expect("readable"));
+        run.step().learnt.rows().into_iter().map(read).collect()
     };
     let before = read(&run);
     run.train(folder.path(), &mut Silent).expect("a run");

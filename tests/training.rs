@@ -9,10 +9,12 @@ use gscream_vk::config::Settings;
 use gscream_vk::gpu::form::without_form;
 use gscream_vk::gpu::{Descriptors, Form, Gpu, Options, testing};
 use gscream_vk::model::files;
+use gscream_vk::model::stored::Stored;
 use gscream_vk::render::forward::Capacity;
 use gscream_vk::render::view::Renderer;
 use gscream_vk::scene::{self, Scene, synthetic};
 use gscream_vk::signal::Signal;
+use gscream_vk::train::begin::Beginning;
 use gscream_vk::train::config::Coarse;
 use gscream_vk::train::run::{Observer, Progress, Run, Summary};
 use gscream_vk::train::{checkpoint, forecast};
@@ -271,11 +273,11 @@ fn training_learns_and_what_it_saves_draws_the_same_picture_in_one_form(gpu: &Gp
     let logged = lines[5]["psnr"].as_f64().expect("a number");
     assert!((logged - trained).abs() < 1e-12 * trained, "{logged} in the log, {trained}");
 
-    let memory = run.step().model().expect("readable");
-    let file = files::load(&folder.path().join("model")).expect("a model that was just written");
+    let memory = run.step().stored().expect("readable");
+    let file = Stored::load(&folder.path().join("model")).expect("a model that was just written");
     assert!(memory == file, "what was saved is what was trained");
-    let pictures = |(anchors, weights): &(files::Anchors, files::Weights)| {
-        let mut renderer = Renderer::new(gpu, anchors, weights, &settings.render).expect("the device has room");
+    let pictures = |model: &Stored| {
+        let mut renderer = Renderer::of(gpu, model, &settings.render).expect("the device has room");
         let views = scene.test.iter().chain(&scene.train);
         views.map(|view| renderer.render(&view.camera).expect("a picture")).collect::<Vec<_>>()
     };
@@ -572,7 +574,7 @@ fn a_device_that_binds_little_trains_to_the_end() {
     let scene = scene::load(&dir, &scene::Config::default()).expect("a scene");
     let mut settings = common::settings(12);
     settings.densify.gradient_threshold = 1e-9;
-    let initial = forecast::initial(&scene, &settings).expect("points").anchors.position.len() as u32;
+    let initial = Beginning::of(&scene, &settings).expect("points").count();
 
     // A first guess has room for 2^17 pairs of three floats, less than for these anchors.
     assert!(480 * u64::from(initial) * 4 / 5 > 12 << 17, "{initial}");

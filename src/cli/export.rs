@@ -439,13 +439,7 @@ pub(super) fn export(
             screen: args.screen,
             seed: settings.train.seed,
         };
-        let made = match &model {
-            Stored::Anchors(anchors, weights) => {
-                export::make(gpu, (anchors, weights), &scene, &settings, &options, observer)
-            }
-            Stored::Gaussians(cloud) => export::of_gaussians(gpu, cloud, &scene, &settings, &options, observer),
-        };
-        let mut made = made?;
+        let mut made = export::make(gpu, &model, &scene, &settings, &options, observer)?;
         // All files are made before the first is written.
         let mut written = vec![];
         for format in &args.formats() {

@@ -8,10 +8,10 @@
 use super::{Cloud, Error, logit};
 use crate::gpu::{Buffer, Gpu};
 use crate::math::harmonics::ZEROTH;
-use crate::model::anchors::Anchors;
+use crate::model::anchors::Decoded;
 use crate::model::files;
 use crate::render::config::BACKGROUND;
-use crate::render::forward::{Capacity, Model};
+use crate::render::forward::Capacity;
 use crate::render::rasterize::{self, Backward, Outputs, Picture, PictureGradient};
 use crate::render::session::{Room, Stages};
 use crate::render::view::to_rgb8;
@@ -53,8 +53,7 @@ pub struct Baker {
     gpu: Gpu,
     near: f64,
     session: Session<Shares>,
-    anchors: Anchors,
-    weights: Buffer<f32>,
+    model: Decoded,
     /// \[gaussian\] world.
     position: Vec<[f64; 3]>,
     sums: Vec<Sums>,
@@ -96,8 +95,7 @@ impl Baker {
             gpu: gpu.clone(),
             near: config.near,
             session: Session::new(gpu, config, capacity, Shares::new)?,
-            anchors: Anchors::upload(gpu, anchors, 0)?,
-            weights: gpu.upload("weights", &weights.decoders())?,
+            model: Decoded::upload(gpu, anchors, &weights.decoders(), 0)?,
             sums: vec![Sums::default(); position.len()],
             position,
         })
@@ -113,8 +111,7 @@ impl Baker {
     /// # Errors
     /// When the device has no room for it, or is lost.
     pub fn look(&mut self, camera: &Camera) -> Result<image::RgbImage, Error> {
-        let model = Model::Anchors { anchors: &self.anchors, weights: &self.weights };
-        let stages = self.session.run(model, camera, |rec, stages, binned| {
+        let stages = self.session.run(&self.model, camera, |rec, stages, binned| {
             let Stages { room, forward, own: Shares { picture, backward, ones } } = stages;
             rasterize::forward(rec, room.method, forward.projected(), binned, BACKGROUND, picture);
             let gradient = PictureGradient { rgb: ones, depth: None, transmittance: None };
@@ -129,7 +126,7 @@ impl Baker {
         let Stages { forward, own: Shares { backward, .. }, .. } = self.session.stages();
         let gpu = &self.gpu;
         let visible_count = gpu.read(&forward.visible().count)?[0] as usize;
-        let offsets = self.anchors.offsets as usize;
+        let offsets = self.model.anchors.offsets as usize;
         let slots = visible_count * offsets;
         let visible = gpu.read_range(&forward.visible().list, visible_count)?;
         let opacity = gpu.read_range(&forward.decode().opacity, slots)?;

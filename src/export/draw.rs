@@ -1,17 +1,15 @@
-//! Static Gaussians drawn, compared and improved: the training step's own stages behind [`Activate`].
+//! Static Gaussians drawn, compared and improved: the training step's own stages.
 
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::losses::{self, Losses, View, Weights};
 use crate::model::gaussians::Static;
 use crate::optimizer::adam::{self, Tensors};
-use crate::primitives::Count;
 use crate::primitives::limit::{Counter, Limits};
-use crate::render::activate::{self, Activate, DrawnGradients};
-use crate::render::bin::{Bin, Binned};
-use crate::render::project::Projected;
-use crate::render::project::{Project, ProjectBackward, SplatGradients};
+use crate::render::bin::Binned;
+use crate::render::decode::GaussianGradients;
+use crate::render::forward::{Capacity, Forward, Representation as _};
+use crate::render::project::{ProjectBackward, SplatGradients};
 use crate::render::rasterize::{self, Backward, Outputs, Picture, PictureGradient};
-use crate::render::slots::Slots;
 use crate::render::{Config, Method};
 use crate::scene::Camera;
 
@@ -22,12 +20,9 @@ pub type Rates = [f64; 5];
 const PAIRS: u32 = 1 << 17;
 
 struct Stages {
-    activate: Activate,
-    all: Slots,
-    project: Project,
-    bin: Bin,
-    rasterize_backward: Backward,
-    project_backward: ProjectBackward,
+    forward: Forward,
+    rasterize: Backward,
+    project: ProjectBackward,
 }
 
 /// What depends on the pictures' size.
@@ -112,12 +107,12 @@ impl Drawer {
         self.run(camera, |drawer, rec, stages, canvas| {
             let binned = drawer.forward(rec, stages, canvas, camera);
             let gradient = PictureGradient { rgb: &canvas.ones, depth: None, transmittance: None };
-            let method = drawer.method();
-            stages.rasterize_backward.record(rec, method, drawer.projected(stages), binned, &canvas.picture, gradient);
+            let Stages { forward, rasterize, .. } = stages;
+            rasterize.record(rec, forward.method(), forward.projected(), binned, &canvas.picture, gradient);
         })?;
         let stages = self.stages.as_ref().expect("made by the run");
-        let tiles = self.gpu.read(stages.bin.tiles())?;
-        let shares = self.gpu.read(&stages.rasterize_backward.grad_color)?;
+        let tiles = self.gpu.read(stages.forward.bin.tiles())?;
+        let shares = self.gpu.read(&stages.rasterize.grad_color)?;
         Ok(tiles.iter().zip(shares).map(|(tiles, share)| if *tiles > 0 { share[0] } else { 0.0 }).collect())
     }
 
@@ -135,34 +130,15 @@ impl Drawer {
         Ok(self.gpu.read(self.canvas.as_ref().expect("made by the run").losses.terms())?[0])
     }
 
-    fn method(&self) -> Method {
-        Method::new(&self.gpu, &self.config)
-    }
-
-    fn projected<'s>(&'s self, stages: &'s Stages) -> Projected<'s> {
-        Projected {
-            slots: Count::Host(self.gaussians.count),
-            existing: &stages.all,
-            mean: &stages.project.mean,
-            covariance: &stages.project.covariance,
-            depth: &stages.project.depth,
-            opacity: &stages.activate.opacity,
-            color: &stages.activate.color,
-        }
-    }
-
     fn forward<'s>(
         &'s self,
         rec: &mut Recorder<'_>,
-        stages: &'s Stages,
+        Stages { forward, .. }: &'s Stages,
         canvas: &Canvas,
         camera: &Camera,
     ) -> Binned<'s> {
-        let Stages { activate, all, project, bin, .. } = stages;
-        activate.record(rec, &self.gaussians, camera.center());
-        project.record(rec, all, activate.gaussians(), camera, self.config.near as f32);
-        let binned = bin.record(rec, self.projected(stages), camera.size, &self.limits);
-        rasterize::forward(rec, self.method(), self.projected(stages), binned, self.background, &canvas.picture);
+        let binned = forward.record(rec, &self.gaussians, camera, self.config.near as f32, &self.limits);
+        rasterize::forward(rec, forward.method(), forward.projected(), binned, self.background, &canvas.picture);
         binned
     }
 
@@ -175,28 +151,26 @@ impl Drawer {
         camera: &Camera,
         (step, rates): (u32, Rates),
     ) {
-        let Stages { activate, rasterize_backward, project_backward, .. } = stages;
+        let Stages { forward, rasterize, project } = stages;
         let weights = Weights { outside: 1.0, inside: 1.0 };
         let view = View { picture: &canvas.target, weights, depth: None };
         let gradient = canvas.losses.forward_backward(rec, &view, &canvas.picture.rgb, None);
         let gradient = PictureGradient { rgb: gradient.rgb, depth: None, transmittance: None };
-        rasterize_backward.record(rec, self.method(), self.projected(stages), binned, &canvas.picture, gradient);
-        let splats = SplatGradients {
-            mean: &rasterize_backward.grad_mean,
-            covariance: &rasterize_backward.grad_covariance,
-            depth: None,
+        rasterize.record(rec, forward.method(), forward.projected(), binned, &canvas.picture, gradient);
+        let splats = SplatGradients { mean: &rasterize.grad_mean, covariance: &rasterize.grad_covariance, depth: None };
+        project.record(rec, binned.drawn, forward.gaussians(), splats, camera, self.config.near as f32);
+        let gradients = GaussianGradients {
+            drawn: binned.tiles,
+            position: &project.grad_position,
+            opacity: &rasterize.grad_opacity,
+            color: &rasterize.grad_color,
+            scale: &project.grad_scale,
+            rotation: &project.grad_rotation,
         };
-        project_backward.record(rec, binned.drawn, activate.gaussians(), splats, camera, self.config.near as f32);
-        let drawn = DrawnGradients {
-            drawn: binned.drawn,
-            seen: &project_backward.grad_position,
-            scale: &project_backward.grad_scale,
-            rotation: &project_backward.grad_rotation,
-            opacity: &rasterize_backward.grad_opacity,
-            color: &rasterize_backward.grad_color,
-        };
-        activate::backward(rec, &self.gaussians, activate, drawn);
-        let all = self.gaussians.parameters().into_iter().zip(rates).filter(|(_, rate)| *rate != 0.0);
+        let gaussians = self.gaussians.parameters();
+        gaussians.into_iter().filter_map(|row| row.gradient.as_ref()).for_each(|gradient| rec.zero(gradient));
+        self.gaussians.backward(rec, (&forward.front, None), None, binned.drawn, gradients);
+        let all = gaussians.into_iter().zip(rates).filter(|(_, rate)| *rate != 0.0);
         for (parameter, rate) in all {
             let Some(gradient) = &parameter.gradient else { continue };
             let tensors = Tensors { value: &parameter.value, gradient, first: &parameter.first, root: &parameter.root };
@@ -214,19 +188,17 @@ impl Drawer {
             *canvas = Some(Canvas::new(gpu, size)?);
         }
         if stages.is_none() {
-            let n = gaussians.count;
-            let method = Method::new(gpu, config);
-            let project = Project::new(gpu, n, 1)?;
             for parameter in gaussians.parameters_mut() {
                 parameter.make_gradient(gpu)?;
             }
+            let capacity = Capacity { pairs: *pairs, ..Capacity::guess(gaussians.count) };
+            let method = Method::new(gpu, config);
+            let forward = Forward::new(gpu, capacity, gaussians, method, size, false)?;
+            let (slots, pairs) = (forward.slots as usize, *pairs as usize);
             *stages = Some(Stages {
-                activate: Activate::new(gpu, n)?,
-                all: Slots::all(gpu, n)?,
-                bin: Bin::new(gpu, method, n, *pairs, size)?,
-                rasterize_backward: Backward::new(gpu, method, n as usize, *pairs as usize, Outputs::Color)?,
-                project_backward: ProjectBackward::new(gpu, &project)?,
-                project,
+                rasterize: Backward::new(gpu, method, slots, pairs, Outputs::Color)?,
+                project: ProjectBackward::new(gpu, &forward.project)?,
+                forward,
             });
         }
         Ok(())

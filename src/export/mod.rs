@@ -17,7 +17,6 @@ use glam::DMat3;
 use crate::config::Settings;
 use crate::gpu::Gpu;
 use crate::math::harmonics::coefficients;
-use crate::model::files;
 use crate::model::gaussians::Static;
 pub use crate::model::gaussians::{Cloud, logit, sigmoid};
 use crate::model::stored::Stored;
@@ -154,52 +153,20 @@ pub struct Export {
     pub larger: f64,
 }
 
-/// Plain Gaussians as they are, in the cloud's axes: nothing is baked, refined or pruned. Those thinner than the pixels of
-/// the training are widened for larger pictures, see [`low_pass`].
-///
-/// # Errors
-/// When the device has no room, or is lost.
-pub fn of_gaussians(
-    gpu: &Gpu,
-    cloud: &Cloud,
-    scene: &Scene,
-    settings: &Settings,
-    options: &Options,
-    observer: &mut dyn Observer,
-) -> Result<Export, Error> {
-    let train: Vec<Camera> = scene.train.iter().map(|view| view.camera).collect();
-    let turn = if options.upright { up::upright(&train) } else { DMat3::IDENTITY };
-    let turned = |camera: &Camera| up::turn_camera(camera, turn);
-    let held_out = poses::virtual_views(&train, HELD_OUT, !options.seed);
-    let tests = if scene.test.is_empty() { held_out.len() } else { scene.test.len() };
-    observer.begin("drawing the Gaussians to compare with", tests as u64);
-    let model = Stored::Gaussians(cloud.clone());
-    let mut renderer = Renderer::of(gpu, &model, &settings.render)?;
-    let yardstick = measure::Yardstick::new(&mut renderer, scene, &held_out, turned, || observer.turn(""))?;
-    let losses = vec![("Gaussians".to_owned(), yardstick.of_anchors()?)];
-    let mut cloud = cloud.clone();
-    if options.upright {
-        cloud.turn(turn);
-    }
-    let larger = larger(options, &train);
-    low_pass::widen(&mut cloud, &train.iter().map(turned).collect::<Vec<_>>(), larger);
-    let gaussians = [cloud.len(); 2];
-    Ok(Export { cloud, turn, yardstick, losses, poses: [0, 0], gaussians, larger })
-}
-
 /// How many times larger than the training's pictures the scene will be looked at.
 fn larger(options: &Options, train: &[Camera]) -> f64 {
     let longest = train.iter().flat_map(|camera| camera.size).max().unwrap_or(1);
     (f64::from(options.screen) / f64::from(longest)).max(1.0)
 }
 
-/// Bakes, refines and prunes.
+/// Bakes anchors, refines and prunes; plain Gaussians stay as they are, in the cloud's axes. Those thinner than the pixels of
+/// the training are widened for larger pictures, see [`low_pass`].
 ///
 /// # Errors
 /// When the device has no room, or is lost; a model of which nothing is seen.
 pub fn make(
     gpu: &Gpu,
-    model: (&files::Anchors, &files::Weights),
+    model: &Stored,
     scene: &Scene,
     settings: &Settings,
     options: &Options,
@@ -208,18 +175,30 @@ pub fn make(
     let train: Vec<Camera> = scene.train.iter().map(|view| view.camera).collect();
     let turn = if options.upright { up::upright(&train) } else { DMat3::IDENTITY };
     let turned = |camera: &Camera| up::turn_camera(camera, turn);
+    let (larger, held_out) = (larger(options, &train), poses::virtual_views(&train, HELD_OUT, !options.seed));
+    let tests = if scene.test.is_empty() { held_out.len() } else { scene.test.len() };
+    let rows = model.form().rows();
+    observer.begin(&format!("drawing the {rows} to compare with"), tests as u64);
+    let mut renderer = Renderer::of(gpu, model, &settings.render)?;
+    let yardstick = measure::Yardstick::new(&mut renderer, scene, &held_out, turned, || observer.turn(""))?;
+    drop(renderer);
+    let mut losses = vec![(rows.to_owned(), yardstick.of_anchors()?)];
+    let widened: Vec<Camera> = train.iter().map(turned).collect();
+    let model = match model {
+        Stored::Anchors(anchors, weights) => (anchors, weights),
+        Stored::Gaussians(cloud) => {
+            let (mut cloud, gaussians) = (cloud.clone(), [cloud.len(); 2]);
+            if options.upright {
+                cloud.turn(turn);
+            }
+            low_pass::widen(&mut cloud, &widened, larger);
+            return Ok(Export { cloud, turn, yardstick, losses, poses: [0, 0], gaussians, larger });
+        }
+    };
+
     let looked = poses::spread(&train, TRAIN_VIEWS);
     let between = poses::every_other_wide(poses::virtual_views(&train, options.views, options.seed));
     let cameras: Vec<Camera> = looked.iter().chain(&between).copied().collect();
-
-    let held_out = poses::virtual_views(&train, HELD_OUT, !options.seed);
-    let tests = if scene.test.is_empty() { held_out.len() } else { scene.test.len() };
-    observer.begin("drawing the anchors to compare with", tests as u64);
-    let mut renderer = Renderer::new(gpu, model.0, model.1, &settings.render)?;
-    let yardstick = measure::Yardstick::new(&mut renderer, scene, &held_out, turned, || observer.turn(""))?;
-    drop(renderer);
-    let mut losses = vec![("anchors".to_owned(), yardstick.of_anchors()?)];
-
     observer.begin("baking", cameras.len() as u64);
     let mut baker = bake::Baker::new(gpu, model, &settings.render)?;
     let mut views = vec![];
@@ -255,8 +234,7 @@ pub fn make(
     }
     cloud = drawer.gaussians.read(gpu)?;
     cloud.retain(&shares.iter().map(|share| *share > SEEN).collect::<Vec<_>>());
-    let larger = larger(options, &train);
-    low_pass::widen(&mut cloud, &train.iter().map(turned).collect::<Vec<_>>(), larger);
+    low_pass::widen(&mut cloud, &widened, larger);
     observer.end();
     Ok(Export { cloud, turn, yardstick, losses, poses: [looked.len(), between.len()], gaussians, larger })
 }

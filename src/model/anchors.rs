@@ -1,8 +1,9 @@
 //! The anchors on the device: everything that is learnt per anchor, with Adam's moments.
 
 use super::arrays::{self, ARRAYS, Array};
-use super::parameter::{Parameter, lengthen};
+use super::parameter::{DECODERS, Parameter, Part, WEIGHTS, lengthen};
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
+use crate::math::decoder::Layout;
 use crate::optimizer::Group;
 
 /// The anchors, with room for `capacity`; the first `count` are in use. Their positions do not move.
@@ -105,6 +106,29 @@ impl Anchors {
             (array.set)(&mut anchors, parameter.read(gpu, self.count)?);
         }
         Ok(anchors)
+    }
+}
+
+/// Anchors, and the decoders that make Gaussians of them.
+#[derive(Debug)]
+pub struct Decoded {
+    /// The anchors.
+    pub anchors: Anchors,
+    /// The decoders, flat.
+    pub weights: Parameter,
+}
+
+impl Decoded {
+    /// Anchors of a model, with room for at least `capacity`, and its decoders, flat; moments zero.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub fn upload(gpu: &Gpu, anchors: &arrays::Anchors, decoders: &[f32], capacity: u32) -> Result<Self, Error> {
+        let anchors = Anchors::upload(gpu, anchors, capacity)?;
+        let layout = Layout { offsets: anchors.offsets as usize };
+        let part = |(head, &group): (usize, &Group)| Part { group, first: layout.head(head) as u32 };
+        let weights = Parameter::upload(gpu, WEIGHTS, decoders.len() as u32, 1, decoders)?;
+        Ok(Self { anchors, weights: weights.in_parts(DECODERS.iter().enumerate().map(part)) })
     }
 }
 

@@ -7,7 +7,6 @@ pub mod config;
 pub mod files;
 pub mod gaussians;
 pub mod init;
-pub mod learnt;
 pub mod parameter;
 pub mod stored;
 

@@ -3,6 +3,7 @@
 use std::io::Write as _;
 use std::path::Path;
 
+use super::config::Form;
 use super::files::{self, Anchors, Error, POINT_CLOUD, Weights};
 use super::gaussians::Cloud;
 use crate::formats::ply;
@@ -17,6 +18,30 @@ pub enum Stored {
 }
 
 impl Stored {
+    /// The form that it is of.
+    pub fn form(&self) -> Form {
+        match self {
+            Self::Anchors(..) => Form::Anchors,
+            Self::Gaussians(_) => Form::Gaussians,
+        }
+    }
+
+    /// The positions of the anchors or of the plain Gaussians, scene units.
+    pub fn positions(&self) -> &[[f32; 3]] {
+        match self {
+            Self::Anchors(anchors, _) => &anchors.position,
+            Self::Gaussians(cloud) => &cloud.position,
+        }
+    }
+
+    /// Gaussians of an anchor; 1 for plain ones.
+    pub fn offsets(&self) -> u32 {
+        match self {
+            Self::Anchors(anchors, _) => anchors.offsets_per_anchor as u32,
+            Self::Gaussians(_) => 1,
+        }
+    }
+
     /// Counts the model's lengths in units of which `unit` make one of those they are counted in now, and leaves what it
     /// shows as it is.
     pub fn rescale(&mut self, unit: f64) {

@@ -1,6 +1,7 @@
 //! From what is learnt of static Gaussians to what is drawn, and back.
 
-use super::project::{Gaussians, listed};
+use super::decode::GaussianGradients;
+use super::project::listed;
 use super::slots::Slots;
 use crate::gpu::kernels::render::{activate, activate_backward};
 use crate::gpu::{Buffer, Check, Error, Gpu, Recorder, Reference};
@@ -112,11 +113,6 @@ impl Activate {
         })
     }
 
-    /// As the projection reads them.
-    pub fn gaussians(&self) -> Gaussians<'_> {
-        Gaussians { position: &self.seen, scale: &self.scale, rotation: &self.rotation }
-    }
-
     /// Records the Gaussians for a camera centre (world).
     pub fn record(&self, rec: &mut Recorder<'_>, of: &Static, center: [f64; 3]) {
         let [center, center_low] = split(center);
@@ -138,43 +134,26 @@ impl Activate {
     }
 }
 
-/// Gradients of [`Activate`]'s outputs, of Gaussians that touch a tile.
-#[derive(Clone, Copy)]
-pub struct DrawnGradients<'a> {
-    /// Those that touch a tile.
-    pub drawn: &'a Slots,
-    /// World.
-    pub seen: &'a Buffer<[f32; 3]>,
-    /// Of the standard deviations.
-    pub scale: &'a Buffer<[f32; 3]>,
-    /// Of the unit quaternion.
-    pub rotation: &'a Buffer<[f32; 4]>,
-    /// Of the opacity.
-    pub opacity: &'a Buffer<f32>,
-    /// Of the color.
-    pub color: &'a Buffer<[f32; 3]>,
-}
-
 /// The gradient's buffer of a parameter.
 fn gradient(parameter: &Parameter) -> &Buffer<f32> {
     parameter.gradient.as_ref().expect("made before the way back is recorded")
 }
 
-/// Records the gradients of what is learnt, after [`Activate::record`] of the same Gaussians: zero for those that touch no
-/// tile.
+/// Records the gradients of what is learnt, after [`Activate::record`] of the same Gaussians: of those that are drawn, for
+/// the others are left alone.
 ///
 /// # Panics
 /// When a parameter has no buffer for its gradient.
-pub fn backward(rec: &mut Recorder<'_>, of: &Static, forward: &Activate, grad: DrawnGradients<'_>) {
+pub fn backward(rec: &mut Recorder<'_>, of: &Static, forward: &Activate, drawn: &Slots, grad: GaussianGradients<'_>) {
     let buffers = activate_backward::Buffers {
-        count: &grad.drawn.count,
-        list: &grad.drawn.list,
+        count: &drawn.count,
+        list: &drawn.list,
         seen: &forward.seen,
         scale: &forward.scale,
         quaternion: &of.quaternion.value.view(),
         opacity: &forward.opacity,
         color: &forward.color,
-        grad_seen: grad.seen,
+        grad_seen: grad.position,
         grad_scale: grad.scale,
         grad_rotation: grad.rotation,
         grad_opacity: grad.opacity,
@@ -185,11 +164,9 @@ pub fn backward(rec: &mut Recorder<'_>, of: &Static, forward: &Activate, grad: D
         grad_logit: gradient(&of.logit),
         grad_harmonics: &gradient(&of.harmonics).view(),
     };
-    // Only rows of those that do are written: fewer are visited, and filling costs next to nothing.
-    of.parameters().into_iter().for_each(|parameter| rec.zero(gradient(parameter)));
     let coefficients = coefficients(of.degree) as u32;
     let push = activate_backward::Push { coefficients, higher: of.higher };
-    rec.run(activate_backward::Kernel, buffers, push, &grad.drawn.groups);
+    rec.run(activate_backward::Kernel, buffers, push, &drawn.groups);
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 
 use super::Config;
 use super::bin::Binned;
-use super::forward::{Capacity, Forward, Model};
+use super::forward::{Capacity, Forward, Representation};
 use super::method::Method;
 use crate::gpu::{Error, Gpu, Recorder};
 use crate::primitives::limit::{Counter, Limits};
@@ -105,7 +105,7 @@ impl<S> Session<S> {
     /// For more anchors than the capacity's.
     pub fn run(
         &mut self,
-        model: Model<'_>,
+        model: &dyn Representation,
         camera: &Camera,
         work: impl Fn(&mut Recorder<'_>, &Stages<S>, Binned<'_>),
     ) -> Result<&Stages<S>, Error> {
@@ -121,7 +121,7 @@ impl<S> Session<S> {
     /// As [`Session::run`].
     pub fn run_within(
         &mut self,
-        model: Model<'_>,
+        model: &dyn Representation,
         camera: &Camera,
         most: u32,
         work: impl Fn(&mut Recorder<'_>, &Stages<S>, Binned<'_>),
@@ -151,14 +151,10 @@ impl<S> Session<S> {
         Ok(if fits { self.stages.as_ref() } else { None })
     }
 
-    fn allocate(&self, model: Model<'_>, size: [u32; 2]) -> Result<Stages<S>, Error> {
+    fn allocate(&self, model: &dyn Representation, size: [u32; 2]) -> Result<Stages<S>, Error> {
         let Self { gpu, method, capacity, .. } = self;
-        let mut forward = Forward::of(gpu, *capacity, model, *method, size, self.cull)?;
-        let slots = match model {
-            Model::Anchors { anchors, .. } => capacity.visible as usize * anchors.offsets as usize,
-            Model::Gaussians(gaussians) => gaussians.count as usize,
-        };
-        let room = Room { method: *method, size, slots, pairs: capacity.pairs as usize };
+        let mut forward = Forward::new(gpu, *capacity, model, *method, size, self.cull)?;
+        let room = Room { method: *method, size, slots: forward.slots as usize, pairs: capacity.pairs as usize };
         forward.larger = self.larger;
         Ok(Stages { room, forward, own: (self.make)(gpu, room)? })
     }

@@ -1,12 +1,11 @@
 //! One picture from a finished model, for files and figures.
 
 use super::config::BACKGROUND;
-use super::forward::{Capacity, Model};
+use super::forward::{Capacity, Representation};
 use super::rasterize::{self, Outputs, Picture};
 use super::session::{Room, Session, Stages};
-use crate::gpu::{Buffer, Error, Gpu};
-use crate::model::anchors::Anchors;
-use crate::model::files;
+use crate::gpu::{Error, Gpu};
+use crate::model::anchors::Decoded;
 use crate::model::gaussians::Static;
 use crate::model::stored::Stored;
 use crate::scene::Camera;
@@ -88,7 +87,7 @@ impl Painter {
     ///
     /// # Panics
     /// As [`Session::run`].
-    pub fn render(&mut self, model: Model<'_>, camera: &Camera) -> Result<Rendered, Error> {
+    pub fn render(&mut self, model: &dyn Representation, camera: &Camera) -> Result<Rendered, Error> {
         Ok(self.render_within(model, camera, u32::MAX)?.expect("no view has more pairs than can be counted"))
     }
 
@@ -99,7 +98,12 @@ impl Painter {
     ///
     /// # Panics
     /// As [`Session::run`].
-    pub fn render_within(&mut self, model: Model<'_>, camera: &Camera, most: u32) -> Result<Option<Rendered>, Error> {
+    pub fn render_within(
+        &mut self,
+        model: &dyn Representation,
+        camera: &Camera,
+        most: u32,
+    ) -> Result<Option<Rendered>, Error> {
         let gpu = self.session.gpu().clone();
         let drawn = self.session.run_within(model, camera, most, |rec, stages, binned| {
             let Stages { room, forward, own: picture } = stages;
@@ -116,13 +120,7 @@ pub struct Renderer {
 }
 
 /// A finished model on the device.
-#[expect(clippy::large_enum_variant, reason = "a renderer has one")]
-pub enum Finished {
-    /// Anchors and their decoders, flat.
-    Anchors(Anchors, Buffer<f32>),
-    /// Plain Gaussians.
-    Gaussians(Static),
-}
+pub struct Finished(Box<dyn Representation>);
 
 impl Finished {
     /// This model on the device.
@@ -130,58 +128,28 @@ impl Finished {
     /// # Errors
     /// When the device has no room for it.
     pub fn upload(gpu: &Gpu, model: &Stored) -> Result<Self, Error> {
-        Ok(match model {
-            Stored::Anchors(anchors, weights) => {
-                let weights = gpu.upload("weights", &weights.decoders())?;
-                Self::Anchors(Anchors::upload(gpu, anchors, 0)?, weights)
-            }
-            Stored::Gaussians(cloud) => Self::Gaussians(Static::upload(gpu, cloud)?),
-        })
-    }
-
-    /// Anchors or plain Gaussians.
-    pub fn count(&self) -> u32 {
-        match self {
-            Self::Anchors(anchors, _) => anchors.count,
-            Self::Gaussians(gaussians) => gaussians.count,
-        }
-    }
-
-    /// Gaussians of an anchor; 1 for plain ones.
-    pub fn offsets(&self) -> u32 {
-        match self {
-            Self::Anchors(anchors, _) => anchors.offsets,
-            Self::Gaussians(_) => 1,
-        }
+        Ok(Self(match model {
+            Stored::Anchors(anchors, weights) => Box::new(Decoded::upload(gpu, anchors, &weights.decoders(), 0)?),
+            Stored::Gaussians(cloud) => Box::new(Static::upload(gpu, cloud)?),
+        }))
     }
 
     /// The model as the forward stages read it.
-    pub fn model(&self) -> Model<'_> {
-        match self {
-            Self::Anchors(anchors, weights) => Model::Anchors { anchors, weights },
-            Self::Gaussians(gaussians) => Model::Gaussians(gaussians),
-        }
+    pub fn model(&self) -> &dyn Representation {
+        &*self.0
+    }
+}
+
+impl std::ops::Deref for Finished {
+    type Target = dyn Representation;
+
+    fn deref(&self) -> &Self::Target {
+        &*self.0
     }
 }
 
 impl Renderer {
     /// A renderer of this model.
-    ///
-    /// # Errors
-    /// When the device has no room for it.
-    pub fn new(
-        gpu: &Gpu,
-        anchors: &files::Anchors,
-        weights: &files::Weights,
-        config: &super::Config,
-    ) -> Result<Self, Error> {
-        let weights = gpu.upload("weights", &weights.decoders())?;
-        let anchors = Anchors::upload(gpu, anchors, 0)?;
-        let painter = Painter::new(gpu, config, Capacity::guess(anchors.count))?;
-        Ok(Self { painter, model: Finished::Anchors(anchors, weights) })
-    }
-
-    /// A renderer of a model in either form.
     ///
     /// # Errors
     /// When the device has no room for it.

@@ -46,6 +46,8 @@ impl Room {
 pub struct Attended<'a> {
     chosen: Chosen<'a>,
     reference: bool,
+    /// The features to decode.
+    pub feature: &'a Buffer<f32>,
 }
 
 impl<'a> Attended<'a> {
@@ -96,18 +98,17 @@ impl Attend {
         self.room.as_ref().expect("released only while no step is recorded")
     }
 
-    /// Chooses tokens and blends their features. Returns the features to decode, and what the way back needs; nothing
-    /// where the view has no mask.
+    /// Chooses tokens and blends their features; nothing where the view has no mask.
     pub fn forward<'a>(
         &'a self,
         rec: &mut Recorder<'_>,
-        anchors: &'a Anchors,
+        anchors: &Anchors,
         visible: &Visible,
         photograph: &Photograph,
         near: f32,
         step: u32,
-    ) -> (&'a Buffer<f32>, Option<Attended<'a>>) {
-        let Some([x0, y0, x1, y1]) = photograph.mask_box else { return (&anchors.feature().value, None) };
+    ) -> Option<Attended<'a>> {
+        let [x0, y0, x1, y1] = photograph.mask_box?;
         let camera = &photograph.camera;
         let view = View {
             rotation: camera.rotation,
@@ -130,14 +131,14 @@ impl Attend {
         let chosen = select.take(rec, sorted.values);
         let inputs = Inputs { chosen, weights: &self.weights.value };
         let feature = &anchors.feature().value;
-        let attended = Attended { chosen, reference: photograph.reference };
+        let attended = Attended { chosen, reference: photograph.reference, feature: blended };
         if self.config.write_back {
             let which = (anchors.count as usize, attended.reference);
             self.blend.mix_to_write_back(rec, inputs, feature, blended, which);
         } else {
             self.blend.mix(rec, inputs, feature, blended, anchors.count as usize);
         }
-        (blended, Some(attended))
+        Some(attended)
     }
 
     /// Writes the blended features into the anchors where the settings say so, unless the step overflowed. Returns the
@@ -157,7 +158,8 @@ impl Attend {
     }
 
     /// From the gradient of the decoded features to that of the features and of the projections.
-    pub fn backward(&self, rec: &mut Recorder<'_>, attended: Attended<'_>, grad_feature: &Buffer<f32>) {
+    pub fn backward(&self, rec: &mut Recorder<'_>, attended: Attended<'_>, anchors: &Anchors) {
+        let Some(grad_feature) = &anchors.feature().gradient else { return };
         let inputs = Inputs { chosen: attended.chosen, weights: &self.weights.value };
         if self.config.write_back {
             self.blend.weights_backward(rec, inputs, grad_feature, self.grad_weights());

@@ -1,14 +1,48 @@
-//! The plain Gaussians that a training begins with.
+//! What a training begins with.
 
 use std::path::Path;
 
 use crate::config::Settings;
+use crate::model::config::Form;
 use crate::model::gaussians::Cloud;
-use crate::model::init;
+use crate::model::init::{self, Initial};
+use crate::model::stored::Stored;
 use crate::scene::Scene;
 use crate::splat::read::{self, of_degree};
 
-/// Those of the file that the settings name, in the scene's unit, with the harmonics that the settings ask for; otherwise
+/// The model before the first step.
+#[derive(Clone, Debug)]
+pub struct Beginning {
+    /// The model; the networks with projections of an attention, whether there is one or not.
+    pub model: Stored,
+    /// Side of the anchors' grid, scene units.
+    pub voxel: f64,
+}
+
+impl Beginning {
+    /// That of a run under these settings.
+    ///
+    /// # Errors
+    /// Points that make no model; a file of Gaussians that cannot be begun with.
+    pub fn of(scene: &Scene, settings: &Settings) -> Result<Self, init::Error> {
+        let Settings { model, train, .. } = &settings.fitted(scene);
+        Ok(match model.form {
+            Form::Anchors => {
+                let Initial { anchors, voxel } = init::from_points(&scene.starts(), model, train.seed)?;
+                let weights = init::weights(train.seed, anchors.offsets_per_anchor, true, model.opacity);
+                Self { model: Stored::Anchors(anchors, weights), voxel }
+            }
+            Form::Gaussians => Self { model: Stored::Gaussians(gaussians(scene, settings)?), voxel: 0.0 },
+        })
+    }
+
+    /// Anchors or plain Gaussians.
+    pub fn count(&self) -> u32 {
+        self.model.positions().len() as u32
+    }
+}
+
+/// Plain Gaussians of the file that the settings name, in the scene's unit, with the harmonics that the settings ask for; otherwise
 /// Gaussians at the scene's points.
 ///
 /// # Errors

@@ -32,12 +32,11 @@ use crate::losses::Term;
 use crate::math::attention::WEIGHTS as ATTENTION;
 use crate::math::decoder::Layout;
 use crate::math::harmonics::coefficients;
-use crate::model::anchors::Anchors;
 use crate::model::arrays::ARRAYS;
 use crate::model::files;
 use crate::model::gaussians::{self, Cloud};
-use crate::model::learnt::Learnt;
 use crate::model::parameter::{Names, PROJECTIONS, WEIGHTS};
+use crate::model::stored::Stored;
 use crate::render::forward::Capacity;
 use crate::scene::{Camera, Prior, Scene};
 
@@ -87,10 +86,7 @@ pub struct Culprit {
 fn floats(step: &Step) -> Vec<(Buffer<f32>, usize)> {
     let Step { learnt, statistics, .. } = step;
     let n = learnt.count() as usize;
-    let mut all = match learnt {
-        Learnt::Anchors { anchors, .. } => vec![(anchors.position.view(), 3 * n)],
-        Learnt::Gaussians(_) => vec![],
-    };
+    let mut all: Vec<_> = learnt.anchors().iter().map(|anchors| (anchors.position.view(), 3 * n)).collect();
     let rows = learnt.rows().into_iter().map(|parameter| (parameter, n));
     for (parameter, rows) in rows.chain(step.networks().map(|parameter| (parameter, 1))) {
         all.extend(parameter.tensors().map(|tensor| (tensor.view(), rows * parameter.width as usize)));
@@ -133,10 +129,7 @@ impl Model {
         if let Some(initial) = &step.attention_weights {
             arrays.insert(WAITING.to_owned(), Values::Float(initial.clone()));
         }
-        let offsets = match &step.learnt {
-            Learnt::Anchors { anchors, .. } => anchors.offsets,
-            Learnt::Gaussians(_) => PLAIN,
-        };
+        let offsets = step.learnt.anchors().map_or(PLAIN, |anchors| anchors.offsets);
         Ok(Self { capacity: step.capacity(), voxel: step.voxel, offsets, anchors: step.learnt.count(), arrays })
     }
 
@@ -179,8 +172,8 @@ impl Model {
         (0..=3).find(|degree| floats == 3 * coefficients(*degree) * self.anchors as usize)
     }
 
-    /// The anchors' files.
-    fn files(&self) -> (files::Anchors, files::Weights) {
+    /// The anchors and their networks.
+    fn anchors(&self) -> Stored {
         let mut anchors = files::Anchors { offsets_per_anchor: self.offsets as usize, ..files::Anchors::default() };
         anchors.position = self.float("position").as_chunks().0.to_vec();
         for array in &ARRAYS {
@@ -188,7 +181,8 @@ impl Model {
         }
         let attention = [WAITING, PROJECTIONS.value].map(|name| self.float(name)).concat();
         let attention = Some(attention.as_slice()).filter(|weights| !weights.is_empty());
-        (anchors, files::Weights::from_device(self.offsets as usize, self.float(WEIGHTS.value), attention))
+        let weights = files::Weights::from_device(self.offsets as usize, self.float(WEIGHTS.value), attention);
+        Stored::Anchors(anchors, weights)
     }
 
     /// The step that this was read from, stages included.
@@ -196,16 +190,8 @@ impl Model {
     /// # Errors
     /// When the device has no room.
     pub fn restore(&self, gpu: &Gpu, plan: Plan, settings: &Settings) -> Result<Step, gpu::Error> {
-        let mut step = if self.offsets == PLAIN {
-            Step::of_gaussians(gpu, plan, settings, &self.cloud())?
-        } else {
-            let (anchors, weights) = self.files();
-            let mut step = Step::new(gpu, plan, settings, &anchors, &weights, self.voxel)?;
-            if let Learnt::Anchors { anchors: device, .. } = &mut step.learnt {
-                *device = Anchors::upload(gpu, &anchors, self.capacity.anchors)?;
-            }
-            step
-        };
+        let model = if self.offsets == PLAIN { Stored::Gaussians(self.cloud()) } else { self.anchors() };
+        let mut step = Step::new(gpu, plan, settings, (&model, self.voxel), self.capacity.anchors)?;
         step.resize(self.capacity)?;
         if self.arrays.contains_key(PROJECTIONS.value) {
             let (config, seed) = (&settings.model.attention, settings.train.seed);
@@ -306,7 +292,7 @@ pub struct History {
 
 /// [`History`] and the model's sizes in the metadata. Floats by their bits: a decimal reader may round to a neighbour.
 #[derive(Serialize, Deserialize)]
-struct Stored {
+struct Metadata {
     step: u32,
     seconds: u64,
     view: String,
@@ -323,7 +309,7 @@ struct Stored {
     anchors: u32,
 }
 
-impl Stored {
+impl Metadata {
     fn of(history: &History, model: &Model) -> Self {
         let History { last, told, since_line, recent, repeated, figures, log: _ } = history;
         Self {
@@ -586,7 +572,7 @@ pub fn write(run: &Path, owner: &Owner, state: &State) -> Result<PathBuf, WriteE
         ("version", env!("CARGO_PKG_VERSION").to_owned()),
         ("scene", json(serde_json::to_string(&owner.scene))),
         ("settings", owner.settings.clone()),
-        ("state", json(serde_json::to_string(&Stored::of(&state.history, &state.model)))),
+        ("state", json(serde_json::to_string(&Metadata::of(&state.history, &state.model)))),
     ]
     .into_iter()
     .map(|(key, value)| (key.to_owned(), value))
@@ -648,7 +634,7 @@ pub fn read(path: &Path, owner: &Owner) -> Result<State, Refusal> {
         let (version, own) = (entry("version"), env!("CARGO_PKG_VERSION"));
         log::warn!("{}: written by version {version}; version {own} may not give the same bytes", path.display());
     }
-    let stored: Stored =
+    let stored: Metadata =
         serde_json::from_str(entry("state")).map_err(|error| refuse(format!("has no state to go on from: {error}")))?;
     let mut log = String::new();
     let mut arrays = BTreeMap::new();

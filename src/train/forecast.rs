@@ -11,21 +11,21 @@ use std::collections::{BTreeMap, BTreeSet};
 use image::{GrayImage, RgbImage};
 use serde::Serialize;
 
-use super::begin;
+use super::begin::Beginning;
 use super::photographs;
 use super::plan::Plan;
 use super::step::{Rates, Step};
 use crate::config::Settings;
 use crate::densify::config::LEVELS;
 use crate::gpu::{self, Gpu, Used};
-use crate::model::anchors::Anchors;
 use crate::model::config::Form;
-use crate::model::gaussians::{Cloud, Static};
-use crate::model::init::{self, Initial};
-use crate::model::learnt::Learnt;
+use crate::model::gaussians::Static;
+use crate::model::init;
+use crate::model::stored::Stored;
 use crate::primitives::limit::{Counter, Limits};
 use crate::render::Method;
-use crate::render::forward::{self, Capacity, Forward, Model};
+use crate::render::forward::{self, Capacity, Forward};
+use crate::render::view::Finished;
 use crate::scene::{Camera, Hole, Notes, Prior, Reference, Scene, View};
 use crate::stage;
 
@@ -62,44 +62,6 @@ impl Survey {
     }
 }
 
-/// The model that a run starts from.
-///
-/// # Errors
-/// Points that make no anchor.
-pub fn initial(scene: &Scene, settings: &Settings) -> Result<Initial, init::Error> {
-    init::from_points(&scene.starts(), &settings.fitted(scene).model, settings.train.seed)
-}
-
-/// The start of a run, in either form of the model.
-#[derive(Clone, Debug)]
-pub enum Beginning {
-    /// Anchors.
-    Anchors(Initial),
-    /// Plain Gaussians.
-    Gaussians(Cloud),
-}
-
-impl Beginning {
-    /// That of a run under these settings.
-    ///
-    /// # Errors
-    /// Points that make no model.
-    pub fn of(scene: &Scene, settings: &Settings) -> Result<Self, init::Error> {
-        Ok(match settings.model.form {
-            Form::Anchors => Self::Anchors(initial(scene, settings)?),
-            Form::Gaussians => Self::Gaussians(begin::gaussians(scene, settings)?),
-        })
-    }
-
-    /// Anchors or plain Gaussians.
-    pub fn count(&self) -> u32 {
-        match self {
-            Self::Anchors(initial) => initial.anchors.position.len() as u32,
-            Self::Gaussians(cloud) => cloud.len() as u32,
-        }
-    }
-}
-
 /// Most cameras that a survey looks through: it comes before the first step, and what they miss the margin of
 /// [`Survey::capacity`] covers.
 const SURVEYED: usize = 12;
@@ -115,52 +77,32 @@ pub fn survey<'c>(
     cameras: impl IntoIterator<Item = &'c Camera>,
 ) -> Result<Survey, gpu::Error> {
     let cameras: Vec<&Camera> = cameras.into_iter().collect();
-    match initial {
-        Beginning::Anchors(initial) => {
-            let offsets = initial.anchors.offsets_per_anchor;
-            let flat = init::weights(settings.train.seed, offsets, false, settings.model.opacity).decoders();
-            let weights = gpu.upload("weights", &flat)?;
-            let anchors = Anchors::upload(gpu, &initial.anchors, 0)?;
-            survey_of(gpu, Model::Anchors { anchors: &anchors, weights: &weights }, anchors.count, settings, cameras)
-        }
-        Beginning::Gaussians(cloud) => {
-            let gaussians = Static::upload(gpu, cloud)?;
-            survey_of(gpu, Model::Gaussians(&gaussians), gaussians.count, settings, cameras)
-        }
-    }
-}
-
-fn survey_of(
-    gpu: &Gpu,
-    model: Model<'_>,
-    count: u32,
-    settings: &Settings,
-    cameras: Vec<&Camera>,
-) -> Result<Survey, gpu::Error> {
+    let model = Finished::upload(gpu, &initial.model)?;
+    let count = model.count();
     let size = cameras.iter().fold([1, 1], |a, c| [a[0].max(c.size[0]), a[1].max(c.size[1])]);
     let method = Method::new(gpu, &settings.render);
     let limits = Limits::new(gpu)?;
     let near = settings.render.near as f32;
     // Pairs are counted whether they fit or not.
     let mut capacity = Capacity { pairs: 1, ..Capacity::guess(count.max(1)) };
-    let mut forward = Forward::of(gpu, capacity, model, method, size, settings.render.cull)?;
+    let mut forward = Forward::new(gpu, capacity, model.model(), method, size, settings.render.cull)?;
     let mut most = Survey { anchors: count, visible: 0, pairs: 0 };
     let every = cameras.len().div_ceil(SURVEYED).max(1);
     for camera in cameras.into_iter().step_by(every) {
         loop {
             let mut rec = gpu.recorder()?;
             limits.lower(&mut rec);
-            forward.record(&mut rec, model, camera, near, &limits);
+            forward.record(&mut rec, model.model(), camera, near, &limits);
             rec.submit()?.wait()?;
             let counters = gpu.read(limits.counters())?;
             let [visible, pairs] = [Counter::Visible, Counter::Pairs].map(|c| counters[c as usize]);
-            if visible <= capacity.visible || matches!(model, Model::Gaussians(_)) {
+            if visible <= model.in_view(capacity) {
                 most = Survey { visible: most.visible.max(visible), pairs: most.pairs.max(pairs), ..most };
                 break;
             }
             drop(forward);
             capacity.visible = visible.saturating_add(visible / 2).min(count.max(1));
-            forward = Forward::of(gpu, capacity, model, method, size, settings.render.cull)?;
+            forward = Forward::new(gpu, capacity, model.model(), method, size, settings.render.cull)?;
         }
     }
     Ok(most)
@@ -179,9 +121,9 @@ pub fn expected_anchors(gpu: &Gpu, plan: &Plan, settings: &Settings, initial: &B
     let count = initial.count();
     let Some(rounds) = plan.rounds else { return count };
     let config = &settings.densify;
-    let initial = match initial {
-        Beginning::Anchors(initial) => initial,
-        Beginning::Gaussians(cloud) => {
+    let anchors = match &initial.model {
+        Stored::Anchors(anchors, _) => anchors,
+        Stored::Gaussians(cloud) => {
             let rounds = (rounds.last - rounds.first) / config.every + 1;
             let grown = f64::from(count) * (1.0 + crate::densify::split::GROWTH).powi(rounds.min(10_000) as i32);
             let most = config.max_gaussians.min(Static::most(gpu, cloud.degree));
@@ -190,7 +132,7 @@ pub fn expected_anchors(gpu: &Gpu, plan: &Plan, settings: &Settings, initial: &B
     };
     let side = initial.voxel * config.coarsest_cell;
     let cells: BTreeSet<[i64; 3]> =
-        initial.anchors.position.iter().map(|p| p.map(|x| (f64::from(x) / side).round_ties_even() as i64)).collect();
+        anchors.position.iter().map(|p| p.map(|x| (f64::from(x) / side).round_ties_even() as i64)).collect();
     let rounds = f64::from((rounds.last - rounds.first) / config.every + 1);
     let per_cell = 16f64.powi(LEVELS as i32 - 1) / 30.0;
     let grown = cells.len() as f64 * per_cell * rounds / (rounds + 8.0);
@@ -279,14 +221,7 @@ pub fn rehearse(
     let plan = Plan::new(scene, settings);
     let coarse = settings.train.coarse;
     let mut photographs = photographs::upload(&gpu, scene, &plan, coarse.reduction(1))?;
-    let mut step = match initial {
-        Beginning::Anchors(initial) => {
-            let offsets = settings.model.offsets as usize;
-            let weights = init::weights(settings.train.seed, offsets, plan.attention, settings.model.opacity);
-            Step::new(&gpu, plan.clone(), settings, &initial.anchors, &weights, initial.voxel)?
-        }
-        Beginning::Gaussians(cloud) => Step::of_gaussians(&gpu, plan.clone(), settings, cloud)?,
-    };
+    let mut step = Step::new(&gpu, plan.clone(), settings, (&initial.model, initial.voxel), 0)?;
     let capacity = survey.capacity();
     step.resize(capacity)?;
     let start = gpu.memory().0;
@@ -306,7 +241,7 @@ pub fn rehearse(
     at.extend(counted.map(|c| c.first).into_iter().chain(attention).chain(after).chain(evaluations));
     let every = settings.densify.every as usize;
     let mut rounds: Vec<u32> = plan.rounds.map_or(vec![], |r| (r.first..=r.last).step_by(every).collect());
-    if matches!(initial, Beginning::Gaussians(_)) {
+    if step.learnt.anchors().is_none() {
         // All rounds are alike, and the room of the last is there from the first step on.
         rounds.drain(..rounds.len().saturating_sub(1));
     }
@@ -340,9 +275,9 @@ pub fn rehearse(
         if Some(number) == attention {
             note("attention begins", number, step.learnt.count());
         }
-        if let Learnt::Gaussians(gaussians) = &mut step.learnt {
+        if step.learnt.anchors().is_none() {
             if rounds.last() == Some(&number) && number <= iterations {
-                gaussians.count = anchors.clamp(gaussians.count, gaussians.capacity);
+                step.learnt.swell(anchors);
                 step.resize(step.capacity())?;
                 note("the last round of growing", number, step.learnt.count());
             }
@@ -501,7 +436,7 @@ const VIEWS: usize = 8;
 pub fn forecast(gpu: &Gpu, scene: &Scene, settings: &Settings, question: Question) -> Result<Verdict, Error> {
     let available = question.available.unwrap_or_else(|| gpu.available_bytes());
     let settings = &settings.fitted(scene);
-    let start = Start::of(gpu, scene, settings)?;
+    let start = Start::of(gpu, scene, settings, Beginning::of(scene, settings)?)?;
     let anchors = question.anchors.unwrap_or_else(|| start.expected(gpu, scene, settings));
     let forecast = start.rehearse(gpu, scene, settings, anchors, question.also)?;
     let mut verdict = Verdict { available, forecast, remedies: vec![] };
@@ -518,8 +453,7 @@ struct Start {
 }
 
 impl Start {
-    fn of(gpu: &Gpu, scene: &Scene, settings: &Settings) -> Result<Self, Error> {
-        let initial = Beginning::of(scene, settings)?;
+    fn of(gpu: &Gpu, scene: &Scene, settings: &Settings, initial: Beginning) -> Result<Self, Error> {
         let counts = surveyed(gpu, &initial, settings, scene.train.iter().map(|v| &v.camera))?;
         Ok(Self { initial, counts })
     }
@@ -571,21 +505,23 @@ pub fn fitting(gpu: &Gpu, scene: &Scene, asked: &Settings, available: Option<u64
     if asked.model.form == Form::Gaussians {
         return fitting_gaussians(gpu, scene, asked, available);
     }
-    let most = forward::most_anchors(gpu, asked.model.offsets) as usize;
+    let most = forward::most_anchors(gpu, asked.model.offsets);
     for coarser in COARSER {
         let mut settings = asked.clone();
         let model = &mut settings.model;
         let grid = if model.voxel > 0.0 { &mut model.voxel } else { &mut model.voxel_factor };
         *grid *= coarser;
         let grid = *grid;
-        let count = initial(scene, &settings)?.anchors.position.len();
+        let fitted = settings.fitted(scene);
+        let initial = Beginning::of(scene, &fitted)?;
+        let count = initial.count();
         if count > most {
             continue;
         }
-        let start = Start::of(gpu, scene, &settings.fitted(scene))?;
-        let expected = start.expected(gpu, scene, &settings.fitted(scene));
+        let start = Start::of(gpu, scene, &fitted, initial)?;
+        let expected = start.expected(gpu, scene, &fitted);
         for share in GROWTH_SHARES {
-            let anchors = count as u32 + (f64::from(expected.saturating_sub(count as u32)) * share) as u32;
+            let anchors = count + (f64::from(expected.saturating_sub(count)) * share) as u32;
             if share < 1.0 {
                 settings.densify.max_anchors = anchors;
             }
@@ -603,7 +539,7 @@ pub fn fitting(gpu: &Gpu, scene: &Scene, asked: &Settings, available: Option<u64
                 });
                 return Ok(Fitting { settings, verdict, reduced });
             }
-            if expected as usize <= count {
+            if expected <= count {
                 break;
             }
         }
@@ -646,8 +582,7 @@ fn surveyed<'c>(
     match survey(gpu, initial, settings, cameras) {
         Err(gpu::Error::TooLarge { .. } | gpu::Error::OutOfMemory { .. } | gpu::Error::Missing { .. }) => {
             let anchors = initial.count();
-            let offsets = if settings.model.form == Form::Anchors { settings.model.offsets } else { 1 };
-            Ok(Survey { anchors, visible: anchors, pairs: anchors.saturating_mul(offsets) })
+            Ok(Survey { anchors, visible: anchors, pairs: anchors.saturating_mul(initial.model.offsets()) })
         }
         other => Ok(other?),
     }

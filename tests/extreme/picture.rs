@@ -1,7 +1,7 @@
 //! From anchors to a picture and back: scenes far from the origin, tiny and huge ones, nothing to see, odd pictures.
 
 use gscream_vk::gpu::{Gpu, testing};
-use gscream_vk::model::anchors::Anchors;
+use gscream_vk::model::anchors::Decoded;
 use gscream_vk::model::files;
 use gscream_vk::primitives::limit::{Counter, Limits};
 use gscream_vk::render::decode::{self, AnchorGradients, DecodeBackward, GaussianGradients};
@@ -137,12 +137,12 @@ fn run_with(gpu: &Gpu, method: Method, model: &Model, camera: &Camera, near: f32
     let size = camera.size;
     let pixels = (size[0] * size[1]) as usize;
     let capacity = Capacity { anchors: n.max(1), visible: n.max(1), pairs: 1 << 18 };
-    let anchors = Anchors::upload(gpu, &model.anchors, 0).expect(fine);
-    let weights = gpu.upload("weights", &model.weights).expect(fine);
+    let decoded = Decoded::upload(gpu, &model.anchors, &model.weights, 0).expect(fine);
+    let (anchors, weights) = (&decoded.anchors, &decoded.weights.value);
     let limits = Limits::new(gpu).expect(fine);
     // Depths are sorted by their distance from the near plane.
     let method = Method { depth_key: DepthKey::new(near, method.depth_key.bits), ..method };
-    let forward = Forward::new(gpu, capacity, K as u32, method, size, true).expect(fine);
+    let forward = Forward::new(gpu, capacity, &decoded, method, size, true).expect(fine);
     let mut picture = Picture::new(gpu, size, pixels, Outputs::Transmittance).expect(fine);
     picture.rgb = gpu.upload("rgb", &vec![[testing::UNWRITTEN; 3]; pixels]).expect(fine);
     let slots = capacity.visible as usize * K;
@@ -162,14 +162,14 @@ fn run_with(gpu: &Gpu, method: Method, model: &Model, camera: &Camera, near: f32
     let grad_z = gpu.upload("grad_depth_map", &z).expect(fine);
 
     let mut rec = gpu.recorder().expect(fine);
-    forward.visible().record(&mut rec, &anchors, camera, near, &limits);
+    forward.visible().record(&mut rec, anchors, camera, near, &limits);
     let offset = anchors.offset().value.view();
     let of = decode::Anchors {
         position: &anchors.position,
         feature: &anchors.feature().value,
         offset: &offset,
         log_scaling: &anchors.log_scaling().value,
-        weights: &weights,
+        weights,
         visible: &forward.visible().list,
     };
     forward.decode().record(&mut rec, of, &forward.visible().count, camera.center());

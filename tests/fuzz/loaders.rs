@@ -7,6 +7,7 @@ use gscream_vk::config::{Settings, Source};
 use gscream_vk::evaluate::network::Weights;
 use gscream_vk::formats::{self, gltf, ply, sog, spz};
 use gscream_vk::gpu::testing;
+use gscream_vk::model::stored::Stored;
 use gscream_vk::model::{files, init};
 use gscream_vk::prepare::graph_cut::Strokes;
 use gscream_vk::prepare::lens::Pinhole;
@@ -269,8 +270,8 @@ fn checkpoints() {
     let gpu = testing::gpu();
     let plan = Plan::new(&scene, &settings);
     let initial = init::from_points(&scene.points, &settings.model, 0).expect("points");
-    let weights = init::weights(0, 2, plan.attention, settings.model.opacity);
-    let step = Step::new(&gpu, plan, &settings, &initial.anchors, &weights, initial.voxel).expect("room");
+    let model = Stored::Anchors(initial.anchors, init::weights(0, 2, plan.attention, settings.model.opacity));
+    let step = Step::new(&gpu, plan, &settings, (&model, initial.voxel), 0).expect("room");
     let state = State { history: History::default(), model: Model::of(&gpu, &step).expect("a device") };
     let owner = Owner::new(&scene, &settings);
     let path = checkpoint::write(folder.path(), &owner, &state).expect("a writable folder");

@@ -5,6 +5,7 @@ use gscream_vk::config::{Settings, without_removed};
 use gscream_vk::gpu::{Check, Gpu, testing};
 use gscream_vk::losses::{self, DepthView, NO_PRIOR, Quantity, Weights};
 use gscream_vk::model::files;
+use gscream_vk::model::stored::Stored;
 use gscream_vk::primitives::limit::Counter;
 use gscream_vk::scene::{Camera, PriorKind};
 use gscream_vk::train::photographs::{Photograph, PriorMap};
@@ -34,6 +35,10 @@ fn anchors(case: &Case) -> files::Anchors {
         case.f32("offset"),
         case.vectors("log_scaling"),
     )
+}
+
+fn model(case: &Case, attention: bool) -> Stored {
+    Stored::Anchors(anchors(case), weights(case, attention))
 }
 
 fn weights(case: &Case, attention: bool) -> files::Weights {
@@ -126,7 +131,7 @@ fn whole(gpu: &Gpu, case: &Case) {
         ..Plan::default()
     };
     let voxel = case.f64("voxel")[0];
-    let mut step = Step::new(gpu, plan, &settings, &anchors(case), &weights(case, true), voxel).unwrap();
+    let mut step = Step::new(gpu, plan, &settings, (&model(case, true), voxel), 0).unwrap();
     let mut losses = vec![];
     for number in 1..=case.shape("losses")[0] {
         let photograph = &photographs[(number - 1) % 2];
@@ -182,7 +187,7 @@ fn step_in_one_form(gpu: &Gpu) {
         };
         let size = cameras[0].size;
         assert_eq!(size, cameras[1].size);
-        let step = Step::new(gpu, plan, &settings, &anchors(case), &weights(case, false), 0.1).unwrap();
+        let step = Step::new(gpu, plan, &settings, (&model(case, false), 0.1), 0).unwrap();
         let priors = [0, 1].map(|v| gpu.upload("prior", &case.f32(&format!("view{v}.prior"))).unwrap());
         let count = case.shape("losses")[0];
         let mut losses = vec![];

@@ -19,7 +19,8 @@ use crate::lab::pace::Pace;
 use crate::lab::pareto::{self, Choice};
 use crate::lab::statistics::Spread;
 use crate::lab::variants::Variant;
-use crate::model::{files, init};
+use crate::model::init;
+use crate::model::stored::Stored;
 use crate::scene::{Reference, Scene};
 use crate::train::photographs::{self, Photograph};
 use crate::train::plan::Plan;
@@ -232,7 +233,7 @@ pub fn measure(
         step,
         views: subset.train.iter().map(|view| view.name.clone()).collect(),
         repetitions: options.repetitions,
-        anchors: warm.anchors.position.len() as u32,
+        anchors: warm.model.positions().len() as u32,
         variants: figures,
         omitted,
     })
@@ -307,8 +308,7 @@ pub(crate) fn choose_views(scene: &Scene, views: usize) -> Scene {
 
 /// The model that all choices start from.
 pub(crate) struct Warm {
-    pub(crate) anchors: files::Anchors,
-    pub(crate) weights: files::Weights,
+    pub(crate) model: Stored,
     /// Value and moments of what is learnt, without the attention, which may not have begun.
     pub(crate) tensors: Vec<[Vec<f32>; 3]>,
     /// Values by their buffers' names.
@@ -344,7 +344,7 @@ impl Warm {
             values.insert(parameter.value.name(), value.clone());
             tensors.push([value, first?, root?]);
         }
-        Ok(Self { anchors, weights, tensors, values, capacity: step.capacity() })
+        Ok(Self { model: Stored::Anchors(anchors, weights), tensors, values, capacity: step.capacity() })
     }
 }
 
@@ -371,7 +371,7 @@ impl Bench {
         let settings = &variant.settings;
         // The grid's side matters to growing alone, which is not measured.
         let voxel = if settings.model.voxel > 0.0 { settings.model.voxel } else { 1.0 };
-        let mut step = Step::new(gpu, plan, settings, &warm.anchors, &warm.weights, voxel)?;
+        let mut step = Step::new(gpu, plan, settings, (&warm.model, voxel), 0)?;
         step.resize(warm.capacity)?;
         step.prepare(number)?;
         let mut initial = vec![];

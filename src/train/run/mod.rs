@@ -9,14 +9,12 @@ use crate::config::Settings;
 use crate::evaluate::{self, Report, ViewMetrics};
 use crate::gpu::{self, Buffer, Gpu, NotFinite, Submission, Timing, Timings};
 use crate::losses::{Term, photometric};
-use crate::model::config::Form;
-use crate::model::init;
 use crate::primitives::finite::NOT_FINITE;
 use crate::primitives::limit::{COUNTERS, Counter};
 use crate::render::forward::Capacity;
 use crate::render::view::Rendered;
 use crate::scene::{Scene, View};
-use crate::train::begin;
+use crate::train::begin::Beginning;
 use crate::train::checkpoint::{self, History, LastFigures, Model, Owner, State};
 use crate::train::order::Order;
 use crate::train::photographs::{self, Photograph};
@@ -150,14 +148,8 @@ const DEPTH: usize = 2;
 fn fresh(gpu: &Gpu, scene: &Scene, settings: &Settings) -> Result<Step, Error> {
     let settings = &settings.fitted(scene);
     let plan = Plan::new(scene, settings);
-    if settings.model.form == Form::Gaussians {
-        let cloud = begin::gaussians(scene, settings)?;
-        return Ok(Step::of_gaussians(gpu, plan, settings, &cloud)?);
-    }
-    let offsets = settings.model.offsets as usize;
-    let initial = init::from_points(&scene.starts(), &settings.model, settings.train.seed)?;
-    let weights = init::weights(settings.train.seed, offsets, plan.attention, settings.model.opacity);
-    Ok(Step::new(gpu, plan, settings, &initial.anchors, &weights, initial.voxel)?)
+    let Beginning { model, voxel } = Beginning::of(scene, settings)?;
+    Ok(Step::new(gpu, plan, settings, (&model, voxel), 0)?)
 }
 
 /// The settings for the step behind `done`.

@@ -7,32 +7,29 @@ mod read;
 mod update;
 mod weights;
 
+pub use growth::Growing;
 pub use rates::Rates;
 
 use crate::config::Settings;
 use crate::densify::{Drawn, Statistics};
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::losses::{self, DepthView, Losses, View};
-use crate::math::decoder::Layout;
-use crate::model::anchors::Anchors;
-use crate::model::files;
-use crate::model::gaussians::{Cloud, Static};
-use crate::model::learnt::Learnt;
-use crate::model::parameter::{DECODERS, Parameter, Part, WEIGHTS};
+use crate::model::anchors::{Anchors, Decoded};
+use crate::model::gaussians::Static;
+use crate::model::parameter::{DECODERS, Parameter};
+use crate::model::stored::Stored;
 use crate::optimizer::{BETAS, Group, adam};
-use crate::primitives::limit::{Counter, Limits};
-use crate::render::activate::{self, Activate, DrawnGradients};
+use crate::primitives::limit::Limits;
 use crate::render::config::BACKGROUND;
-use crate::render::decode::{self, Decode, DecodeBackward, GaussianGradients, WantedGradients};
-use crate::render::forward::{Capacity, Forward, Front, Model};
+use crate::render::decode::{DecodeBackward, GaussianGradients};
+use crate::render::forward::{Capacity, Forward, Representation};
 use crate::render::project::{ProjectBackward, SplatGradients};
 use crate::render::rasterize::{self, Backward, Picture, PictureGradient};
-use crate::render::visible::Visible;
 use crate::render::{Config, Method};
 use crate::scene::Camera;
 use crate::stage;
 
-use super::attend::{Attend, Attended};
+use super::attend::Attend;
 use super::photographs::Photograph;
 use super::plan::Plan;
 
@@ -41,67 +38,28 @@ struct Stages {
     forward: Forward,
     rasterize: Backward,
     project: ProjectBackward,
-    /// Stages of anchors.
-    decode: Option<DecodeBackward>,
+    scratch: Option<DecodeBackward>,
 }
 
 impl Stages {
-    fn new(gpu: &Gpu, plan: &Plan, capacity: Capacity, model: Model<'_>, config: &Config) -> Result<Self, Error> {
-        let [feature, decoders] = [&[Group::Feature][..], &DECODERS].map(|groups| plan.trained.any(groups.to_vec()));
+    fn new(
+        gpu: &Gpu,
+        plan: &Plan,
+        capacity: Capacity,
+        model: &dyn Representation,
+        config: &Config,
+    ) -> Result<Self, Error> {
+        let wanted = [&[Group::Feature][..], &DECODERS].map(|groups| plan.trained.any(groups.to_vec()));
         let method = Method::new(gpu, config);
-        let forward = Forward::of(gpu, capacity, model, method, plan.largest(), config.cull)?;
-        let slots = match model {
-            Model::Anchors { anchors, .. } => (capacity.visible * anchors.offsets) as usize,
-            Model::Gaussians(gaussians) => gaussians.count as usize,
-        };
-        let decode = match &forward.front {
-            Front::Anchors { decode, .. } => Some(decode),
-            Front::Gaussians { .. } => None,
-        };
-        let pairs = capacity.pairs as usize;
+        let forward = Forward::new(gpu, capacity, model, method, plan.largest(), config.cull)?;
+        let (slots, pairs) = (forward.slots as usize, capacity.pairs as usize);
         Ok(Self {
             rasterize: gpu
                 .stage(stage::RASTERIZE_BACKWARD, || Backward::new(gpu, method, slots, pairs, plan.outputs()))?,
             project: gpu.stage(stage::PROJECT_BACKWARD, || ProjectBackward::new(gpu, &forward.project))?,
-            decode: decode
-                .map(|decode| gpu.stage(stage::DECODE_BACKWARD, || DecodeBackward::of(gpu, decode, feature, decoders)))
-                .transpose()?,
+            scratch: model.scratch(gpu, &forward.front, wanted)?,
             forward,
         })
-    }
-}
-
-/// The Gaussians that a step draws, with what its way back needs.
-enum Drawable<'a> {
-    Anchors {
-        anchors: &'a Anchors,
-        weights: &'a Parameter,
-        visible: &'a Visible,
-        decode: &'a Decode,
-        feature: &'a Buffer<f32>,
-        attended: Option<Attended<'a>>,
-    },
-    Gaussians {
-        gaussians: &'a Static,
-        activate: &'a Activate,
-    },
-}
-
-/// Anchors as the decoder reads them.
-fn anchors_of<'a>(
-    anchors: &'a Anchors,
-    weights: &'a Parameter,
-    feature: &'a Buffer<f32>,
-    offset: &'a Buffer<[f32; 3]>,
-    visible: &'a Visible,
-) -> decode::Anchors<'a> {
-    decode::Anchors {
-        position: &anchors.position,
-        feature,
-        offset,
-        log_scaling: &anchors.log_scaling().value,
-        weights: &weights.value,
-        visible: &visible.list,
     }
 }
 
@@ -132,7 +90,7 @@ pub struct Step {
     /// The plan the stages were made for.
     pub plan: Plan,
     /// The learnt arrays, but for the attention's.
-    pub learnt: Learnt,
+    pub learnt: Box<dyn Growing>,
     /// Overflow flag and counters.
     pub limits: Limits,
     capacity: Capacity,
@@ -150,7 +108,8 @@ pub struct Step {
 }
 
 impl Step {
-    /// Uploads the model and makes the stages that the plan has. `voxel` is the side of the anchors' grid, scene units.
+    /// Uploads a model, with room for so many anchors, or for as many plain Gaussians as the settings allow where the plan has
+    /// growth, and makes the stages that the plan has. `voxel` is the side of the anchors' grid, scene units.
     ///
     /// # Errors
     /// When the device has no room.
@@ -158,53 +117,34 @@ impl Step {
         gpu: &Gpu,
         plan: Plan,
         settings: &Settings,
-        anchors: &files::Anchors,
-        weights: &files::Weights,
-        voxel: f64,
+        (model, voxel): (&Stored, f64),
+        anchors: u32,
     ) -> Result<Self, Error> {
-        let anchors = gpu.stage(stage::MODEL, || Anchors::upload(gpu, anchors, 0))?;
-        let initial = weights;
-        let flat = initial.decoders();
-        let weights = gpu.stage(stage::MODEL, || Parameter::upload(gpu, WEIGHTS, flat.len() as u32, 1, &flat))?;
-        let layout = Layout { offsets: anchors.offsets as usize };
-        let parts = DECODERS.iter().enumerate();
-        let weights = weights.in_parts(parts.map(|(head, &group)| Part { group, first: layout.head(head) as u32 }));
-        let capacity = Capacity::guess(anchors.capacity);
-        let attention_weights = plan.attention.then(|| initial.attention());
-        let learnt = Learnt::Anchors { anchors, weights };
-        Self::with(gpu, plan, settings, learnt, capacity, voxel, attention_weights)
-    }
-
-    /// Uploads plain Gaussians, with room for as many as the settings allow where the plan has growth, and makes the stages
-    /// that the plan has.
-    ///
-    /// # Errors
-    /// When the device has no room.
-    pub fn of_gaussians(gpu: &Gpu, plan: Plan, settings: &Settings, cloud: &Cloud) -> Result<Self, Error> {
-        let room = if plan.growth { settings.densify.max_gaussians.min(Static::most(gpu, cloud.degree)) } else { 0 };
-        let higher = settings.optimizer.higher_harmonics as f32;
-        let gaussians = gpu.stage(stage::MODEL, || Static::with_room(gpu, cloud, room, higher))?;
-        let capacity = Capacity { visible: gaussians.capacity, ..Capacity::guess(gaussians.capacity) };
-        Self::with(gpu, plan, settings, Learnt::Gaussians(gaussians), capacity, 0.0, None)
-    }
-
-    fn with(
-        gpu: &Gpu,
-        plan: Plan,
-        settings: &Settings,
-        learnt: Learnt,
-        capacity: Capacity,
-        voxel: f64,
-        attention_weights: Option<Vec<f32>>,
-    ) -> Result<Self, Error> {
-        let canvases = Canvas::all(gpu, &plan, settings)?;
+        let upload = || -> Result<(Box<dyn Growing>, _), Error> {
+            Ok(match model {
+                Stored::Anchors(of, weights) => {
+                    let attention = plan.attention.then(|| weights.attention());
+                    (Box::new(Decoded::upload(gpu, of, &weights.decoders(), anchors)?), attention)
+                }
+                Stored::Gaussians(cloud) => {
+                    let most = settings.densify.max_gaussians.min(Static::most(gpu, cloud.degree));
+                    let higher = settings.optimizer.higher_harmonics as f32;
+                    (Box::new(Static::with_room(gpu, cloud, if plan.growth { most } else { 0 }, higher)?), None)
+                }
+            })
+        };
+        let (learnt, attention_weights) = gpu.stage(stage::MODEL, upload)?;
+        let mut capacity = Capacity::guess(learnt.capacity());
+        if learnt.anchors().is_none() {
+            capacity.visible = capacity.anchors;
+        }
         let mut step = Self {
             limits: Limits::new(gpu)?,
             gpu: gpu.clone(),
             learnt,
             capacity,
             stages: None,
-            canvases,
+            canvases: Canvas::all(gpu, &plan, settings)?,
             statistics: None,
             voxel,
             attend: None,
@@ -243,10 +183,10 @@ impl Step {
     /// Takes it again, for the model there is now.
     fn furnish(&mut self) -> Result<(), Error> {
         self.capacity.anchors = self.learnt.capacity();
-        self.stages = Some(Stages::new(&self.gpu, &self.plan, self.capacity, self.model_view(), &self.config.render)?);
+        self.stages = Some(Stages::new(&self.gpu, &self.plan, self.capacity, &*self.learnt, &self.config.render)?);
         let Self { gpu, plan, learnt, .. } = self;
         // The way back to plain Gaussians writes all of their gradients.
-        let whole = matches!(learnt, Learnt::Gaussians(_));
+        let whole = learnt.anchors().is_none();
         let rows = learnt.capacity();
         for parameter in learnt.parameters_mut() {
             if whole || plan.trained.any(parameter.groups()) {
@@ -271,18 +211,7 @@ impl Step {
     /// # Panics
     /// For a step of plain Gaussians.
     pub fn anchors(&self) -> &Anchors {
-        match &self.learnt {
-            Learnt::Anchors { anchors, .. } => anchors,
-            Learnt::Gaussians(_) => panic!("plain Gaussians have no anchors"),
-        }
-    }
-
-    /// The model as the forward stages read it.
-    pub(super) fn model_view(&self) -> Model<'_> {
-        match &self.learnt {
-            Learnt::Anchors { anchors, weights } => Model::Anchors { anchors, weights: &weights.value },
-            Learnt::Gaussians(gaussians) => Model::Gaussians(gaussians),
-        }
+        self.learnt.anchors().expect("plain Gaussians have no anchors")
     }
 
     fn stages(&self) -> &Stages {
@@ -352,41 +281,26 @@ impl Step {
         rates: Rates,
     ) {
         let Self { learnt, limits, near, .. } = self;
-        let Stages { forward, rasterize: backward, project: project_backward, decode: decode_backward } = self.stages();
+        let Stages { forward, rasterize: backward, project: project_backward, scratch } = self.stages();
+        let front = &forward.front;
         let canvas = self.canvas(camera.size);
         // Depth is drawn for views alone whose depth is compared.
         let color_alone = canvas.picture.color();
         let picture = if depth.is_some() { &canvas.picture } else { &color_alone };
         rec.stage(stage::DECODE_BACKWARD);
-        let front = match (learnt, &forward.front) {
-            (Learnt::Anchors { anchors, weights }, Front::Anchors { visible, decode }) => {
-                // Rows of anchors that are not drawn are not written.
-                for gradient in anchors.parameters().iter().filter_map(|parameter| parameter.gradient.as_ref()) {
-                    rec.zero(gradient);
-                }
-                rec.stage(stage::CULL);
-                visible.record(rec, anchors, camera, *near, limits);
-                // A step may be recorded again after later ones: the stage is there then, but its time has not come.
-                let attend = self.attend.as_ref().filter(|_| step >= self.config.model.attention.start);
-                rec.stage(stage::ATTENTION);
-                let (feature, attended) = match attend.zip(photographed) {
-                    Some((attend, (photograph, _))) => attend.forward(rec, anchors, visible, photograph, *near, step),
-                    None => (&anchors.feature().value, None),
-                };
-                let offset = anchors.offset().value.view();
-                rec.stage(stage::DECODE);
-                let model = anchors_of(anchors, weights, feature, &offset, visible);
-                decode.record(rec, model, &visible.count, camera.center());
-                Drawable::Anchors { anchors, weights, visible, decode, feature, attended }
-            }
-            (Learnt::Gaussians(gaussians), Front::Gaussians { activate, all, .. }) => {
-                rec.stage(stage::DECODE);
-                activate.record(rec, gaussians, camera.center());
-                limits.note(rec, &all.count, Counter::Visible);
-                Drawable::Gaussians { gaussians, activate }
-            }
-            _ => unreachable!("the stages were made for the model"),
-        };
+        // Rows that are not drawn are not written.
+        learnt.rows().into_iter().filter_map(|row| row.gradient.as_ref()).for_each(|gradient| rec.zero(gradient));
+        rec.stage(stage::CULL);
+        learnt.cull(rec, front, camera, *near, limits);
+        rec.stage(stage::ATTENTION);
+        // A step may be recorded again after later ones: the stage is there then, but its time has not come.
+        let attend = self.attend.as_ref().filter(|_| step >= self.config.model.attention.start);
+        let attended = attend.zip(photographed).and_then(|(attend, (photograph, _))| {
+            attend.forward(rec, self.anchors(), forward.visible(), photograph, *near, step)
+        });
+        let feature = attended.map(|attended| attended.feature);
+        rec.stage(stage::DECODE);
+        learnt.decode(rec, front, feature, camera, limits);
         rec.stage(stage::PROJECT);
         forward.project.record(rec, forward.existing(), forward.gaussians(), camera, *near);
         rec.stage(stage::BIN);
@@ -410,48 +324,22 @@ impl Step {
         rec.stage(stage::PROJECT_BACKWARD);
         project_backward.record(rec, binned.drawn, forward.gaussians(), splats, camera, *near);
         rec.stage(stage::DECODE_BACKWARD);
-        let attended = match front {
-            Drawable::Anchors { anchors, weights, visible, decode, feature, attended } => {
-                let gaussians = GaussianGradients {
-                    drawn: binned.tiles,
-                    position: &project_backward.grad_position,
-                    opacity: &backward.grad_opacity,
-                    color: &backward.grad_color,
-                    scale: &project_backward.grad_scale,
-                    rotation: &project_backward.grad_rotation,
-                };
-                let (offset, grad_offset) =
-                    (anchors.offset().value.view(), anchors.offset().gradient.as_ref().map(Buffer::view));
-                let to = WantedGradients {
-                    feature: anchors.feature().gradient.as_ref(),
-                    offset: grad_offset.as_ref(),
-                    log_scaling: anchors.log_scaling().gradient.as_ref(),
-                    weights: weights.gradient.as_ref(),
-                };
-                let model = anchors_of(anchors, weights, feature, &offset, visible);
-                if let Some(decode_backward) = decode_backward {
-                    decode_backward.record(rec, decode, model, gaussians, to);
-                }
-                self.sentinel(rec, to.weights, weights.width);
-                rec.stage(stage::ATTENTION);
-                if let Some(((attend, attended), grad_feature)) = self.attend.as_ref().zip(attended).zip(to.feature) {
-                    attend.backward(rec, attended, grad_feature);
-                }
-                attended
-            }
-            Drawable::Gaussians { gaussians, activate } => {
-                let gradients = DrawnGradients {
-                    drawn: binned.drawn,
-                    seen: &project_backward.grad_position,
-                    scale: &project_backward.grad_scale,
-                    rotation: &project_backward.grad_rotation,
-                    opacity: &backward.grad_opacity,
-                    color: &backward.grad_color,
-                };
-                activate::backward(rec, gaussians, activate, gradients);
-                None
-            }
+        let gradients = GaussianGradients {
+            drawn: binned.tiles,
+            position: &project_backward.grad_position,
+            opacity: &backward.grad_opacity,
+            color: &backward.grad_color,
+            scale: &project_backward.grad_scale,
+            rotation: &project_backward.grad_rotation,
         };
+        learnt.backward(rec, (front, scratch.as_ref()), feature, binned.drawn, gradients);
+        if let Some(weights) = learnt.weights() {
+            self.sentinel(rec, weights.gradient.as_ref(), weights.width);
+        }
+        rec.stage(stage::ATTENTION);
+        if let Some((attend, attended)) = self.attend.as_ref().zip(attended) {
+            attend.backward(rec, attended, self.anchors());
+        }
         // Whatever changes the model or is gathered for it comes behind: it obeys the flag.
         self.watch(rec, attended, step);
         if let Some(statistics) = &self.statistics {

@@ -3,7 +3,6 @@
 use super::Step;
 use crate::gpu::Error;
 use crate::model::files;
-use crate::model::learnt::Learnt;
 use crate::model::parameter::Parameter;
 use crate::model::stored::Stored;
 use crate::render::forward::Capacity;
@@ -27,8 +26,8 @@ impl Step {
         let gpu = self.gpu.clone();
         gpu.stage(stage::EVALUATION, || {
             let mut painter = Painter::new(&gpu, &self.config.render, self.capacity)?;
-            let model = self.model_view();
-            cameras.into_iter().enumerate().try_for_each(|(i, camera)| look(i, painter.render(model, camera)?))
+            let draw = |(i, camera)| look(i, painter.render(&*self.learnt, camera)?);
+            cameras.into_iter().enumerate().try_for_each(draw)
         })?;
         Ok(self.furnish()?)
     }
@@ -46,8 +45,7 @@ impl Step {
             let trained = self.plan.sizes.iter().map(longest).fold(1.0, f64::max);
             let painter = Painter::new(&self.gpu, &self.config.render, capacity)?;
             let mut painter = painter.larger(longest(&camera.size) / trained);
-            let model = self.model_view();
-            painter.render_within(model, camera, capacity.pairs.max(1 << 20).saturating_mul(4))
+            painter.render_within(&*self.learnt, camera, capacity.pairs.max(1 << 20).saturating_mul(4))
         })
     }
 
@@ -83,17 +81,8 @@ impl Step {
     /// # Errors
     /// Errors of the copies.
     pub fn stored(&self) -> Result<Stored, Error> {
-        let (anchors, weights) = match &self.learnt {
-            Learnt::Anchors { anchors, weights } => (anchors, weights),
-            Learnt::Gaussians(gaussians) => return Ok(Stored::Gaussians(gaussians.read(&self.gpu)?)),
-        };
-        let flat = weights.read(&self.gpu, 1)?;
-        let attention = match (&self.attend, &self.attention_weights) {
-            (Some(attend), _) => Some(attend.weights.read(&self.gpu, 1)?),
-            (None, initial) => initial.clone(),
-        };
-        let weights = files::Weights::from_device(anchors.offsets as usize, &flat, attention.as_deref());
-        Ok(Stored::Anchors(anchors.read(&self.gpu)?, weights))
+        let attention = self.attend.as_ref().map(|attend| attend.weights.read(&self.gpu, 1)).transpose()?;
+        self.learnt.stored(&self.gpu, attention.as_deref().or(self.attention_weights.as_deref()))
     }
 
     /// The anchors and networks as they are now.
@@ -104,9 +93,7 @@ impl Step {
     /// # Panics
     /// For a step of plain Gaussians.
     pub fn model(&self) -> Result<(files::Anchors, files::Weights), Error> {
-        match self.stored()? {
-            Stored::Anchors(anchors, weights) => Ok((anchors, weights)),
-            Stored::Gaussians(_) => panic!("plain Gaussians have no anchors"),
-        }
+        let Stored::Anchors(anchors, weights) = self.stored()? else { panic!("plain Gaussians have no anchors") };
+        Ok((anchors, weights))
     }
 }
