@@ -17,6 +17,7 @@
 //! | --- | --- |
 //! | anchor | a point of the scene with a feature, from which the decoders make its Gaussians |
 //! | plain Gaussian | one that is learnt by itself, in a model without anchors (`model.form`) |
+//! | representation | what a model is made of, anchors or plain Gaussians: a file of [`representation`] for each |
 //! | slot | the place of one Gaussian of one anchor: anchor x offsets + offset |
 //! | form | which kernels run where two exist: those for GPUs or those for CPU drivers ([`gpu::Form`]) |
 //! | tile | a square of pixels that one workgroup draws |
@@ -56,6 +57,7 @@ pub mod prepare;
 pub mod primitives;
 pub mod remove;
 pub mod render;
+pub mod representation;
 pub mod scene;
 pub mod segments;
 mod sentence;

@@ -83,7 +83,7 @@ pub struct Attention {
 impl Default for Config {
     fn default() -> Self {
         Self {
-            form: Form::Anchors,
+            form: Form::default(),
             from: String::new(),
             frozen: 0,
             degree: 1,
@@ -116,14 +116,14 @@ impl Config {
     /// Refuses values that no run could use.
     pub fn validate(&self) -> Result<(), Invalid> {
         ensure(self.degree <= 3, "degree", self.degree, "must be between 0 and 3")?;
+        let plain = self.form == Form::Gaussians;
         ensure(
-            self.form == Form::Anchors || !self.attention.enabled,
+            !plain || !self.attention.enabled,
             "attention.enabled",
             self.attention.enabled,
             "model.form is \"gaussians\", which have no features to attend to; set model.attention.enabled=false",
         )
         .map_err(|invalid| invalid.against("form"))?;
-        let plain = self.form == Form::Gaussians;
         let what = "begins with plain Gaussians; set model.form=gaussians";
         ensure(plain || self.from.is_empty(), "from", &self.from, what).map_err(|invalid| invalid.against("form"))?;
         let what = "keeps plain Gaussians; set model.form=gaussians";

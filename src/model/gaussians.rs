@@ -174,7 +174,7 @@ impl Static {
     pub fn with_room(gpu: &Gpu, cloud: &Cloud, capacity: u32, higher: f32) -> Result<Self, Error> {
         let count = cloud.len() as u32;
         let each = coefficients(cloud.degree);
-        let capacity = capacity.max(count).max(1);
+        let capacity = capacity.min(Self::most(gpu, cloud.degree)).max(count).max(1);
         let parameter = |group, names, width, data: &[f32]| {
             Ok::<_, Error>(Parameter::upload(gpu, names, width, capacity, data)?.in_group(group))
         };

@@ -34,12 +34,9 @@ impl Stored {
         }
     }
 
-    /// Gaussians of an anchor; 1 for plain ones.
-    pub fn offsets(&self) -> u32 {
-        match self {
-            Self::Anchors(anchors, _) => anchors.offsets_per_anchor as u32,
-            Self::Gaussians(_) => 1,
-        }
+    /// The networks, of a model that has them.
+    pub fn weights(&self) -> Option<&Weights> {
+        if let Self::Anchors(_, weights) = self { Some(weights) } else { None }
     }
 
     /// Counts the model's lengths in units of which `unit` make one of those they are counted in now, and leaves what it

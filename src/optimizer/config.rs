@@ -1,7 +1,6 @@
 use serde::{Deserialize, Serialize};
 
 use crate::config::{Invalid, ensure};
-use crate::model::config::Form;
 
 /// Adam's decay of the first and of the second moment.
 pub const BETAS: [f64; 2] = [0.9, 0.999];
@@ -96,12 +95,9 @@ impl Group {
         matches!(self, Self::Offset | Self::Position)
     }
 
-    /// The form of the model that has parameters of this group.
-    pub fn form(self) -> Form {
-        match self {
-            Self::Position | Self::LogScale | Self::Quaternion | Self::Opacity | Self::Harmonics => Form::Gaussians,
-            _ => Form::Anchors,
-        }
+    /// Whether its parameters are those of plain Gaussians.
+    pub fn is_plain(self) -> bool {
+        matches!(self, Self::Position | Self::LogScale | Self::Quaternion | Self::Opacity | Self::Harmonics)
     }
 }
 

@@ -4,12 +4,12 @@ use super::bin::{Bin, Binned};
 use super::decode::Decode;
 use super::method::Method;
 use super::project::{Gaussians, Project, Projected};
-pub use super::representation::{Capacity, Front, Representation, most_anchors};
 use super::slots::Slots;
 use super::visible::Visible;
 use super::widen;
 use crate::gpu::{Error, Gpu, Recorder};
 use crate::primitives::limit::Limits;
+pub use crate::representation::{Capacity, Front, Representation};
 use crate::scene::Camera;
 use crate::stage;
 

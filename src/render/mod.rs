@@ -1,17 +1,14 @@
 //! Cull, decode, project, bin, rasterize: forward and backward of a stage in one room.
 
 pub mod activate;
-mod anchors;
 pub mod bin;
 pub mod config;
 pub mod cull;
 pub mod decode;
 pub mod forward;
-mod gaussians;
 pub mod method;
 pub mod project;
 pub mod rasterize;
-pub mod representation;
 pub mod session;
 pub mod slots;
 pub mod tiling;

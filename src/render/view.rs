@@ -5,9 +5,8 @@ use super::forward::{Capacity, Representation};
 use super::rasterize::{self, Outputs, Picture};
 use super::session::{Room, Session, Stages};
 use crate::gpu::{Error, Gpu};
-use crate::model::anchors::Decoded;
-use crate::model::gaussians::Static;
 use crate::model::stored::Stored;
+use crate::representation;
 use crate::scene::Camera;
 
 /// A finished picture on the host.
@@ -128,10 +127,7 @@ impl Finished {
     /// # Errors
     /// When the device has no room for it.
     pub fn upload(gpu: &Gpu, model: &Stored) -> Result<Self, Error> {
-        Ok(Self(match model {
-            Stored::Anchors(anchors, weights) => Box::new(Decoded::upload(gpu, anchors, &weights.decoders(), 0)?),
-            Stored::Gaussians(cloud) => Box::new(Static::upload(gpu, cloud)?),
-        }))
+        Ok(Self(representation::upload(gpu, model, 0, 1.0)?))
     }
 
     /// The model as the forward stages read it.

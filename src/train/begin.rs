@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use super::plan::rounds;
 use crate::config::Settings;
 use crate::model::config::Form;
 use crate::model::gaussians::Cloud;
@@ -17,6 +18,8 @@ pub struct Beginning {
     pub model: Stored,
     /// Side of the anchors' grid, scene units.
     pub voxel: f64,
+    /// Rows to have room for, where there are more than those of the model.
+    pub rows: u32,
 }
 
 impl Beginning {
@@ -26,14 +29,14 @@ impl Beginning {
     /// Points that make no model; a file of Gaussians that cannot be begun with.
     pub fn of(scene: &Scene, settings: &Settings) -> Result<Self, init::Error> {
         let Settings { model, train, .. } = &settings.fitted(scene);
-        Ok(match model.form {
-            Form::Anchors => {
-                let Initial { anchors, voxel } = init::from_points(&scene.starts(), model, train.seed)?;
-                let weights = init::weights(train.seed, anchors.offsets_per_anchor, true, model.opacity);
-                Self { model: Stored::Anchors(anchors, weights), voxel }
-            }
-            Form::Gaussians => Self { model: Stored::Gaussians(gaussians(scene, settings)?), voxel: 0.0 },
-        })
+        if model.form == Form::Gaussians {
+            // Room is made once, for all that may come.
+            let rows = if rounds(settings).is_some() { settings.densify.max_gaussians } else { 0 };
+            return Ok(Self { model: Stored::Gaussians(gaussians(scene, settings)?), voxel: 0.0, rows });
+        }
+        let Initial { anchors, voxel } = init::from_points(&scene.starts(), model, train.seed)?;
+        let weights = init::weights(train.seed, anchors.offsets_per_anchor, true, model.opacity);
+        Ok(Self { model: Stored::Anchors(anchors, weights), voxel, rows: 0 })
     }
 
     /// Anchors or plain Gaussians.

@@ -21,6 +21,7 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 
 use super::attend::Attend;
+use super::begin::Beginning;
 use super::plan::Plan;
 use super::run::Progress;
 use super::step::Step;
@@ -191,7 +192,8 @@ impl Model {
     /// When the device has no room.
     pub fn restore(&self, gpu: &Gpu, plan: Plan, settings: &Settings) -> Result<Step, gpu::Error> {
         let model = if self.offsets == PLAIN { Stored::Gaussians(self.cloud()) } else { self.anchors() };
-        let mut step = Step::new(gpu, plan, settings, (&model, self.voxel), self.capacity.anchors)?;
+        let from = Beginning { model, voxel: self.voxel, rows: self.capacity.anchors };
+        let mut step = Step::new(gpu, plan, settings, &from)?;
         step.resize(self.capacity)?;
         if self.arrays.contains_key(PROJECTIONS.value) {
             let (config, seed) = (&settings.model.attention, settings.train.seed);

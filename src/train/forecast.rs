@@ -24,8 +24,9 @@ use crate::model::init;
 use crate::model::stored::Stored;
 use crate::primitives::limit::{Counter, Limits};
 use crate::render::Method;
-use crate::render::forward::{self, Capacity, Forward};
+use crate::render::forward::{Capacity, Forward};
 use crate::render::view::Finished;
+use crate::representation;
 use crate::scene::{Camera, Hole, Notes, Prior, Reference, Scene, View};
 use crate::stage;
 
@@ -121,19 +122,16 @@ pub fn expected_anchors(gpu: &Gpu, plan: &Plan, settings: &Settings, initial: &B
     let count = initial.count();
     let Some(rounds) = plan.rounds else { return count };
     let config = &settings.densify;
-    let anchors = match &initial.model {
-        Stored::Anchors(anchors, _) => anchors,
-        Stored::Gaussians(cloud) => {
-            let rounds = (rounds.last - rounds.first) / config.every + 1;
-            let grown = f64::from(count) * (1.0 + crate::densify::split::GROWTH).powi(rounds.min(10_000) as i32);
-            let most = config.max_gaussians.min(Static::most(gpu, cloud.degree));
-            return grown.min(most.max(count).into()) as u32;
-        }
+    let number = (rounds.last - rounds.first) / config.every + 1;
+    let Stored::Anchors(anchors, _) = &initial.model else {
+        let grown = f64::from(count) * (1.0 + crate::densify::split::GROWTH).powi(number.min(10_000) as i32);
+        let most = config.max_gaussians.min(Static::most(gpu, settings.model.degree));
+        return grown.min(most.max(count).into()) as u32;
     };
     let side = initial.voxel * config.coarsest_cell;
     let cells: BTreeSet<[i64; 3]> =
         anchors.position.iter().map(|p| p.map(|x| (f64::from(x) / side).round_ties_even() as i64)).collect();
-    let rounds = f64::from((rounds.last - rounds.first) / config.every + 1);
+    let rounds = f64::from(number);
     let per_cell = 16f64.powi(LEVELS as i32 - 1) / 30.0;
     let grown = cells.len() as f64 * per_cell * rounds / (rounds + 8.0);
     (f64::from(count) + grown).min(f64::from(most_anchors(gpu, settings, count))) as u32
@@ -141,7 +139,7 @@ pub fn expected_anchors(gpu: &Gpu, plan: &Plan, settings: &Settings, initial: &B
 
 /// The most anchors that growing makes.
 fn most_anchors(gpu: &Gpu, settings: &Settings, count: u32) -> u32 {
-    let most = forward::most_anchors(gpu, settings.model.offsets);
+    let most = representation::most_anchors(gpu, settings.model.offsets);
     let most = if settings.densify.max_anchors == 0 { most } else { most.min(settings.densify.max_anchors) };
     most.max(count)
 }
@@ -221,7 +219,7 @@ pub fn rehearse(
     let plan = Plan::new(scene, settings);
     let coarse = settings.train.coarse;
     let mut photographs = photographs::upload(&gpu, scene, &plan, coarse.reduction(1))?;
-    let mut step = Step::new(&gpu, plan.clone(), settings, (&initial.model, initial.voxel), 0)?;
+    let mut step = Step::new(&gpu, plan.clone(), settings, initial)?;
     let capacity = survey.capacity();
     step.resize(capacity)?;
     let start = gpu.memory().0;
@@ -241,7 +239,7 @@ pub fn rehearse(
     at.extend(counted.map(|c| c.first).into_iter().chain(attention).chain(after).chain(evaluations));
     let every = settings.densify.every as usize;
     let mut rounds: Vec<u32> = plan.rounds.map_or(vec![], |r| (r.first..=r.last).step_by(every).collect());
-    if step.learnt.anchors().is_none() {
+    if counted.is_none() {
         // All rounds are alike, and the room of the last is there from the first step on.
         rounds.drain(..rounds.len().saturating_sub(1));
     }
@@ -275,7 +273,7 @@ pub fn rehearse(
         if Some(number) == attention {
             note("attention begins", number, step.learnt.count());
         }
-        if step.learnt.anchors().is_none() {
+        if counted.is_none() {
             if rounds.last() == Some(&number) && number <= iterations {
                 step.learnt.swell(anchors);
                 step.resize(step.capacity())?;
@@ -492,6 +490,20 @@ pub struct Fitting {
 
 /// By how much the initial grid is made coarser, one after the other, until the first anchors fit.
 const COARSER: [f64; 10] = [1.0, 1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0];
+
+/// The setting of the initial grid, and its value and the settings where the grid is coarser.
+fn coarser(settings: &Settings, factor: f64) -> (&'static str, f64, Settings) {
+    let mut settings = settings.clone();
+    let model = &mut settings.model;
+    let (key, grid) = if model.voxel > 0.0 {
+        ("model.voxel", &mut model.voxel)
+    } else {
+        ("model.voxel_factor", &mut model.voxel_factor)
+    };
+    *grid *= factor;
+    (key, *grid, settings)
+}
+
 /// Shares of the expected growth that are tried, the most first.
 const GROWTH_SHARES: [f64; 6] = [1.0, 0.75, 0.5, 0.25, 0.1, 0.0];
 
@@ -502,16 +514,19 @@ const GROWTH_SHARES: [f64; 6] = [1.0, 0.75, 0.5, 0.25, 0.1, 0.0];
 /// As [`forecast`].
 pub fn fitting(gpu: &Gpu, scene: &Scene, asked: &Settings, available: Option<u64>) -> Result<Fitting, Error> {
     let available = available.unwrap_or_else(|| gpu.available_bytes());
-    if asked.model.form == Form::Gaussians {
-        return fitting_gaussians(gpu, scene, asked, available);
+    let fewer = if asked.model.form == Form::Gaussians { fewer_gaussians } else { fewer_anchors };
+    if let Some(fitting) = fewer(gpu, scene, asked, available)? {
+        return Ok(fitting);
     }
-    let most = forward::most_anchors(gpu, asked.model.offsets);
-    for coarser in COARSER {
-        let mut settings = asked.clone();
-        let model = &mut settings.model;
-        let grid = if model.voxel > 0.0 { &mut model.voxel } else { &mut model.voxel_factor };
-        *grid *= coarser;
-        let grid = *grid;
+    let verdict = forecast(gpu, scene, asked, Question { available: Some(available), ..Question::default() })?;
+    Ok(Fitting { settings: asked.clone(), verdict, reduced: None })
+}
+
+/// The settings of anchors under which they fit, if any do: less growth first, then a coarser grid.
+fn fewer_anchors(gpu: &Gpu, scene: &Scene, asked: &Settings, available: u64) -> Result<Option<Fitting>, Error> {
+    let most = representation::most_anchors(gpu, asked.model.offsets);
+    for factor in COARSER {
+        let (key, grid, mut settings) = coarser(asked, factor);
         let fitted = settings.fitted(scene);
         let initial = Beginning::of(scene, &fitted)?;
         let count = initial.count();
@@ -528,32 +543,30 @@ pub fn fitting(gpu: &Gpu, scene: &Scene, asked: &Settings, available: Option<u64
             let forecast = start.rehearse(gpu, scene, &settings.fitted(scene), anchors, None)?;
             let verdict = Verdict { available, forecast, remedies: vec![] };
             if verdict.fits() {
-                let what = if coarser > 1.0 {
-                    let key = if asked.model.voxel > 0.0 { "model.voxel" } else { "model.voxel_factor" };
-                    Some(format!("the first anchors stand on a grid {coarser} times coarser ({key}={grid})"))
+                let what = if factor > 1.0 {
+                    Some(format!("the first anchors stand on a grid {factor} times coarser ({key}={grid})"))
                 } else {
                     (share < 1.0).then(|| "growing stops earlier".to_owned())
                 };
                 let reduced = what.map(|what| {
                     format!("{what}, at {anchors} anchors at most (densify.max_anchors), which is what the device has room for")
                 });
-                return Ok(Fitting { settings, verdict, reduced });
+                return Ok(Some(Fitting { settings, verdict, reduced }));
             }
             if expected <= count {
                 break;
             }
         }
     }
-    let verdict = forecast(gpu, scene, asked, Question { available: Some(available), ..Question::default() })?;
-    Ok(Fitting { settings: asked.clone(), verdict, reduced: None })
+    Ok(None)
 }
 
-/// As [`fitting`]: fewer Gaussians until they fit.
-fn fitting_gaussians(gpu: &Gpu, scene: &Scene, asked: &Settings, available: u64) -> Result<Fitting, Error> {
+/// The settings of plain Gaussians under which they fit, if any do: fewer of them.
+fn fewer_gaussians(gpu: &Gpu, scene: &Scene, asked: &Settings, available: u64) -> Result<Option<Fitting>, Error> {
     let most = asked.densify.max_gaussians.min(Static::most(gpu, asked.model.degree));
     for share in GAUSSIANS {
         let mut settings = asked.clone();
-        settings.densify.max_gaussians = if share < 1.0 { (f64::from(most) * share).ceil() as u32 } else { most };
+        settings.densify.max_gaussians = (f64::from(most) * share).ceil() as u32;
         let verdict = forecast(gpu, scene, &settings, Question { available: Some(available), ..Question::default() })?;
         if verdict.fits() {
             let fewer = settings.densify.max_gaussians;
@@ -562,11 +575,10 @@ fn fitting_gaussians(gpu: &Gpu, scene: &Scene, asked: &Settings, available: u64)
                     "there are {fewer} Gaussians at most (densify.max_gaussians), which is what the device has room for"
                 )
             });
-            return Ok(Fitting { settings, verdict, reduced });
+            return Ok(Some(Fitting { settings, verdict, reduced }));
         }
     }
-    let verdict = forecast(gpu, scene, asked, Question { available: Some(available), ..Question::default() })?;
-    Ok(Fitting { settings: asked.clone(), verdict, reduced: None })
+    Ok(None)
 }
 
 /// Shares of the Gaussians asked for that are tried, the most first.
@@ -581,8 +593,8 @@ fn surveyed<'c>(
 ) -> Result<Survey, Error> {
     match survey(gpu, initial, settings, cameras) {
         Err(gpu::Error::TooLarge { .. } | gpu::Error::OutOfMemory { .. } | gpu::Error::Missing { .. }) => {
-            let anchors = initial.count();
-            Ok(Survey { anchors, visible: anchors, pairs: anchors.saturating_mul(initial.model.offsets()) })
+            let (anchors, each) = (initial.count(), initial.model.weights().map_or(1, |_| settings.model.offsets));
+            Ok(Survey { anchors, visible: anchors, pairs: anchors.saturating_mul(each) })
         }
         other => Ok(other?),
     }
@@ -614,71 +626,58 @@ fn remedies(
             Err(error) => Err(error),
         }
     };
-    let mut found = vec![];
+    let with = |change: String, make: &dyn Fn(&mut Settings)| {
+        let mut changed = settings.clone();
+        make(&mut changed);
+        (change, changed)
+    };
     let scale = settings.scene.downscale;
-    for to in [scale + 1, scale * 2, scale * 3, scale * 4, scale * 8] {
-        let mut changed = settings.clone();
-        changed.scene.downscale = to;
-        if let Some(needs) = needs(&resized(scene, scale, to), &changed)? {
-            found.push(Remedy { change: format!("--downscale {to}"), needs });
-            break;
-        }
-    }
+    let smaller = |to| with(format!("--downscale {to}"), &|changed| changed.scene.downscale = to);
+    let mut ways = vec![[scale + 1, scale * 2, scale * 3, scale * 4, scale * 8].map(smaller).to_vec()];
     if settings.model.form == Form::Gaussians {
-        for share in GAUSSIANS.into_iter().skip(1) {
-            let mut changed = settings.clone();
-            changed.densify.max_gaussians = (f64::from(settings.densify.max_gaussians) * share).ceil() as u32;
-            if let Some(needs) = needs(scene, &changed)? {
-                let change = format!("--set densify.max_gaussians={}", changed.densify.max_gaussians);
-                found.push(Remedy { change, needs });
-                break;
-            }
-        }
-        return Ok(found);
-    }
-    for factor in [1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0] {
-        let mut changed = settings.clone();
-        let change = if settings.model.voxel > 0.0 {
-            changed.model.voxel *= factor;
-            format!("--set model.voxel={}", changed.model.voxel)
-        } else {
-            changed.model.voxel_factor *= factor;
-            format!("--set model.voxel_factor={}", changed.model.voxel_factor)
+        let fewer = |share: f64| {
+            let most = (f64::from(settings.densify.max_gaussians) * share).ceil() as u32;
+            with(format!("--set densify.max_gaussians={most}"), &|changed| changed.densify.max_gaussians = most)
         };
-        if let Some(needs) = needs(scene, &changed)? {
-            found.push(Remedy { change, needs });
-            break;
-        }
+        ways.push(GAUSSIANS.into_iter().skip(1).map(fewer).collect());
+    } else {
+        let coarser = |factor| {
+            let (key, grid, changed) = coarser(settings, factor);
+            (format!("--set {key}={grid}"), changed)
+        };
+        ways.push(COARSER[1..8].iter().copied().map(coarser).collect());
     }
-    let first = Beginning::of(scene, settings)?;
     let plan = Plan::new(scene, settings);
-    let count = first.count();
-    if plan.growth && question.anchors.is_none() {
-        let expected = expected_anchors(gpu, &plan, settings, &first);
+    if plan.growth && !plan.plain && question.anchors.is_none() {
+        let first = Beginning::of(scene, settings)?;
+        let count = first.count();
+        let growth = u64::from(expected_anchors(gpu, &plan, settings, &first) - count);
+        let fewer = |eighths| {
+            let most = count + (growth * eighths / 8) as u32;
+            with(format!("--set densify.max_anchors={most}"), &|changed| changed.densify.max_anchors = most)
+        };
         // In eighths of the growth, the most first.
-        for eighths in (0..8).rev() {
-            let mut changed = settings.clone();
-            changed.densify.max_anchors = count + (u64::from(expected - count) * eighths / 8) as u32;
-            if let Some(needs) = needs(scene, &changed)? {
-                found.push(Remedy {
-                    change: format!("--set densify.max_anchors={}", changed.densify.max_anchors),
-                    needs,
-                });
-                break;
-            }
-        }
+        ways.push((0..8).rev().map(fewer).collect());
     }
     if plan.attention {
         let attention = &settings.model.attention;
-        let mut tokens = attention.tokens / 2;
-        while tokens > attention.min_tokens {
-            let mut changed = settings.clone();
-            changed.model.attention.tokens = tokens;
-            if let Some(needs) = needs(scene, &changed)? {
-                found.push(Remedy { change: format!("--set model.attention.tokens={tokens}"), needs });
+        let halves = std::iter::successors(Some(attention.tokens / 2), |tokens| Some(tokens / 2));
+        let fewer = |tokens| {
+            with(format!("--set model.attention.tokens={tokens}"), &|changed| {
+                changed.model.attention.tokens = tokens;
+            })
+        };
+        ways.push(halves.take_while(|tokens| *tokens > attention.min_tokens).map(fewer).collect());
+    }
+    let mut found = vec![];
+    for way in ways {
+        for (change, changed) in way {
+            let to = changed.scene.downscale;
+            let needs = if to == scale { needs(scene, &changed) } else { needs(&resized(scene, scale, to), &changed) };
+            if let Some(needs) = needs? {
+                found.push(Remedy { change, needs });
                 break;
             }
-            tokens /= 2;
         }
     }
     Ok(found)

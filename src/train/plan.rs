@@ -86,9 +86,9 @@ pub struct Plan {
     pub other_depth: DepthLosses,
     /// Cross-attention, from `model.attention.start` on.
     pub attention: bool,
-    /// Anchors, or plain Gaussians.
+    /// The model is of plain Gaussians.
     #[serde(skip)]
-    pub form: Form,
+    pub plain: bool,
     /// Growing and pruning of anchors, or moving and adding of plain Gaussians.
     pub growth: bool,
     /// Likewise, with the steps behind which the first and the last round come.
@@ -120,7 +120,7 @@ fn depth_losses(config: &losses::config::Depth, reference: bool) -> DepthLosses 
 }
 
 /// The rounds of growing and pruning that come to pass; none behind the last step, whose anchors nobody would train.
-fn rounds(settings: &Settings) -> Option<Steps> {
+pub(super) fn rounds(settings: &Settings) -> Option<Steps> {
     let config = &settings.densify;
     // No multiple fits behind the largest steps.
     let first = config.from.max(1).checked_next_multiple_of(config.every)?;
@@ -188,8 +188,7 @@ impl Plan {
             };
             leave("cross-attention", &why);
         }
-        let form = settings.model.form;
-        let plain = form == Form::Gaussians;
+        let plain = settings.model.form == Form::Gaussians;
         let rounds = rounds(settings);
         if rounds.is_none() {
             let why = if settings.densify.enabled {
@@ -216,7 +215,9 @@ impl Plan {
         }
         let rates = &settings.optimizer.learning_rate;
         let trained = |group: &Group| match group {
-            group if group.form() != form => false,
+            group if group.is_plain() != plain => false,
+            // The way back to plain Gaussians writes all of their gradients.
+            _ if plain => true,
             // Gradients pass through the features to the attention's projections.
             Group::Feature if attention => true,
             Group::Attention => attention,
@@ -247,7 +248,7 @@ impl Plan {
             align_to_points: settings.scene.check_priors,
             other_depth,
             attention,
-            form,
+            plain,
             growth: rounds.is_some(),
             rounds,
             counted,
@@ -300,7 +301,7 @@ impl Plan {
         match name {
             stage::ATTENTION => self.attention.then_some(Steps { first: settings.model.attention.start.max(1), ..all }),
             stage::SENTINEL => self.sentinel.then_some(all),
-            stage::CULL => (self.form == Form::Anchors).then_some(all),
+            stage::CULL => (!self.plain).then_some(all),
             stage::STATISTICS => self.counted,
             stage::GROWTH => self.rounds,
             stage::EVALUATION => {

@@ -8,6 +8,7 @@ use gscream_vk::model::files;
 use gscream_vk::model::stored::Stored;
 use gscream_vk::primitives::limit::Counter;
 use gscream_vk::scene::{Camera, PriorKind};
+use gscream_vk::train::begin::Beginning;
 use gscream_vk::train::photographs::{Photograph, PriorMap};
 use gscream_vk::train::plan::{DepthLosses, Plan, Steps};
 use gscream_vk::train::step::{Rates, Step};
@@ -37,8 +38,8 @@ fn anchors(case: &Case) -> files::Anchors {
     )
 }
 
-fn model(case: &Case, attention: bool) -> Stored {
-    Stored::Anchors(anchors(case), weights(case, attention))
+fn model(case: &Case, attention: bool, voxel: f64) -> Beginning {
+    Beginning { model: Stored::Anchors(anchors(case), weights(case, attention)), voxel, rows: 0 }
 }
 
 fn weights(case: &Case, attention: bool) -> files::Weights {
@@ -131,7 +132,7 @@ fn whole(gpu: &Gpu, case: &Case) {
         ..Plan::default()
     };
     let voxel = case.f64("voxel")[0];
-    let mut step = Step::new(gpu, plan, &settings, (&model(case, true), voxel), 0).unwrap();
+    let mut step = Step::new(gpu, plan, &settings, &model(case, true, voxel)).unwrap();
     let mut losses = vec![];
     for number in 1..=case.shape("losses")[0] {
         let photograph = &photographs[(number - 1) % 2];
@@ -187,7 +188,7 @@ fn step_in_one_form(gpu: &Gpu) {
         };
         let size = cameras[0].size;
         assert_eq!(size, cameras[1].size);
-        let step = Step::new(gpu, plan, &settings, (&model(case, false), 0.1), 0).unwrap();
+        let step = Step::new(gpu, plan, &settings, &model(case, false, 0.1)).unwrap();
         let priors = [0, 1].map(|v| gpu.upload("prior", &case.f32(&format!("view{v}.prior"))).unwrap());
         let count = case.shape("losses")[0];
         let mut losses = vec![];

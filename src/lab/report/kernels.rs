@@ -22,6 +22,7 @@ use crate::lab::variants::Variant;
 use crate::model::init;
 use crate::model::stored::Stored;
 use crate::scene::{Reference, Scene};
+use crate::train::begin::Beginning;
 use crate::train::photographs::{self, Photograph};
 use crate::train::plan::Plan;
 use crate::train::run::Run;
@@ -233,7 +234,7 @@ pub fn measure(
         step,
         views: subset.train.iter().map(|view| view.name.clone()).collect(),
         repetitions: options.repetitions,
-        anchors: warm.model.positions().len() as u32,
+        anchors: warm.from.count(),
         variants: figures,
         omitted,
     })
@@ -308,7 +309,7 @@ pub(crate) fn choose_views(scene: &Scene, views: usize) -> Scene {
 
 /// The model that all choices start from.
 pub(crate) struct Warm {
-    pub(crate) model: Stored,
+    pub(crate) from: Beginning,
     /// Value and moments of what is learnt, without the attention, which may not have begun.
     pub(crate) tensors: Vec<[Vec<f32>; 3]>,
     /// Values by their buffers' names.
@@ -336,6 +337,8 @@ impl Warm {
                 init::weights(settings.train.seed, settings.model.offsets as usize, true, settings.model.opacity);
             fresh.tensors.into_iter().for_each(|(name, tensor)| _ = weights.tensors.entry(name).or_insert(tensor));
         }
+        // The grid's side matters to growing alone, which is not measured.
+        let from = Beginning { model: Stored::Anchors(anchors, weights), voxel: 1.0, rows: 0 };
         let mut tensors = vec![];
         let mut values = BTreeMap::new();
         for parameter in step.learnt.rows().into_iter().chain(step.learnt.weights()) {
@@ -344,7 +347,7 @@ impl Warm {
             values.insert(parameter.value.name(), value.clone());
             tensors.push([value, first?, root?]);
         }
-        Ok(Self { model: Stored::Anchors(anchors, weights), tensors, values, capacity: step.capacity() })
+        Ok(Self { from, tensors, values, capacity: step.capacity() })
     }
 }
 
@@ -369,9 +372,7 @@ impl Bench {
         number: u32,
     ) -> Result<Self, Error> {
         let settings = &variant.settings;
-        // The grid's side matters to growing alone, which is not measured.
-        let voxel = if settings.model.voxel > 0.0 { settings.model.voxel } else { 1.0 };
-        let mut step = Step::new(gpu, plan, settings, (&warm.model, voxel), 0)?;
+        let mut step = Step::new(gpu, plan, settings, &warm.from)?;
         step.resize(warm.capacity)?;
         step.prepare(number)?;
         let mut initial = vec![];

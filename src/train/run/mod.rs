@@ -148,8 +148,7 @@ const DEPTH: usize = 2;
 fn fresh(gpu: &Gpu, scene: &Scene, settings: &Settings) -> Result<Step, Error> {
     let settings = &settings.fitted(scene);
     let plan = Plan::new(scene, settings);
-    let Beginning { model, voxel } = Beginning::of(scene, settings)?;
-    Ok(Step::new(gpu, plan, settings, (&model, voxel), 0)?)
+    Ok(Step::new(gpu, plan, settings, &Beginning::of(scene, settings)?)?)
 }
 
 /// The settings for the step behind `done`.

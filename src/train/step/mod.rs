@@ -7,29 +7,29 @@ mod read;
 mod update;
 mod weights;
 
-pub use growth::Growing;
 pub use rates::Rates;
 
 use crate::config::Settings;
 use crate::densify::{Drawn, Statistics};
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::losses::{self, DepthView, Losses, View};
-use crate::model::anchors::{Anchors, Decoded};
-use crate::model::gaussians::Static;
+use crate::model::anchors::Anchors;
+use crate::model::files::Weights;
 use crate::model::parameter::{DECODERS, Parameter};
-use crate::model::stored::Stored;
 use crate::optimizer::{BETAS, Group, adam};
 use crate::primitives::limit::Limits;
 use crate::render::config::BACKGROUND;
 use crate::render::decode::{DecodeBackward, GaussianGradients};
-use crate::render::forward::{Capacity, Forward, Representation};
+use crate::render::forward::{Capacity, Forward};
 use crate::render::project::{ProjectBackward, SplatGradients};
 use crate::render::rasterize::{self, Backward, Picture, PictureGradient};
 use crate::render::{Config, Method};
+use crate::representation::{self, Representation};
 use crate::scene::Camera;
 use crate::stage;
 
 use super::attend::Attend;
+use super::begin::Beginning;
 use super::photographs::Photograph;
 use super::plan::Plan;
 
@@ -90,7 +90,7 @@ pub struct Step {
     /// The plan the stages were made for.
     pub plan: Plan,
     /// The learnt arrays, but for the attention's.
-    pub learnt: Box<dyn Growing>,
+    pub learnt: Box<dyn Representation>,
     /// Overflow flag and counters.
     pub limits: Limits,
     capacity: Capacity,
@@ -108,47 +108,25 @@ pub struct Step {
 }
 
 impl Step {
-    /// Uploads a model, with room for so many anchors, or for as many plain Gaussians as the settings allow where the plan has
-    /// growth, and makes the stages that the plan has. `voxel` is the side of the anchors' grid, scene units.
+    /// Uploads what a run begins with, and makes the stages that the plan has.
     ///
     /// # Errors
     /// When the device has no room.
-    pub fn new(
-        gpu: &Gpu,
-        plan: Plan,
-        settings: &Settings,
-        (model, voxel): (&Stored, f64),
-        anchors: u32,
-    ) -> Result<Self, Error> {
-        let upload = || -> Result<(Box<dyn Growing>, _), Error> {
-            Ok(match model {
-                Stored::Anchors(of, weights) => {
-                    let attention = plan.attention.then(|| weights.attention());
-                    (Box::new(Decoded::upload(gpu, of, &weights.decoders(), anchors)?), attention)
-                }
-                Stored::Gaussians(cloud) => {
-                    let most = settings.densify.max_gaussians.min(Static::most(gpu, cloud.degree));
-                    let higher = settings.optimizer.higher_harmonics as f32;
-                    (Box::new(Static::with_room(gpu, cloud, if plan.growth { most } else { 0 }, higher)?), None)
-                }
-            })
-        };
-        let (learnt, attention_weights) = gpu.stage(stage::MODEL, upload)?;
-        let mut capacity = Capacity::guess(learnt.capacity());
-        if learnt.anchors().is_none() {
-            capacity.visible = capacity.anchors;
-        }
+    pub fn new(gpu: &Gpu, plan: Plan, settings: &Settings, from: &Beginning) -> Result<Self, Error> {
+        let Beginning { model, voxel, rows } = from;
+        let higher = settings.optimizer.higher_harmonics as f32;
+        let learnt = gpu.stage(stage::MODEL, || representation::upload(gpu, model, *rows, higher))?;
         let mut step = Self {
             limits: Limits::new(gpu)?,
             gpu: gpu.clone(),
+            capacity: Capacity::guess(learnt.capacity()),
             learnt,
-            capacity,
             stages: None,
             canvases: Canvas::all(gpu, &plan, settings)?,
             statistics: None,
-            voxel,
+            voxel: *voxel,
             attend: None,
-            attention_weights,
+            attention_weights: model.weights().filter(|_| plan.attention).map(Weights::attention),
             adam: adam::Config { beta1: BETAS[0], beta2: BETAS[1], epsilon: settings.optimizer.epsilon },
             near: settings.render.near as f32,
             config: settings.clone(),
@@ -185,11 +163,9 @@ impl Step {
         self.capacity.anchors = self.learnt.capacity();
         self.stages = Some(Stages::new(&self.gpu, &self.plan, self.capacity, &*self.learnt, &self.config.render)?);
         let Self { gpu, plan, learnt, .. } = self;
-        // The way back to plain Gaussians writes all of their gradients.
-        let whole = learnt.anchors().is_none();
         let rows = learnt.capacity();
         for parameter in learnt.parameters_mut() {
-            if whole || plan.trained.any(parameter.groups()) {
+            if plan.trained.any(parameter.groups()) {
                 gpu.stage(stage::DECODE_BACKWARD, || parameter.make_gradient(gpu))?;
             }
         }

@@ -1,16 +1,25 @@
-//! A representation of the model on the device: what is learnt of it, and how it becomes the Gaussians of a view, both ways.
+//! Representations of the model on the device: what is learnt, how it becomes the Gaussians of a view, both ways, and how it
+//! grows. Each has a file here; behind [`upload`] nothing asks which one it is.
 
-use super::activate::Activate;
-use super::decode::{self, Decode, DecodeBackward, GaussianGradients};
-use super::project::Gaussians;
-use super::slots::Slots;
-use super::visible::Visible;
+mod anchors;
+mod gaussians;
+
+pub use anchors::most as most_anchors;
+
+use crate::config::Settings;
+use crate::densify::Statistics;
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
-use crate::model::anchors::Anchors;
+use crate::model::anchors::{Anchors, Decoded};
+use crate::model::gaussians::Static;
 use crate::model::parameter::Parameter;
 use crate::model::stored::Stored;
 use crate::primitives::Count;
 use crate::primitives::limit::{COUNTERS, Counter, Limits};
+use crate::render::activate::Activate;
+use crate::render::decode::{Decode, DecodeBackward, GaussianGradients};
+use crate::render::project::Gaussians;
+use crate::render::slots::Slots;
+use crate::render::visible::Visible;
 use crate::scene::Camera;
 
 /// What the stages, the optimiser and the files ask of a model, whatever it is made of.
@@ -89,6 +98,36 @@ pub trait Representation: Send + Sync {
         drawn: &Slots,
         gradients: GaussianGradients<'_>,
     );
+
+    /// A round of growth behind this step, by what the steps since the last one have counted; says what changed. `voxel` is the
+    /// side of the anchors' grid.
+    ///
+    /// # Errors
+    /// When the device has no room.
+    fn grow(
+        &mut self,
+        gpu: &Gpu,
+        settings: &Settings,
+        counted: Option<&mut Statistics>,
+        voxel: f64,
+        step: u32,
+    ) -> Result<String, Error>;
+
+    /// Counts so many rows as in use, as far as the room for those of all rounds is there from the first step on: for
+    /// rehearsals.
+    fn swell(&mut self, _rows: u32) {}
+}
+
+/// A model on the device with room for at least so many rows, moments zero. Harmonics beyond the first are learnt at `higher`
+/// times the rate of the first.
+///
+/// # Errors
+/// When the device has no room for it.
+pub fn upload(gpu: &Gpu, model: &Stored, rows: u32, higher: f32) -> Result<Box<dyn Representation>, Error> {
+    Ok(match model {
+        Stored::Anchors(anchors, weights) => Box::new(Decoded::upload(gpu, anchors, &weights.decoders(), rows)?),
+        Stored::Gaussians(cloud) => Box::new(Static::with_room(gpu, cloud, rows, higher)?),
+    })
 }
 
 /// How much the forward stages have room for.
@@ -170,7 +209,7 @@ impl Front {
     }
 
     /// The Gaussians: how many slots, those that exist, as the projection reads them, opacity and colour.
-    pub(super) fn drawn(&self) -> (Count<'_>, &Slots, Gaussians<'_>, &Buffer<f32>, &Buffer<[f32; 3]>) {
+    pub(crate) fn drawn(&self) -> (Count<'_>, &Slots, Gaussians<'_>, &Buffer<f32>, &Buffer<[f32; 3]>) {
         match self {
             Self::Anchors { decode, .. } => {
                 let Decode { existing, position, scale, rotation, opacity, color, .. } = decode;
@@ -181,13 +220,6 @@ impl Front {
             }
         }
     }
-}
-
-/// As many anchors of `offsets` Gaussians as the device trains: each of their arrays fits one binding, and so does each
-/// array that a view needs which shows all of them.
-pub fn most_anchors(gpu: &Gpu, offsets: u32) -> u32 {
-    let in_view = gpu.info().max_binding_bytes.min(u32::MAX.into()) / decode::widest(offsets);
-    Anchors::most(gpu, offsets).min(in_view as u32)
 }
 
 /// As many (Gaussian, tile) pairs as the device trains: the widest array over them holds three floats each.

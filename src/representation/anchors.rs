@@ -1,17 +1,26 @@
 //! Anchors as a representation of the model: those in view are decoded into Gaussians.
 
-use super::decode::{self, Decode, DecodeBackward, GaussianGradients, WantedGradients};
-use super::representation::{Capacity, Front, Representation};
-use super::slots::Slots;
-use super::visible::Visible;
+use super::{Capacity, Front, Representation};
+use crate::config::Settings;
+use crate::densify::{self, Statistics};
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::model::anchors::{Anchors, Decoded};
 use crate::model::files::Weights;
 use crate::model::parameter::Parameter;
 use crate::model::stored::Stored;
 use crate::primitives::limit::Limits;
+use crate::render::decode::{self, Decode, DecodeBackward, GaussianGradients, WantedGradients};
+use crate::render::slots::Slots;
+use crate::render::visible::Visible;
 use crate::scene::Camera;
 use crate::stage;
+
+/// As many anchors of `offsets` Gaussians as the device trains: each of their arrays fits one binding, and so does each
+/// array that a view needs which shows all of them.
+pub fn most(gpu: &Gpu, offsets: u32) -> u32 {
+    let in_view = gpu.info().max_binding_bytes.min(u32::MAX.into()) / decode::widest(offsets);
+    Anchors::most(gpu, offsets).min(in_view as u32)
+}
 
 impl Decoded {
     /// As the decoder reads them.
@@ -124,5 +133,40 @@ impl Representation for Decoded {
         };
         let scratch = scratch.expect("made with the front");
         scratch.record(rec, decode, self.read_by(visible, feature, &offset), gradients, to);
+    }
+
+    fn grow(
+        &mut self,
+        gpu: &Gpu,
+        settings: &Settings,
+        counted: Option<&mut Statistics>,
+        voxel: f64,
+        step: u32,
+    ) -> Result<String, Error> {
+        let (Self { anchors, .. }, Some(statistics)) = (self, counted) else { return Ok(String::new()) };
+        let most = most(gpu, anchors.offsets);
+        let asked = settings.densify.max_anchors;
+        let max_anchors = if asked == 0 { most } else { asked.min(most) };
+        let config = &densify::Config { max_anchors, ..settings.densify.clone() };
+        let round = densify::Round { voxel: voxel as f32, seed: settings.train.seed, step };
+        let before = anchors.count;
+        let grown = densify::grow::run(gpu, anchors, statistics, config, round)?;
+        let pruned = densify::prune::run(gpu, anchors, statistics, config)?;
+        let mut text =
+            format!("step {step}: {} new anchors, {pruned} pruned: {before} -> {}", grown.added, anchors.count);
+        if grown.refused > 0 {
+            text.push_str(&format!(
+                "; {} more had no room (densify.max_anchors, or the device's memory)",
+                grown.refused
+            ));
+        }
+        if grown.beyond > 0 {
+            text.push_str(&format!(
+                "; {} Gaussians lie more than {:.0e} cells from the origin, where none grows: move the scene or raise model.voxel",
+                grown.beyond,
+                densify::grow::CELL_LIMIT
+            ));
+        }
+        Ok(text)
     }
 }

@@ -1,14 +1,16 @@
 //! Plain Gaussians as a representation of the model: each is a row, drawn in every view.
 
-use super::activate::{self, Activate};
-use super::decode::{DecodeBackward, GaussianGradients};
-use super::representation::{Capacity, Front, Representation};
-use super::slots::Slots;
+use super::{Capacity, Front, Representation};
+use crate::config::Settings;
+use crate::densify::{Statistics, split};
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::model::gaussians::Static;
 use crate::model::parameter::Parameter;
 use crate::model::stored::Stored;
 use crate::primitives::limit::{Counter, Limits};
+use crate::render::activate::{self, Activate};
+use crate::render::decode::{DecodeBackward, GaussianGradients};
+use crate::render::slots::Slots;
 use crate::scene::Camera;
 use crate::stage;
 
@@ -63,5 +65,23 @@ impl Representation for Static {
         gradients: GaussianGradients<'_>,
     ) {
         activate::backward(rec, self, front.of_gaussians().0, drawn, gradients);
+    }
+
+    fn grow(
+        &mut self,
+        gpu: &Gpu,
+        settings: &Settings,
+        _: Option<&mut Statistics>,
+        _voxel: f64,
+        step: u32,
+    ) -> Result<String, Error> {
+        let before = self.count;
+        let moved = split::run(gpu, self, &settings.densify, split::Round { seed: settings.train.seed, step })?;
+        let (now, new) = (self.count, self.count - before);
+        Ok(format!("step {step}: {moved} faded Gaussians are halves of others, {new} new: {before} -> {now}"))
+    }
+
+    fn swell(&mut self, rows: u32) {
+        self.count = rows.clamp(self.count, self.capacity);
     }
 }
