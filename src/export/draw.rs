@@ -1,43 +1,33 @@
 //! Static Gaussians drawn, compared and improved: the training step's own stages.
 
-use crate::gpu::{Buffer, Error, Gpu, Recorder};
+use crate::gpu::{Buffer, Error, Gpu};
 use crate::losses::{self, Losses, View, Weights};
 use crate::model::gaussians::Static;
 use crate::optimizer::adam::{self, Tensors};
-use crate::primitives::limit::{Counter, Limits};
-use crate::render::bin::Binned;
 use crate::render::decode::GaussianGradients;
-use crate::render::forward::{Capacity, Forward, Representation as _};
+use crate::render::forward::{Capacity, Representation as _};
 use crate::render::project::{ProjectBackward, SplatGradients};
 use crate::render::rasterize::{self, Backward, Outputs, Picture, PictureGradient};
-use crate::render::{Config, Method};
+use crate::render::session::{Room, Stages};
+use crate::render::{Config, Session};
 use crate::scene::Camera;
 
 /// Learning rates of a step, in the order of [`Static::parameters`].
 pub type Rates = [f64; 5];
 
-/// (Gaussian, tile) pairs there is room for at first; overflow corrects it.
-const PAIRS: u32 = 1 << 17;
-
-struct Stages {
-    forward: Forward,
-    rasterize: Backward,
-    project: ProjectBackward,
-}
-
-/// What depends on the pictures' size.
+/// What is drawn, compared and asked beside the forward stages.
 struct Canvas {
     picture: Picture,
     losses: Losses,
-    target: Buffer<u32>,
+    rasterize: Backward,
+    project: ProjectBackward,
     ones: Buffer<[f32; 3]>,
 }
 
 impl Canvas {
-    fn new(gpu: &Gpu, size: [u32; 2]) -> Result<Self, Error> {
-        let pixels = size[0] as usize * size[1] as usize;
+    fn new(gpu: &Gpu, room: Room) -> Result<Self, Error> {
         let plan = losses::Plan {
-            size,
+            size: room.size,
             ssim_weight: SSIM_WEIGHT,
             masks: false,
             ssim_across_masks: false,
@@ -45,10 +35,11 @@ impl Canvas {
             gradient_scales: 0,
         };
         Ok(Self {
-            picture: Picture::new(gpu, size, pixels, Outputs::Color)?,
+            picture: Picture::new(gpu, room.size, room.pixels(), Outputs::Color)?,
             losses: Losses::new(gpu, &plan)?,
-            target: gpu.buffer("picture", pixels)?,
-            ones: gpu.upload("ones", &vec![[1.0; 3]; pixels])?,
+            rasterize: Backward::new(gpu, room.method, room.slots, room.pairs, Outputs::Color)?,
+            project: ProjectBackward::new(gpu, room.slots)?,
+            ones: gpu.upload("ones", &vec![[1.0; 3]; room.pixels()])?,
         })
     }
 }
@@ -58,33 +49,21 @@ const SSIM_WEIGHT: f32 = 0.2;
 
 /// Draws static Gaussians.
 pub struct Drawer {
-    gpu: Gpu,
-    config: Config,
+    near: f32,
     background: [f32; 3],
-    limits: Limits,
-    pairs: u32,
+    session: Session<Canvas>,
     /// The Gaussians.
     pub gaussians: Static,
-    stages: Option<Stages>,
-    canvas: Option<Canvas>,
 }
 
 impl Drawer {
     /// Of these Gaussians. `background` is what shines through, linear rgb.
     ///
     /// # Errors
-    /// As [`Gpu::buffer`].
+    /// As [`Session::new`].
     pub fn new(gpu: &Gpu, gaussians: Static, config: &Config, background: [f32; 3]) -> Result<Self, Error> {
-        Ok(Self {
-            gpu: gpu.clone(),
-            config: config.clone(),
-            background,
-            limits: Limits::new(gpu)?,
-            pairs: PAIRS,
-            gaussians,
-            stages: None,
-            canvas: None,
-        })
+        let session = Session::new(gpu, config, Capacity::guess(gaussians.count), Canvas::new)?;
+        Ok(Self { near: config.near as f32, background, session, gaussians })
     }
 
     /// The picture \[pixel\] from a camera.
@@ -92,10 +71,11 @@ impl Drawer {
     /// # Errors
     /// When the device has no room for it, or is lost.
     pub fn draw(&mut self, camera: &Camera) -> Result<Vec<[f32; 3]>, Error> {
-        self.run(camera, |drawer, rec, stages, canvas| {
-            drawer.forward(rec, stages, canvas, camera);
+        let (gpu, background) = (self.session.gpu().clone(), self.background);
+        let stages = self.session.run(&self.gaussians, camera, |rec, Stages { room, forward, own }, binned| {
+            rasterize::forward(rec, room.method, forward.projected(), binned, background, &own.picture);
         })?;
-        self.gpu.read(&self.canvas.as_ref().expect("made by the run").picture.rgb)
+        gpu.read(&stages.own.picture.rgb)
     }
 
     /// The sum of alpha x transmittance of every Gaussian over the pixels of a view: the colour's own gradient where the
@@ -104,15 +84,13 @@ impl Drawer {
     /// # Errors
     /// As [`Drawer::draw`].
     pub fn contributions(&mut self, camera: &Camera) -> Result<Vec<f32>, Error> {
-        self.run(camera, |drawer, rec, stages, canvas| {
-            let binned = drawer.forward(rec, stages, canvas, camera);
-            let gradient = PictureGradient { rgb: &canvas.ones, depth: None, transmittance: None };
-            let Stages { forward, rasterize, .. } = stages;
-            rasterize.record(rec, forward.method(), forward.projected(), binned, &canvas.picture, gradient);
+        let (gpu, background) = (self.session.gpu().clone(), self.background);
+        let drawn = self.session.run(&self.gaussians, camera, |rec, Stages { room, forward, own }, binned| {
+            rasterize::forward(rec, room.method, forward.projected(), binned, background, &own.picture);
+            let gradient = PictureGradient { rgb: &own.ones, depth: None, transmittance: None };
+            own.rasterize.record(rec, room.method, forward.projected(), binned, &own.picture, gradient);
         })?;
-        let stages = self.stages.as_ref().expect("made by the run");
-        let tiles = self.gpu.read(stages.forward.bin.tiles())?;
-        let shares = self.gpu.read(&stages.rasterize.grad_color)?;
+        let (tiles, shares) = (gpu.read(drawn.forward.bin.tiles())?, gpu.read(&drawn.own.rasterize.grad_color)?);
         Ok(tiles.iter().zip(shares).map(|(tiles, share)| if *tiles > 0 { share[0] } else { 0.0 }).collect())
     }
 
@@ -121,104 +99,48 @@ impl Drawer {
     /// # Errors
     /// As [`Drawer::draw`].
     pub fn step(&mut self, camera: &Camera, target: &[u32], step: u32, rates: Rates) -> Result<f32, Error> {
-        self.furnish(camera.size)?;
-        self.gpu.write(&self.canvas.as_ref().expect("just made").target, target)?;
-        self.run(camera, |drawer, rec, stages, canvas| {
-            let binned = drawer.forward(rec, stages, canvas, camera);
-            drawer.improve(rec, stages, canvas, binned, camera, (step, rates));
+        let (gpu, limits, near) = (self.session.gpu().clone(), self.session.limits().share(), self.near);
+        for parameter in self.gaussians.parameters_mut().into_iter().filter(|row| row.gradient.is_none()) {
+            parameter.make_gradient(&gpu)?;
+        }
+        let target = gpu.upload("picture", target)?;
+        let (gaussians, background) = (&self.gaussians, self.background);
+        let stages = self.session.run(gaussians, camera, |rec, stages, binned| {
+            let Stages { room, forward, own: Canvas { picture, losses, rasterize, project, .. } } = stages;
+            rasterize::forward(rec, room.method, forward.projected(), binned, background, picture);
+            let weights = Weights { outside: 1.0, inside: 1.0 };
+            let view = View { picture: &target, weights, depth: None };
+            let gradient = losses.forward_backward(rec, &view, &picture.rgb, None);
+            let gradient = PictureGradient { rgb: gradient.rgb, depth: None, transmittance: None };
+            rasterize.record(rec, room.method, forward.projected(), binned, picture, gradient);
+            let Backward { grad_mean: mean, grad_covariance: covariance, .. } = rasterize;
+            let splats = SplatGradients { mean, covariance, depth: None };
+            project.record(rec, binned.drawn, forward.gaussians(), splats, camera, near);
+            let gradients = GaussianGradients {
+                drawn: binned.tiles,
+                position: &project.grad_position,
+                opacity: &rasterize.grad_opacity,
+                color: &rasterize.grad_color,
+                scale: &project.grad_scale,
+                rotation: &project.grad_rotation,
+            };
+            let trained = || {
+                gaussians
+                    .parameters()
+                    .into_iter()
+                    .zip(rates)
+                    .filter_map(|(p, rate)| Some((p, p.gradient.as_ref()?, rate)))
+            };
+            trained().for_each(|(_, gradient, _)| rec.zero(gradient));
+            gaussians.backward(rec, (&forward.front, None), None, binned.drawn, gradients);
+            for (parameter, gradient, rate) in trained().filter(|(_, _, rate)| *rate != 0.0) {
+                let tensors =
+                    Tensors { value: &parameter.value, gradient, first: &parameter.first, root: &parameter.root };
+                let range = (0, gaussians.count * parameter.width);
+                adam::record(rec, &adam::Config::default(), tensors, limits.overflow(), range, (step, rate));
+            }
         })?;
-        Ok(self.gpu.read(self.canvas.as_ref().expect("made by the run").losses.terms())?[0])
-    }
-
-    fn forward<'s>(
-        &'s self,
-        rec: &mut Recorder<'_>,
-        Stages { forward, .. }: &'s Stages,
-        canvas: &Canvas,
-        camera: &Camera,
-    ) -> Binned<'s> {
-        let binned = forward.record(rec, &self.gaussians, camera, self.config.near as f32, &self.limits);
-        rasterize::forward(rec, forward.method(), forward.projected(), binned, self.background, &canvas.picture);
-        binned
-    }
-
-    fn improve(
-        &self,
-        rec: &mut Recorder<'_>,
-        stages: &Stages,
-        canvas: &Canvas,
-        binned: Binned<'_>,
-        camera: &Camera,
-        (step, rates): (u32, Rates),
-    ) {
-        let Stages { forward, rasterize, project } = stages;
-        let weights = Weights { outside: 1.0, inside: 1.0 };
-        let view = View { picture: &canvas.target, weights, depth: None };
-        let gradient = canvas.losses.forward_backward(rec, &view, &canvas.picture.rgb, None);
-        let gradient = PictureGradient { rgb: gradient.rgb, depth: None, transmittance: None };
-        rasterize.record(rec, forward.method(), forward.projected(), binned, &canvas.picture, gradient);
-        let splats = SplatGradients { mean: &rasterize.grad_mean, covariance: &rasterize.grad_covariance, depth: None };
-        project.record(rec, binned.drawn, forward.gaussians(), splats, camera, self.config.near as f32);
-        let gradients = GaussianGradients {
-            drawn: binned.tiles,
-            position: &project.grad_position,
-            opacity: &rasterize.grad_opacity,
-            color: &rasterize.grad_color,
-            scale: &project.grad_scale,
-            rotation: &project.grad_rotation,
-        };
-        let gaussians = self.gaussians.parameters();
-        gaussians.into_iter().filter_map(|row| row.gradient.as_ref()).for_each(|gradient| rec.zero(gradient));
-        self.gaussians.backward(rec, (&forward.front, None), None, binned.drawn, gradients);
-        let all = gaussians.into_iter().zip(rates).filter(|(_, rate)| *rate != 0.0);
-        for (parameter, rate) in all {
-            let Some(gradient) = &parameter.gradient else { continue };
-            let tensors = Tensors { value: &parameter.value, gradient, first: &parameter.first, root: &parameter.root };
-            let range = (0, self.gaussians.count * parameter.width);
-            adam::record(rec, &adam::Config::default(), tensors, self.limits.overflow(), range, (step, rate));
-        }
-    }
-
-    /// Makes what is missing for pictures of this size.
-    fn furnish(&mut self, size: [u32; 2]) -> Result<(), Error> {
-        let Self { gpu, config, pairs, gaussians, stages, canvas, .. } = self;
-        if canvas.as_ref().is_none_or(|canvas| canvas.picture.size != size) {
-            // Those of another size go before these are made: the tiles' lists are of that size as well.
-            (*canvas, *stages) = (None, None);
-            *canvas = Some(Canvas::new(gpu, size)?);
-        }
-        if stages.is_none() {
-            for parameter in gaussians.parameters_mut() {
-                parameter.make_gradient(gpu)?;
-            }
-            let capacity = Capacity { pairs: *pairs, ..Capacity::guess(gaussians.count) };
-            let method = Method::new(gpu, config);
-            let forward = Forward::new(gpu, capacity, gaussians, method, size, false)?;
-            let (slots, pairs) = (forward.slots as usize, *pairs as usize);
-            *stages = Some(Stages {
-                rasterize: Backward::new(gpu, method, slots, pairs, Outputs::Color)?,
-                project: ProjectBackward::new(gpu, &forward.project)?,
-                forward,
-            });
-        }
-        Ok(())
-    }
-
-    /// Records and runs `work`, again with more room where the pairs did not fit.
-    fn run(&mut self, camera: &Camera, work: impl Fn(&Self, &mut Recorder<'_>, &Stages, &Canvas)) -> Result<(), Error> {
-        let (gpu, limits) = (self.gpu.clone(), self.limits.share());
-        limits.until_all_fits(&gpu, |counted| {
-            if let Some(counted) = counted {
-                let wanted = counted[Counter::Pairs as usize];
-                self.pairs = wanted.saturating_add(wanted / 2);
-                self.stages = None;
-            }
-            self.furnish(camera.size)?;
-            let (stages, canvas) = self.stages.as_ref().zip(self.canvas.as_ref()).expect("just made");
-            let mut rec = gpu.recorder()?;
-            work(self, &mut rec, stages, canvas);
-            rec.submit()?.wait().map(drop)
-        })
+        Ok(gpu.read(stages.own.losses.terms())?[0])
     }
 }
 
@@ -300,7 +222,7 @@ mod tests {
         let camera = camera([256, 192]);
         let mut drawer = drawer(&gpu, &cloud);
         let first = drawer.draw(&camera).expect("a picture");
-        assert!(drawer.pairs > PAIRS, "the case has enough pairs");
+        assert!(drawer.session.stages().room.pairs > 1 << 17, "the case has enough pairs");
         assert!(first == drawer.draw(&camera).expect("a picture") && first.iter().any(|rgb| rgb[0] > 0.1));
     }
 }

@@ -219,12 +219,11 @@ impl Project {
 }
 
 impl ProjectBackward {
-    /// Buffers for the gradients of `forward`'s slots.
+    /// Buffers for the gradients of so many slots.
     ///
     /// # Errors
     /// When the device has no memory for them.
-    pub fn new(gpu: &Gpu, forward: &Project) -> Result<Self, Error> {
-        let slots = forward.depth.len();
+    pub fn new(gpu: &Gpu, slots: usize) -> Result<Self, Error> {
         Ok(Self {
             grad_position: gpu.buffer("grad_position", slots)?,
             grad_scale: gpu.buffer("grad_scale", slots)?,
@@ -512,7 +511,7 @@ mod tests {
 
         let fine = "the device runs a test";
         let forward = Project::new(&gpu, 86, 10).expect(fine);
-        let backward = ProjectBackward::new(&gpu, &forward).expect(fine);
+        let backward = ProjectBackward::new(&gpu, forward.depth.len()).expect(fine);
         let list = |count: &[u32], list: &[u32]| {
             let slots = Slots::new(&gpu, ["list", "list_count", "list_groups"], 860).expect(fine);
             gpu.write(&slots.count, count).expect(fine);

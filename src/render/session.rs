@@ -87,6 +87,11 @@ impl<S> Session<S> {
         &self.gpu
     }
 
+    /// Overflow flag and counters.
+    pub fn limits(&self) -> &Limits {
+        &self.limits
+    }
+
     /// The stages as the last run left them.
     ///
     /// # Panics

@@ -147,7 +147,7 @@ fn run_with(gpu: &Gpu, method: Method, model: &Model, camera: &Camera, near: f32
     picture.rgb = gpu.upload("rgb", &vec![[testing::UNWRITTEN; 3]; pixels]).expect(fine);
     let slots = capacity.visible as usize * K;
     let backward = Backward::new(gpu, method, slots, 1 << 18, Outputs::Transmittance).expect(fine);
-    let project_backward = ProjectBackward::new(gpu, &forward.project).expect(fine);
+    let project_backward = ProjectBackward::new(gpu, slots).expect(fine);
     let decode_backward = DecodeBackward::new(gpu, forward.decode()).expect(fine);
     let zeros = |name, len: usize| gpu.upload(name, &vec![0f32; len]).expect(fine);
     let grad_feature = zeros("grad_feature", anchors.feature().value.len());

@@ -56,7 +56,7 @@ impl Stages {
         Ok(Self {
             rasterize: gpu
                 .stage(stage::RASTERIZE_BACKWARD, || Backward::new(gpu, method, slots, pairs, plan.outputs()))?,
-            project: gpu.stage(stage::PROJECT_BACKWARD, || ProjectBackward::new(gpu, &forward.project))?,
+            project: gpu.stage(stage::PROJECT_BACKWARD, || ProjectBackward::new(gpu, slots))?,
             scratch: model.scratch(gpu, &forward.front, wanted)?,
             forward,
         })
