@@ -14,19 +14,10 @@ use rand::RngExt as _;
 use rand_pcg::Pcg64;
 use rayon::prelude::*;
 
-use super::Config;
+use super::{Config, Round};
 use crate::gpu::kernels::densify::{prune_gather, split_scatter};
 use crate::gpu::{Buffer, Error, Gpu, Reference};
 use crate::model::gaussians::{NORM_EPSILON, Static, sigmoid};
-
-/// The seed of a round's random numbers.
-#[derive(Clone, Copy, Debug)]
-pub struct Round {
-    /// The run's seed.
-    pub seed: u64,
-    /// The step behind which the round comes.
-    pub step: u32,
-}
 
 /// Deviation of a half along the axis, of that of the whole: divided by 1.6, as by 3DGS.
 const DEVIATION: f64 = 0.625;
@@ -256,7 +247,7 @@ mod tests {
             };
             let whole = picture(Static::upload(&gpu, &one).expect("room"));
             let mut gaussians = Static::with_room(&gpu, &one, 2, 1.0).expect("room");
-            run(&gpu, &mut gaussians, &Config::default(), Round { seed: 0, step: 1 }).expect("a round");
+            run(&gpu, &mut gaussians, &Config::default(), Round { voxel: 0.0, seed: 0, step: 1 }).expect("a round");
             assert_eq!(gaussians.count, 2);
             let [a, b] = gaussians.read(&gpu).expect("readable").position[..] else { panic!("two halves") };
             let apart = (0..3).map(|k| f64::from(a[k] - b[k]).powi(2)).sum::<f64>().sqrt();
@@ -309,7 +300,7 @@ mod tests {
             }
             let counts: Vec<(u32, u32)> = (1..=3)
                 .map(|step| {
-                    let moved = run(&gpu, &mut gaussians, &config, Round { seed, step }).expect("a round");
+                    let moved = run(&gpu, &mut gaussians, &config, Round { voxel: 0.0, seed, step }).expect("a round");
                     (moved, gaussians.count)
                 })
                 .collect();
@@ -340,15 +331,16 @@ mod tests {
         let gpu = testing::gpu();
         let faded = Cloud { logit: vec![-9.0; 9], ..cloud(9) };
         let mut gaussians = Static::with_room(&gpu, &faded, 12, 1.0).expect("room");
-        let moved = run(&gpu, &mut gaussians, &Config::default(), Round { seed: 0, step: 1 }).expect("a round");
+        let moved =
+            run(&gpu, &mut gaussians, &Config::default(), Round { voxel: 0.0, seed: 0, step: 1 }).expect("a round");
         assert_eq!((moved, gaussians.count), (0, 9));
         let weights = [0.0, 1.0, f64::INFINITY, f64::NAN, 2.0];
         for step in 1..20 {
-            let mut drawn = draw(&weights, 4, Round { seed: 0, step });
+            let mut drawn = draw(&weights, 4, Round { voxel: 0.0, seed: 0, step });
             drawn.sort_unstable();
             assert_eq!(drawn, [1, 4]);
         }
-        let heavier = (0..1000).filter(|&step| draw(&weights, 1, Round { seed: 0, step }) == [4]).count();
+        let heavier = (0..1000).filter(|&step| draw(&weights, 1, Round { voxel: 0.0, seed: 0, step }) == [4]).count();
         assert!((600..730).contains(&heavier), "two thirds of the draws: {heavier}");
     }
 }

@@ -15,7 +15,7 @@ use crate::scene::Camera;
 /// Learning rates of a step, in the order of [`Static::parameters`].
 pub type Rates = [f64; 5];
 
-/// What is drawn, compared and asked beside the forward stages.
+/// Picture, losses and way back beside the forward stages.
 struct Canvas {
     picture: Picture,
     losses: Losses,

@@ -1,8 +1,7 @@
 //! Anchors as a representation of the model: those in view are decoded into Gaussians.
 
 use super::{Capacity, Front, Representation};
-use crate::config::Settings;
-use crate::densify::{self, Statistics};
+use crate::densify::{Config, Round, Statistics, grow, prune};
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::model::anchors::{Anchors, Decoded};
 use crate::model::files::Weights;
@@ -23,7 +22,7 @@ pub fn most(gpu: &Gpu, offsets: u32) -> u32 {
 }
 
 impl Decoded {
-    /// As the decoder reads them.
+    /// Anchors as the decoder reads them.
     fn read_by<'a>(
         &'a self,
         visible: &'a Visible,
@@ -138,20 +137,18 @@ impl Representation for Decoded {
     fn grow(
         &mut self,
         gpu: &Gpu,
-        settings: &Settings,
+        config: &Config,
+        round: Round,
         counted: Option<&mut Statistics>,
-        voxel: f64,
-        step: u32,
     ) -> Result<String, Error> {
         let (Self { anchors, .. }, Some(statistics)) = (self, counted) else { return Ok(String::new()) };
         let most = most(gpu, anchors.offsets);
-        let asked = settings.densify.max_anchors;
-        let max_anchors = if asked == 0 { most } else { asked.min(most) };
-        let config = &densify::Config { max_anchors, ..settings.densify.clone() };
-        let round = densify::Round { voxel: voxel as f32, seed: settings.train.seed, step };
+        let max_anchors = if config.max_anchors == 0 { most } else { config.max_anchors.min(most) };
+        let config = &Config { max_anchors, ..config.clone() };
         let before = anchors.count;
-        let grown = densify::grow::run(gpu, anchors, statistics, config, round)?;
-        let pruned = densify::prune::run(gpu, anchors, statistics, config)?;
+        let grown = grow::run(gpu, anchors, statistics, config, round)?;
+        let pruned = prune::run(gpu, anchors, statistics, config)?;
+        let step = round.step;
         let mut text =
             format!("step {step}: {} new anchors, {pruned} pruned: {before} -> {}", grown.added, anchors.count);
         if grown.refused > 0 {
@@ -164,7 +161,7 @@ impl Representation for Decoded {
             text.push_str(&format!(
                 "; {} Gaussians lie more than {:.0e} cells from the origin, where none grows: move the scene or raise model.voxel",
                 grown.beyond,
-                densify::grow::CELL_LIMIT
+                grow::CELL_LIMIT
             ));
         }
         Ok(text)

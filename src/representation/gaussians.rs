@@ -1,8 +1,7 @@
 //! Plain Gaussians as a representation of the model: each is a row, drawn in every view.
 
 use super::{Capacity, Front, Representation};
-use crate::config::Settings;
-use crate::densify::{Statistics, split};
+use crate::densify::{Config, Round, Statistics, split};
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::model::gaussians::Static;
 use crate::model::parameter::Parameter;
@@ -67,17 +66,10 @@ impl Representation for Static {
         activate::backward(rec, self, front.of_gaussians().0, drawn, gradients);
     }
 
-    fn grow(
-        &mut self,
-        gpu: &Gpu,
-        settings: &Settings,
-        _: Option<&mut Statistics>,
-        _voxel: f64,
-        step: u32,
-    ) -> Result<String, Error> {
+    fn grow(&mut self, gpu: &Gpu, config: &Config, round: Round, _: Option<&mut Statistics>) -> Result<String, Error> {
         let before = self.count;
-        let moved = split::run(gpu, self, &settings.densify, split::Round { seed: settings.train.seed, step })?;
-        let (now, new) = (self.count, self.count - before);
+        let moved = split::run(gpu, self, config, round)?;
+        let (step, now, new) = (round.step, self.count, self.count - before);
         Ok(format!("step {step}: {moved} faded Gaussians are halves of others, {new} new: {before} -> {now}"))
     }
 

@@ -6,8 +6,7 @@ mod gaussians;
 
 pub use anchors::most as most_anchors;
 
-use crate::config::Settings;
-use crate::densify::Statistics;
+use crate::densify::{Config, Round, Statistics};
 use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::model::anchors::{Anchors, Decoded};
 use crate::model::gaussians::Static;
@@ -22,7 +21,7 @@ use crate::render::slots::Slots;
 use crate::render::visible::Visible;
 use crate::scene::Camera;
 
-/// What the stages, the optimiser and the files ask of a model, whatever it is made of.
+/// A model on the device, whatever it is made of, as the stages, the optimiser and the files see it.
 pub trait Representation: Send + Sync {
     /// Rows in use: anchors, or plain Gaussians.
     fn count(&self) -> u32;
@@ -99,18 +98,16 @@ pub trait Representation: Send + Sync {
         gradients: GaussianGradients<'_>,
     );
 
-    /// A round of growth behind this step, by what the steps since the last one have counted; says what changed. `voxel` is the
-    /// side of the anchors' grid.
+    /// A round of growth, by what the steps since the last one have counted; says what changed.
     ///
     /// # Errors
     /// When the device has no room.
     fn grow(
         &mut self,
         gpu: &Gpu,
-        settings: &Settings,
+        config: &Config,
+        round: Round,
         counted: Option<&mut Statistics>,
-        voxel: f64,
-        step: u32,
     ) -> Result<String, Error>;
 
     /// Counts so many rows as in use, as far as the room for those of all rounds is there from the first step on: for

@@ -23,7 +23,7 @@ pub struct Beginning {
 }
 
 impl Beginning {
-    /// That of a run under these settings.
+    /// Beginning of a run under these settings.
     ///
     /// # Errors
     /// Points that make no model; a file of Gaussians that cannot be begun with.

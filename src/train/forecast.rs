@@ -434,7 +434,7 @@ const VIEWS: usize = 8;
 pub fn forecast(gpu: &Gpu, scene: &Scene, settings: &Settings, question: Question) -> Result<Verdict, Error> {
     let available = question.available.unwrap_or_else(|| gpu.available_bytes());
     let settings = &settings.fitted(scene);
-    let start = Start::of(gpu, scene, settings, Beginning::of(scene, settings)?)?;
+    let start = Start::of(gpu, scene, settings, Beginning::of(scene, settings)?, 1)?;
     let anchors = question.anchors.unwrap_or_else(|| start.expected(gpu, scene, settings));
     let forecast = start.rehearse(gpu, scene, settings, anchors, question.also)?;
     let mut verdict = Verdict { available, forecast, remedies: vec![] };
@@ -451,8 +451,21 @@ struct Start {
 }
 
 impl Start {
-    fn of(gpu: &Gpu, scene: &Scene, settings: &Settings, initial: Beginning) -> Result<Self, Error> {
-        let counts = surveyed(gpu, &initial, settings, scene.train.iter().map(|v| &v.camera))?;
+    /// Start with a [`survey`] of every so many views; where the device has no room for that either, or no memory at all, as
+    /// if all rows were in view.
+    fn of(gpu: &Gpu, scene: &Scene, settings: &Settings, initial: Beginning, every: usize) -> Result<Self, Error> {
+        let mut counts = match survey(gpu, &initial, settings, scene.train.iter().step_by(every).map(|v| &v.camera)) {
+            Err(gpu::Error::TooLarge { .. } | gpu::Error::OutOfMemory { .. } | gpu::Error::Missing { .. }) => {
+                let (anchors, each) = (initial.count(), initial.model.weights().map_or(1, |_| settings.model.offsets));
+                Survey { anchors, visible: anchors, pairs: anchors.saturating_mul(each) }
+            }
+            other => other?,
+        };
+        if every > 1 {
+            // Not all views were looked at.
+            counts.visible = counts.visible.saturating_add(counts.visible / 10).min(counts.anchors);
+            counts.pairs = counts.pairs.saturating_add(counts.pairs / 5);
+        }
         Ok(Self { initial, counts })
     }
 
@@ -533,7 +546,7 @@ fn fewer_anchors(gpu: &Gpu, scene: &Scene, asked: &Settings, available: u64) -> 
         if count > most {
             continue;
         }
-        let start = Start::of(gpu, scene, &fitted, initial)?;
+        let start = Start::of(gpu, scene, &fitted, initial, 1)?;
         let expected = start.expected(gpu, scene, &fitted);
         for share in GROWTH_SHARES {
             let anchors = count + (f64::from(expected.saturating_sub(count)) * share) as u32;
@@ -584,22 +597,6 @@ fn fewer_gaussians(gpu: &Gpu, scene: &Scene, asked: &Settings, available: u64) -
 /// Shares of the Gaussians asked for that are tried, the most first.
 const GAUSSIANS: [f64; 6] = [1.0, 0.75, 0.5, 0.25, 0.1, 0.03];
 
-/// As [`survey`]; where the device has no room for that either, or no memory at all, as if all anchors were in view.
-fn surveyed<'c>(
-    gpu: &Gpu,
-    initial: &Beginning,
-    settings: &Settings,
-    cameras: impl IntoIterator<Item = &'c Camera>,
-) -> Result<Survey, Error> {
-    match survey(gpu, initial, settings, cameras) {
-        Err(gpu::Error::TooLarge { .. } | gpu::Error::OutOfMemory { .. } | gpu::Error::Missing { .. }) => {
-            let (anchors, each) = (initial.count(), initial.model.weights().map_or(1, |_| settings.model.offsets));
-            Ok(Survey { anchors, visible: anchors, pairs: anchors.saturating_mul(each) })
-        }
-        other => Ok(other?),
-    }
-}
-
 fn remedies(
     gpu: &Gpu,
     scene: &Scene,
@@ -610,21 +607,10 @@ fn remedies(
     let every = scene.train.len().div_ceil(VIEWS);
     // Bytes that a run of these settings needs, if they are as many as there are or fewer.
     let needs = |scene: &Scene, settings: &Settings| -> Result<Option<u64>, Error> {
-        let plan = Plan::new(scene, settings);
-        let first = Beginning::of(scene, settings)?;
-        let cameras = scene.train.iter().step_by(every).map(|v| &v.camera);
-        let mut counts = surveyed(gpu, &first, settings, cameras)?;
-        if every > 1 {
-            // Not all views were looked at.
-            counts.visible = counts.visible.saturating_add(counts.visible / 10).min(counts.anchors);
-            counts.pairs = counts.pairs.saturating_add(counts.pairs / 5);
-        }
-        let anchors = question.anchors.unwrap_or_else(|| expected_anchors(gpu, &plan, settings, &first));
-        match rehearse(gpu, scene, settings, &first, counts, anchors, None) {
-            Ok(forecast) => Ok(Some(forecast.needs()).filter(|&bytes| bytes <= available)),
-            Err(Error::Gpu(gpu::Error::TooLarge { .. })) => Ok(None),
-            Err(error) => Err(error),
-        }
+        let start = Start::of(gpu, scene, settings, Beginning::of(scene, settings)?, every)?;
+        let anchors = question.anchors.unwrap_or_else(|| start.expected(gpu, scene, settings));
+        let forecast = start.rehearse(gpu, scene, settings, anchors, None)?;
+        Ok(forecast.ok().map(|forecast| forecast.needs()).filter(|&bytes| bytes <= available))
     };
     let with = |change: String, make: &dyn Fn(&mut Settings)| {
         let mut changed = settings.clone();

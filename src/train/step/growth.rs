@@ -1,6 +1,7 @@
 //! Growing and pruning behind a step.
 
 use super::Step;
+use crate::densify::Round;
 use crate::gpu::Error;
 use crate::stage;
 
@@ -21,7 +22,8 @@ impl Step {
         }
         self.release();
         let Self { gpu, config, learnt, statistics, voxel, capacity, .. } = self;
-        let text = gpu.stage(stage::GROWTH, || learnt.grow(gpu, config, statistics.as_mut(), *voxel, step))?;
+        let round = Round { voxel: *voxel as f32, seed: config.train.seed, step };
+        let text = gpu.stage(stage::GROWTH, || learnt.grow(gpu, &config.densify, round, statistics.as_mut()))?;
         // As large a share of the rows is in view as before.
         let [visible, old, new] = [capacity.visible, capacity.anchors, learnt.capacity()].map(u64::from);
         capacity.visible = (visible * new).div_ceil(old.max(1)).max(visible).min(new.max(1)) as u32;
