@@ -7,6 +7,7 @@ use super::shared::DeviceArgs;
 use super::{next, signals};
 use crate::folder::Lock;
 use crate::prepare::click::MOST_POINTS;
+use crate::prepare::hole::repaint::{Repaint, Wish};
 use crate::prepare::shadow::Answer;
 use crate::prepare::{self, Evidence, Object, Request, Step, Watch, video};
 use crate::signal::Signal;
@@ -18,7 +19,7 @@ use crate::signal::Signal;
 /// PHOTOS may be a video, too: its sharpest frames of even spacing, which the program ffmpeg takes, are the photographs.
 /// The scene gets the plain layout, which `train` takes.
 ///
-/// The steps are poses, fit, masks, shadow, depth and reference. A step whose inputs have not changed is skipped, a file that was
+/// The steps are poses, fit, masks, shadow, depth, reference and repaint. A step whose inputs have not changed is skipped, a file that was
 /// changed or put there by hand stays, and a mask corrected by hand counts as one that was given. prepare.json says what
 /// every file was made from, prepare/provenance.png where each pixel of the reference is from.
 #[derive(Debug, clap::Args)]
@@ -29,7 +30,8 @@ use crate::signal::Signal;
   gscream-vk prepare photos --out scene --click IMG_0012=430,340 --not IMG_0012=520,460
   gscream-vk prepare photos --out scene --mask IMG_0012=a.png --mask IMG_0040=b.png --reference IMG_0025
   gscream-vk prepare photos --out scene --object pot --mask IMG_0012=a.png --object ball --box IMG_0005=310,220,540,470
-  gscream-vk prepare photos --out scene --only masks --mask IMG_0012=better.png")]
+  gscream-vk prepare photos --out scene --only masks --mask IMG_0012=better.png
+  gscream-vk prepare photos --out scene --repaint IMG_0012=wrong.png@-80,0")]
 pub(super) struct Args {
     /// Folder of photographs, or a video
     #[arg(value_name = "PHOTOS")]
@@ -44,6 +46,8 @@ pub(super) struct Args {
     /// View to become the reference [default: the one whose hole is seen best by others]
     #[arg(long, value_name = "NAME")]
     reference: Option<String>,
+    #[command(flatten)]
+    repaint: RepaintArgs,
     /// Run this step alone, with what those before it left; may be given many times
     #[arg(long, value_name = "STEP", value_parser = step)]
     only: Vec<Step>,
@@ -113,6 +117,28 @@ struct Marks {
     /// Pixel that is not of the object, where another mark of the view takes too much; may be given many times
     #[arg(long, value_name = "NAME=x,y", value_parser = not)]
     not: Vec<(String, Evidence)>,
+}
+
+/// What is repainted by hand.
+#[derive(Debug, Clone, Default, clap::Args)]
+pub(super) struct RepaintArgs {
+    /// Part of a hole to be filled anew, in this view and all others: a picture that is not black there, and where a patch for it lies
+    ///
+    /// The picture is as large as the photograph. Behind @ stands how far right and down of the part the patch lies, in pixels of
+    /// the photograph; without, what is around the part fills it. May be given many times. Repaints are kept in the scene and are made
+    /// again with the hole; those that are the last ones already are not added. A scene that is there needs no mask for it.
+    #[arg(long, value_name = "NAME=FILE[@dx,dy]", value_parser = repaint)]
+    repaint: Vec<Repaint>,
+    /// Take the last repaint back
+    #[arg(long, conflicts_with = "repaint")]
+    undo_repaint: bool,
+}
+
+impl RepaintArgs {
+    /// For the request.
+    pub fn wish(&self) -> Wish {
+        if self.undo_repaint { Wish::Undo } else { Wish::With(self.repaint.clone()) }
+    }
 }
 
 /// How photographs are taken out of a video.
@@ -245,6 +271,20 @@ fn strokes(text: &str) -> Result<(String, Evidence), String> {
     named_file(text).map(|(name, file)| (name, Evidence::Strokes(file)))
 }
 
+/// A view's name, a file, and behind an @ that is not of the file's name how far a patch lies from it.
+fn repaint(text: &str) -> Result<Repaint, String> {
+    let (view, file) = named_file(text)?;
+    let numbers = text.rsplit_once('@').filter(|_| !file.is_file());
+    let number = |word: &str| word.trim().parse::<i32>().ok();
+    let offset = |(_, by): (&str, &str)| by.split_once(',').and_then(|(x, y)| Some([number(x)?, number(y)?]));
+    let Some((before, offset)) = numbers.map(|numbers| (numbers.0, offset(numbers))) else {
+        return Ok(Repaint { view, brush: file, offset: None });
+    };
+    let offset =
+        offset.ok_or("behind @ stands how far the patch lies right and down, two whole numbers: FILE@-40,0")?;
+    named_file(before).map(|(view, brush)| Repaint { view, brush, offset: Some(offset) })
+}
+
 /// A view's name and whole numbers of pixels.
 fn pixels(text: &str) -> Result<(String, Vec<u32>), String> {
     let (name, numbers) = match text.rsplit_once('=') {
@@ -301,6 +341,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let request = Request {
         objects: args.object.0.clone(),
         reference: args.reference.clone(),
+        repaint: args.repaint.wish(),
         only: args.only.clone(),
         depth: !args.no_depth,
         shadow: args.shadow.answer(),

@@ -36,6 +36,7 @@ use crate::signal::Signal;
 use crate::train::checkpoint::Fingerprint;
 
 use fit::Fit;
+use hole::repaint::{self, Asked};
 use network::Inpainting;
 pub use object::{Evidence, Object};
 use object::{Wanted, no_such_view};
@@ -142,11 +143,14 @@ pub enum Step {
     Depth,
     /// The reference view without the object.
     Reference,
+    /// What was repainted by hand in it, and in all other views.
+    Repaint,
 }
 
 impl Step {
     /// All of them.
-    pub const ALL: [Self; 6] = [Self::Poses, Self::Fit, Self::Masks, Self::Shadow, Self::Depth, Self::Reference];
+    pub const ALL: [Self; 7] =
+        [Self::Poses, Self::Fit, Self::Masks, Self::Shadow, Self::Depth, Self::Reference, Self::Repaint];
 
     /// Its name in the record and on the command line.
     pub fn name(self) -> &'static str {
@@ -157,6 +161,7 @@ impl Step {
             Self::Shadow => "shadow",
             Self::Depth => "depth",
             Self::Reference => "reference",
+            Self::Repaint => "repaint",
         }
     }
 }
@@ -172,6 +177,8 @@ pub struct Request {
     pub objects: Vec<Object>,
     /// Name of the reference view; otherwise the one whose hole is seen best by others.
     pub reference: Option<String>,
+    /// What is to be repainted by hand, besides what was before; where nothing else is named, that is done alone.
+    pub repaint: repaint::Wish,
     /// The steps to run, whose inputs must be there; all if empty.
     pub only: Vec<Step>,
     /// The fit, where there is one: the step is left out, and nothing is written for it.
@@ -200,6 +207,7 @@ impl Request {
             out: out.into(),
             objects: vec![Object::default()],
             reference: None,
+            repaint: repaint::Wish::default(),
             only: vec![],
             ready: None,
             fit_steps: 200,
@@ -310,17 +318,23 @@ fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(
         }
     }
     let mut wanted = Wanted::given(&capture, &request.objects)?;
+    let asked = Asked::read(&request.repaint, &capture)?;
     let _lock = crate::folder::Lock::take(&request.out)?;
     let mut folder = Folder::open(&request.out)?;
     folder.sweep();
     wanted.correct(&folder, &capture)?;
-    if wanted.objects.is_empty() && request.wants(Step::Masks) && request.only.is_empty() {
+    let mut request = request.clone();
+    let bare = wanted.objects.is_empty() && request.only.is_empty();
+    if bare && asked.is_some() && folder.made(Step::Reference).next().is_some() {
+        request.only = vec![Step::Repaint];
+    } else if bare {
         return Err(Error::Request(
             "what is to be removed? name one view and its mask, --mask NAME=FILE.png, a box around the object, --box \
              NAME=x0,y0,x1,y1, or a pixel of it, --click NAME=x,y"
                 .into(),
         ));
     }
+    let request = &request;
     let depth = request.depth;
     let mut preparation =
         Preparation { gpu, request, folder: &mut folder, watch, depth, networks, matched: None, unit: 1.0 };
@@ -342,6 +356,10 @@ fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(
     if let Some(name) = request.reference.as_ref().filter(|name| !scene.train.iter().any(|v| v.name == **name)) {
         return Err(no_such_view(name, "--reference", scene.train.iter().map(|v| v.name.as_str())));
     }
+    if request.only == [Step::Repaint] && preparation.knows_behind() {
+        preparation.repaint(&scene, asked)?;
+        return Ok(None);
+    }
     let fit = preparation.fit(&scene)?;
     let mut splats = Splats::new(gpu, &fit.model, &fit.settings.render)?;
     if request.wants(Step::Masks) {
@@ -357,9 +375,13 @@ fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(
     } else if request.only.is_empty() && !request.depth {
         preparation.no_depth()?;
     }
-    if request.wants(Step::Reference) {
+    let repaints = request.wants(Step::Repaint);
+    if request.wants(Step::Reference) || repaints && !preparation.knows_behind() {
         let masks = preparation.masks_on_disk(&scene)?;
         preparation.reference(&scene, &masks)?;
+    }
+    if request.wants(Step::Reference) || repaints {
+        preparation.repaint(&scene, asked)?;
     }
     let matched = preparation.matched.take();
     Ok(Some((scene, fit, matched)))
@@ -518,9 +540,7 @@ impl Preparation<'_> {
         if let Some(ready) = &self.request.ready {
             return ready.made_of.clone();
         }
-        self.folder.record().steps.get(Step::Fit.name()).map_or_else(String::new, |step| {
-            step.files.values().map(|file| file.hash.as_str()).collect::<Vec<_>>().join(" ")
-        })
+        self.folder.made(Step::Fit).map(|(_, file)| file.hash.as_str()).collect::<Vec<_>>().join(" ")
     }
 
     /// Matches the photographs, once.
@@ -576,8 +596,7 @@ impl Preparation<'_> {
 
     /// What the priors that were made are.
     fn kind(&self) -> PriorKind {
-        let files = self.folder.record().steps.get(Step::Depth.name()).map(|step| &step.files);
-        let disparity = files.is_some_and(|files| files.keys().any(|path| path.starts_with("disparity/")));
+        let disparity = self.folder.made(Step::Depth).any(|(path, _)| path.starts_with("disparity/"));
         if disparity { PriorKind::Disparity } else { PriorKind::Depth }
     }
 
@@ -611,12 +630,6 @@ impl Preparation<'_> {
         Ok(())
     }
 
-    /// Hashes of what the step shadow has made.
-    fn shadow_hashes(&self) -> impl Iterator<Item = &str> {
-        let files = self.folder.record().steps.get(Step::Shadow.name()).map(|step| &step.files);
-        files.into_iter().flatten().map(|(_, file)| file.hash.as_str())
-    }
-
     fn depth(&mut self, scene: &Scene, splats: &mut Splats, masks: &[GrayImage]) -> Result<(), Error> {
         if !self.depth {
             self.watch.say("depth: the scene has priors of its own, none are made");
@@ -641,8 +654,13 @@ impl Preparation<'_> {
 
     fn reference(&mut self, scene: &Scene, masks: &[GrayImage]) -> Result<(), Error> {
         let named = self.request.reference.clone().unwrap_or_default();
-        let inputs = self.inputs_behind_masks(masks).with(hole::METHOD).with(named).with([u8::from(self.depth)]);
-        let inputs = self.shadow_hashes().fold(inputs, |inputs, hash| inputs.with(hash));
+        let inputs = self
+            .inputs_behind_masks(masks)
+            .with(hole::METHOD)
+            .with(hole::BEHIND)
+            .with(named)
+            .with([u8::from(self.depth)]);
+        let inputs = self.folder.made(Step::Shadow).fold(inputs, |inputs, (_, file)| inputs.with(&file.hash));
         let mut inputs = self.networks.inputs(inputs, true).with(self.request.shadow.name());
         let mut given = BTreeMap::new();
         for (at, view) in scene.train.iter().enumerate() {
@@ -677,6 +695,30 @@ impl Preparation<'_> {
         };
         let batch = hole::make(&task, self.watch)?;
         self.write(Step::Reference, inputs, batch)?;
+        self.watch.end();
+        Ok(())
+    }
+
+    /// Whether the depth of what is behind the object was kept.
+    fn knows_behind(&self) -> bool {
+        self.folder.made(Step::Reference).any(|(path, _)| path.starts_with(hole::BEHIND))
+    }
+
+    fn repaint(&mut self, scene: &Scene, asked: Asked) -> Result<(), Error> {
+        let (repaints, before) = asked.after(self.folder)?;
+        let seed = self.request.seed;
+        let inputs = repaint::inputs(self.folder, &repaints, seed);
+        let is_new = repaints.is_empty() && !self.folder.record().steps.contains_key(Step::Repaint.name());
+        if is_new || self.skips(Step::Repaint, &inputs)? {
+            return Ok(());
+        }
+        self.watch.begin(Step::Repaint, scene.train.len() as u64);
+        let mut even = scene.clone();
+        scene::even_out(&mut even);
+        let task = repaint::Task { scene, gains: &even.gains, folder: self.folder, seed };
+        let batch = task.make(&repaints, before, self.watch)?;
+        self.write(Step::Repaint, inputs, batch)?;
+        self.folder.repaint(repaints.into_iter().map(|(recorded, _)| recorded).collect())?;
         self.watch.end();
         Ok(())
     }

@@ -389,7 +389,7 @@ fn corrected(
 }
 
 /// A mask of a photograph of this size, as large as its file has it: its proportions are looked at before it is decoded.
-fn read_mask(path: &Path, size: [u32; 2]) -> Result<GrayImage, Error> {
+pub(super) fn read_mask(path: &Path, size: [u32; 2]) -> Result<GrayImage, Error> {
     let found = picture_size(path)?;
     let ratio = |s: [u32; 2]| f64::from(s[0]) / f64::from(s[1]);
     if found != size && (ratio(found) / ratio(size) - 1.0).abs() > 0.01 {

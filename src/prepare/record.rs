@@ -10,10 +10,11 @@ use std::io::{self, Cursor};
 use std::path::{Component, Path, PathBuf};
 
 use crate::atomic::{self, AtomicWriteFile, shortened};
-use image::{GrayImage, ImageFormat, RgbImage};
+use image::{GrayImage, ImageBuffer, ImageFormat, PixelWithColorType, RgbImage};
 use serde::{Deserialize, Serialize};
 use tempfile::TempDir;
 
+use super::hole::repaint::Recorded;
 use super::{Error, Step};
 use crate::folder;
 use crate::scene::npy;
@@ -51,6 +52,9 @@ pub struct Record {
     pub version: String,
     /// Steps by name.
     pub steps: BTreeMap<String, StepRecord>,
+    /// What was repainted by hand, in its order.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub repaints: Vec<Recorded>,
     /// Hashes of files that a step was about to write when this was written: they are the program's own, too.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub pending: BTreeMap<String, String>,
@@ -107,6 +111,16 @@ fn joined<'a>(components: impl Iterator<Item = Component<'a>>) -> Option<String>
     (!names.is_empty()).then(|| names.join("/"))
 }
 
+/// A picture as a PNG file.
+pub(super) fn png<P>(picture: &ImageBuffer<P, Vec<u8>>) -> Vec<u8>
+where
+    P: PixelWithColorType<Subpixel = u8>,
+{
+    let mut bytes = Cursor::new(vec![]);
+    picture.write_to(&mut bytes, ImageFormat::Png).expect("a picture is encoded into memory");
+    bytes.into_inner()
+}
+
 /// What a step writes, all of it at once.
 #[derive(Default)]
 pub struct Batch {
@@ -137,16 +151,12 @@ impl Batch {
 
     /// A picture as PNG.
     pub fn rgb(&mut self, path: impl Into<String>, picture: &RgbImage, from: impl Into<String>) {
-        let mut bytes = Cursor::new(vec![]);
-        picture.write_to(&mut bytes, ImageFormat::Png).expect("a picture is encoded into memory");
-        self.bytes(path, bytes.into_inner(), from);
+        self.bytes(path, png(picture), from);
     }
 
     /// A picture with alpha as PNG.
     pub fn rgba(&mut self, path: impl Into<String>, picture: &image::RgbaImage, from: impl Into<String>) {
-        let mut bytes = Cursor::new(vec![]);
-        picture.write_to(&mut bytes, ImageFormat::Png).expect("a picture is encoded into memory");
-        self.bytes(path, bytes.into_inner(), from);
+        self.bytes(path, png(picture), from);
     }
 
     /// A picture as PNG, one of many large ones: until it is written it waits on disk.
@@ -173,9 +183,7 @@ impl Batch {
 
     /// A mask as PNG.
     pub fn gray(&mut self, path: impl Into<String>, picture: &GrayImage, from: impl Into<String>) {
-        let mut bytes = Cursor::new(vec![]);
-        picture.write_to(&mut bytes, ImageFormat::Png).expect("a picture is encoded into memory");
-        self.bytes(path, bytes.into_inner(), from);
+        self.bytes(path, png(picture), from);
     }
 
     /// The BLAKE3 hash of a file of these bytes, as hexadecimal digits; nothing for a copy.
@@ -264,6 +272,20 @@ impl Folder {
     /// What is known of it.
     pub fn record(&self) -> &Record {
         &self.record
+    }
+
+    /// The files that a step has made, by their path below the scene.
+    pub fn made(&self, step: Step) -> impl Iterator<Item = (&String, &FileRecord)> {
+        self.record.steps.get(step.name()).into_iter().flat_map(|step| &step.files)
+    }
+
+    /// Has these repaints from now on.
+    ///
+    /// # Errors
+    /// A record that cannot be written.
+    pub fn repaint(&mut self, repaints: Vec<Recorded>) -> Result<(), Error> {
+        self.record.repaints = repaints;
+        self.save()
     }
 
     /// Whether a path below the scene holds a file that the program has not written, or that was changed since.

@@ -62,6 +62,7 @@ pub use picture::{decode, dimensions, is_turned, jpeg, object_mask};
 pub(crate) use priors::rank_correlation;
 pub use priors::read as read_prior;
 pub use priors::{Prior, PriorKind, in_own_range, own_range};
+pub(crate) use relight::reduced as relit;
 pub use relight::{RELIGHT, lighten};
 
 /// A photograph at the training resolution and what is known about it.

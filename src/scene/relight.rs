@@ -19,7 +19,7 @@ const ROUNDING: f64 = 1.0;
 ///
 /// # Errors
 /// A map that cannot be read or has other proportions than the photograph.
-pub(super) fn reduced(map: Option<&Path>, photograph: &RgbImage, to: [u32; 2]) -> Result<RgbImage, Error> {
+pub(crate) fn reduced(map: Option<&Path>, photograph: &RgbImage, to: [u32; 2]) -> Result<RgbImage, Error> {
     let Some(path) = map else { return Ok(resample::photograph(photograph, to)) };
     let map = decode(path)?.into_rgb8();
     let [w, h] = [photograph.width(), photograph.height()].map(f64::from);

@@ -10,13 +10,14 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 
-use super::prepare::{ObjectArgs, ShadowArgs, VideoArgs};
+use super::prepare::{ObjectArgs, RepaintArgs, ShadowArgs, VideoArgs};
 use super::shared::{DeviceArgs, SceneArgs};
 use super::{next, preset, signals, train};
 use crate::config::SettingsArgs;
 use crate::export;
 use crate::folder::Lock;
 use crate::prepare::Object;
+use crate::prepare::hole::repaint::Wish;
 use crate::prepare::poses::{self, Capture};
 use crate::remove::objects;
 use crate::scene::stem;
@@ -81,6 +82,8 @@ pub(super) struct Args {
     /// View to become the reference [default: the one whose hole is seen best by others]
     #[arg(long, value_name = "NAME")]
     reference: Option<String>,
+    #[command(flatten)]
+    repaint: RepaintArgs,
     #[command(flatten)]
     shadow: ShadowArgs,
     /// Be done after about so many minutes, from Remove (or the command with --yes) to the files: training has what the rest leaves
@@ -148,7 +151,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let capture = found.map_or_else(|| poses::find(&photographs), Ok)?;
     let time = Time::new(args.minutes, args.work(capture.photographs.len(), &places.root)?);
     let job = Job { args, places, photographs, splat, time };
-    if args.object.is_empty() && !args.yes {
+    if args.object.is_empty() && !args.yes && args.repaint.wish() == Wish::default() {
         return page::run(&job, &capture);
     }
     let objects = job.objects(&capture)?;

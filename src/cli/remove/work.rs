@@ -202,13 +202,14 @@ impl Observer for Watched<'_, export::Bars> {
 impl Job<'_> {
     /// The request to `prepare`.
     pub fn request(&self, objects: Vec<Object>) -> Request {
-        let Args { reference, shadow, fit_steps, .. } = self.args;
+        let Args { reference, repaint, shadow, fit_steps, .. } = self.args;
         // A splat's own Gaussians keep their shadow: only the hole changes.
         let shadow = if self.splat.is_some() { Answer::Keep } else { shadow.answer() };
         Request {
             objects,
             ready: self.splat.as_ref().map(|splat| splat.ready.clone()),
             reference: reference.clone(),
+            repaint: repaint.wish(),
             shadow,
             fit_steps: *fit_steps,
             ..Request::new(&self.photographs, &self.places.scene)

@@ -400,27 +400,32 @@ pub fn repaint(
             if filling.guessed[i] || edge() { repainted(i, !filling.guessed[i]) } else { None }
         })
         .collect();
-    let inside: Vec<usize> = (0..w * h).filter(|i| filling.guessed[*i] && told[*i].is_some()).collect();
+    let inside: Vec<bool> = (0..w * h).map(|i| filling.guessed[i] && told[i].is_some()).collect();
+    filling.behind = (0..w * h)
+        .into_par_iter()
+        .map(|i| if filling.guessed[i] && told[i].is_none() { behind(own, sight, through, i) } else { None })
+        .collect();
+    join(&mut filling.rgb, &inside, &told, size);
+    filling.guessed.iter_mut().zip(inside).for_each(|(guessed, inside)| *guessed &= !inside);
+}
+
+/// Takes what is told of the pixels `inside`, by its gradients: it goes on from what is around them, where that is what is told of it.
+pub fn join(rgb: &mut [[f32; 3]], inside: &[bool], told: &[Option<[f32; 3]>], size: [usize; 2]) {
     let equation = |i: usize| {
         let mut equation = Equation::new(i);
         for (j, there) in neighbours(i, size).filter_map(|j| Some((j, told[j]?))) {
-            let goes_on = filling.guessed[j] || alike(filling.rgb[j], there);
+            let goes_on = inside[j] || alike(rgb[j], there);
             if let Some(here) = told[i].filter(|_| goes_on) {
                 equation.add(j, std::array::from_fn(|c| here[c] - there[c]));
             }
         }
         equation
     };
-    let equations: Vec<Equation> = inside.par_iter().map(|i| equation(*i)).collect();
-    filling.behind = (0..w * h)
-        .into_par_iter()
-        .map(|i| if filling.guessed[i] && told[i].is_none() { behind(own, sight, through, i) } else { None })
-        .collect();
-    for i in inside {
-        filling.rgb[i] = told[i].unwrap_or(filling.rgb[i]);
-        filling.guessed[i] = false;
+    let equations: Vec<Equation> = (0..rgb.len()).into_par_iter().filter(|i| inside[*i]).map(equation).collect();
+    for i in (0..rgb.len()).filter(|i| inside[*i]) {
+        rgb[i] = told[i].unwrap_or(rgb[i]);
     }
-    gradient::solve(&mut filling.rgb, w, &equations);
+    gradient::solve(rgb, size[0], &equations);
 }
 
 /// The surface that a pixel shows where other views look through the point that its site has: of those near it that lie farther, and that

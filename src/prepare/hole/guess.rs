@@ -22,7 +22,7 @@ const CHART: f64 = 960.0;
 /// Least margin of a chart around what is to be filled, pixels.
 const MARGIN: f64 = 48.0;
 /// Margin of a chart on each side, as a multiple of the extent of what is to be filled.
-const AROUND: f64 = 1.5;
+pub const AROUND: f64 = 1.5;
 /// A chart ends where the plane is this many times as far as in the middle of what is to be filled.
 const FARTHEST: f64 = 4.0;
 /// Other views that a chart is filled from.
@@ -198,7 +198,7 @@ pub fn thick(wanted: &[bool], [w, h]: [u32; 2]) -> Vec<bool> {
 }
 
 /// Goes on smoothly with the colours around what nothing tells.
-fn smooth(filling: &mut Filling, size: [usize; 2]) {
+pub fn smooth(filling: &mut Filling, size: [usize; 2]) {
     for c in 0..3 {
         let value = |(rgb, guessed): (&[f32; 3], &bool)| if *guessed { f32::NAN } else { rgb[c] };
         let mut channel: Vec<f32> = filling.rgb.iter().zip(&filling.guessed).map(value).collect();
@@ -209,7 +209,7 @@ fn smooth(filling: &mut Filling, size: [usize; 2]) {
 }
 
 /// The colour at a place of a chart; nothing where the nearest texel has none.
-fn texel(texture: &Texture, wanted: &[bool], place: [f64; 2]) -> Option<[f32; 3]> {
+pub fn texel(texture: &Texture, wanted: &[bool], place: [f64; 2]) -> Option<[f32; 3]> {
     let [w, h] = texture.size;
     let at = |x: i64, y: i64| {
         let inside = x >= 0 && y >= 0 && (x as usize) < w && (y as usize) < h;
@@ -381,7 +381,7 @@ fn in_picture(filling: &mut Filling, size: [usize; 2], wanted: &[bool], surface:
 }
 
 /// The pixels of the surroundings of some, and their texture: each one's colour, whether it is to be filled, and whether it may be copied.
-fn around(
+pub fn around(
     of: &[usize],
     size: [usize; 2],
     color: impl Fn(usize) -> [f32; 3],

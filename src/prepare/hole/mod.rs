@@ -28,6 +28,7 @@ mod lines;
 mod material;
 mod regions;
 mod relief;
+pub mod repaint;
 mod residue;
 mod similar;
 mod support;
@@ -103,6 +104,13 @@ pub struct Task<'a> {
 /// Where a view's reference picture is, below the scene's folder.
 pub fn reference_path(view: &str) -> String {
     format!("reference/{view}.png")
+}
+
+/// Where the depth of what views show without the object is, below the scene's folder: as `reference/NAME_depth.npy`.
+pub(super) const BEHIND: &str = "prepare/behind/";
+
+fn behind_path(view: &str) -> String {
+    format!("{BEHIND}{view}.npy")
 }
 
 /// Pixels that are this part of a mask's longer side.
@@ -227,6 +235,9 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
                     &picture,
                     "the surface behind the object, filled once for all views",
                 );
+                let camera = &task.scene.train[i].camera;
+                let depth = known_depth(&sights.0[i], camera, task.scene.unit);
+                batch.npy(behind_path(name), camera.size, depth, "depth of the surface behind the object");
             }
             if made.contains(&true) {
                 filled.push((i, Filled::new(&sights.0[i], filling.rgb, made)));
@@ -267,6 +278,14 @@ fn painted(task: &Task<'_>, i: usize, hole: &GrayImage, filling: &mut Filling) -
 fn as_exposed(task: &Task<'_>, i: usize, rgb: &[[f32; 3]]) -> Vec<[f32; 3]> {
     let gain = task.fine.gains.get(i).copied().unwrap_or([1.0; 3]);
     rgb.iter().map(|color| std::array::from_fn(|c| color[c] * gain[c] as f32)).collect()
+}
+
+/// A filled picture as large as its photograph.
+fn enlarged_to(filled: RgbImage, full: [u32; 2]) -> RgbImage {
+    if filled.dimensions() == (full[0], full[1]) {
+        return filled;
+    }
+    image::imageops::resize(&filled, full[0], full[1], image::imageops::FilterType::CatmullRom)
 }
 
 /// `[view][site of the hole]` whether other photographs show what is there, of these views.
@@ -341,12 +360,7 @@ fn of_reference(
     let full = [picture.width(), picture.height()];
     let bytes = as_exposed(task, of, &filling.rgb);
     let bytes = bytes.as_flattened().iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-    let filled = RgbImage::from_raw(size[0], size[1], bytes).expect("a colour per pixel");
-    let large = if full == size {
-        filled
-    } else {
-        image::imageops::resize(&filled, full[0], full[1], image::imageops::FilterType::CatmullRom)
-    };
+    let large = enlarged_to(RgbImage::from_raw(size[0], size[1], bytes).expect("a colour per pixel"), full);
     let hole = resample::nearest(&photograph.hole, full);
     let mut provenance = RgbImage::new(full[0], full[1]);
     let mut counts = [0u64; 2];

@@ -448,7 +448,7 @@ fn along(texture: &mut Texture, found: &[(Line, f64, [Piece; 2])]) {
 }
 
 /// Copies pixels and joins them with each other and with what is around them.
-fn paste(texture: &mut Texture, copied: &[Option<usize>]) {
+pub fn paste(texture: &mut Texture, copied: &[Option<usize>]) {
     for (i, from) in copied.iter().enumerate() {
         if let Some(from) = from {
             texture.rgb[i] = texture.rgb[*from];
