@@ -709,7 +709,7 @@ impl Preparation<'_> {
         let seed = self.request.seed;
         let inputs = repaint::inputs(self.folder, &repaints, seed);
         let is_new = repaints.is_empty() && !self.folder.record().steps.contains_key(Step::Repaint.name());
-        if is_new || self.skips(Step::Repaint, &inputs)? {
+        if is_new || !repaint::is_undone(self.folder)? && self.skips(Step::Repaint, &inputs)? {
             return Ok(());
         }
         self.watch.begin(Step::Repaint, scene.train.len() as u64);

@@ -8,6 +8,7 @@
 
 mod list;
 pub mod objects;
+pub mod repaint;
 pub mod site;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -145,6 +146,7 @@ struct State {
     asked: BTreeSet<usize>,
     /// Counts the removals that have ended.
     removals: u64,
+    painting: repaint::Painting,
     problems: Vec<String>,
     error: Option<String>,
 }
@@ -159,6 +161,8 @@ pub enum Wish {
     Remove(bool),
     /// This view is to be drawn without the object.
     Draw(usize),
+    /// Something is to be repainted.
+    Repaint(repaint::Repainting),
 }
 
 /// A view, a version of its mask, and that.
@@ -172,13 +176,20 @@ pub struct Results {
     before: BTreeMap<usize, PathBuf>,
     /// Those that were drawn, as JPEG.
     after: BTreeMap<usize, Vec<u8>>,
+    /// The scene, and the views whose holes are filled there.
+    filled: Option<(PathBuf, BTreeSet<usize>)>,
 }
 
 impl Results {
     /// The page that shows the scene, the files to take away by name, and the scene's photographs of the views that can be drawn
     /// without the object.
     pub fn new(page: Vec<Resource>, files: Vec<(String, PathBuf)>, before: BTreeMap<usize, PathBuf>) -> Self {
-        Self { page: page.into_iter().map(Arc::new).collect(), files, before, after: BTreeMap::new() }
+        Self { page: page.into_iter().map(Arc::new).collect(), files, before, ..Self::default() }
+    }
+
+    /// With the scene, in which these views have holes that are filled.
+    pub fn filled(self, scene: PathBuf, views: BTreeSet<usize>) -> Self {
+        Self { filled: Some((scene, views)), ..self }
     }
 }
 
@@ -561,6 +572,7 @@ impl Session {
         let mut state = self.lock();
         (state.phase, state.part) = (Phase::Done, None);
         state.removals += 1;
+        state.trained();
     }
 
     /// A view without the object; where it cannot be drawn, it is not asked for again.
@@ -637,10 +649,14 @@ impl Session {
     pub fn wish(&self, patience: Duration) -> Wish {
         let state = self.lock();
         let idle = |state: &mut State| {
-            state.wanted.is_none() && state.asked.is_empty() && (state.carried == state.revision || !state.ready)
+            let asked = state.wanted.is_some() || state.painting.wanted.is_some() || !state.asked.is_empty();
+            !asked && (state.carried == state.revision || !state.ready)
         };
         let (mut state, _) =
             self.changed.wait_timeout_while(state, patience, idle).unwrap_or_else(PoisonError::into_inner);
+        if let Some(what) = state.painting.wanted.take() {
+            return Wish::Repaint(what);
+        }
         if let Some(despite) = state.wanted.take() {
             return Wish::Remove(despite);
         }

@@ -286,7 +286,7 @@ function lay(element, [x0, y0, x1, y1]) {
   Object.assign(element.style, { left: `${100 * x0}%`, top: `${100 * y0}%`, width: `${100 * (x1 - x0)}%`, height: `${100 * (y1 - y0)}%` });
 }
 
-const mode = () => document.querySelector('input[name=mode]:checked').value;
+const mode = () => repaints() ? (takes() ? 'take' : 'brush') : document.querySelector('input[name=mode]:checked').value;
 const HINTS = {
   lasso: 'Lasso: drag a rough line around the object. Good for any shape.',
   box: 'Box: drag from corner to corner, closely around the object. Good for what is upright.',
@@ -296,7 +296,8 @@ const HINTS = {
   erase: 'Erase: paint over what is too much. It counts exactly as it is painted.',
 };
 // Half of the brush's width, of the photograph's longer side.
-const radius = () => 0.0015 * Math.exp(Number($('radius').value) * 0.04);
+const thickness = () => $(repaints() ? 'thickness' : 'radius');
+const radius = () => 0.0015 * Math.exp(Number(thickness().value) * 0.04);
 const round = (p) => p.map((v) => Math.round(v * 1e4) / 1e4);
 
 // A line of so many corners at most, none nearer to the next than is seen.
@@ -306,14 +307,14 @@ function thinned(points, most = 200) {
   return kept.filter((_, i) => i % every === 0 || i === kept.length - 1).map(round);
 }
 
-function line(points, kind) {
+function line(points, kind, reach = radius()) {
   const path = document.createElementNS('http://www.w3.org/2000/svg', 'path');
   const shut = kind === 'lasso' ? 'Z' : points.length === 1 ? `L${points[0].join(' ')}` : '';
   path.setAttribute('d', `M${points.map((p) => p.join(' ')).join('L')}${shut}`);
   path.setAttribute('class', kind);
   if (kind !== 'lasso') {
     const [w, h] = view().size;
-    path.style.strokeWidth = `${2 * radius() * $('picture').getBoundingClientRect().width * Math.max(1, h / w)}px`;
+    path.style.strokeWidth = `${2 * reach * $('picture').getBoundingClientRect().width * Math.max(1, h / w)}px`;
   }
   return path;
 }
@@ -328,7 +329,7 @@ function sketch(points, kind) {
 }
 
 function ring(event) {
-  const paints = ['brush', 'erase'].includes(mode()) && event && event.pointerType !== 'touch' && state?.phase === 'choosing';
+  const paints = ['brush', 'erase'].includes(mode()) && event && event.pointerType !== 'touch' && (state?.phase === 'choosing' || repaints());
   $('ring').hidden = !paints;
   if (!paints) return;
   const [w, h] = view().size, [x, y] = at(event);
@@ -346,7 +347,7 @@ stage.addEventListener('pointerdown', (e) => {
     pointers.set(e.pointerId, [e.clientX, e.clientY]);
     divide(at(e)[0]);
   }
-  if (state?.phase === 'working' || (state?.phase === 'done' && !changing)) return;
+  if (state?.phase === 'working' || (state?.phase === 'done' && !changing && !repaints())) return;
   stage.focus();
   stage.setPointerCapture(e.pointerId);
   pointers.set(e.pointerId, [e.clientX, e.clientY]);
@@ -359,7 +360,7 @@ stage.addEventListener('pointerdown', (e) => {
   } else if (pointers.size === 1) {
     const clicks = ['object', 'background'].includes(mode());
     const pans = e.button === 1 || (e.pointerType === 'touch' && clicks);
-    const kind = clicks ? 'box' : mode();
+    const kind = clicks ? 'box' : repaints() && (e.button === 2 || e.shiftKey) ? 'take' : mode();
     drag = { kind, from: at(e), points: [clip(at(e))], start: [e.clientX, e.clientY], last: [e.clientX, e.clientY], pans, other: e.button === 2 || e.shiftKey, moved: false };
   }
   e.preventDefault();
@@ -389,7 +390,8 @@ stage.addEventListener('pointermove', (e) => {
     shift = [shift[0] + e.clientX - drag.last[0], shift[1] + e.clientY - drag.last[1]];
     drag.last = [e.clientX, e.clientY];
     place();
-  } else if (drag.kind === 'box') {
+  } else if (drag.kind === 'take') takeFrom(drag.from, at(e));
+  else if (drag.kind === 'box') {
     $('rubber').hidden = false;
     lay($('rubber'), bounds(clip(drag.from), clip(at(e))));
   } else {
@@ -409,6 +411,10 @@ function lifted(e, counts) {
   $('rubber').hidden = true;
   sketch();
   if (!done || !counts) return;
+  if (done.kind === 'take') {
+    if (!done.moved && !done.pans) takeFrom(done.from, strokes.length ? middle() : done.from);
+    return;
+  }
   const paints = ['brush', 'erase'].includes(done.kind) && e.button !== 1;
   if (paints && within(done.from)) stroke(done.kind, done.points);
   else if (done.moved && !done.pans && done.kind === 'box') enclose('box', [done.from, at(e)]);
@@ -420,7 +426,7 @@ function lifted(e, counts) {
 }
 
 function stroke(kind, points) {
-  add({ kind: 'brush', object: kind === 'brush', radius: Math.round(radius() * 1e5) / 1e5, points: thinned(points) });
+  (repaints() ? brushed : add)({ kind: 'brush', object: kind === 'brush', radius: Math.round(radius() * 1e5) / 1e5, points: thinned(points) });
 }
 
 // What has no inside is nothing.
@@ -476,12 +482,17 @@ async function fetchAfter(key, source) {
   }
 }
 
-function compare(on) {
-  document.body.dataset.look = on ? 'compare' : '';
-  if (on && !state.compare.includes(current)) current = order.find((name) => state.compare.includes(name));
+// The views that can be shown.
+const offered = () => compares() ? state.compare : repaints() ? state.filled : order;
+
+function compare(look) {
+  const on = look === 'compare';
+  document.body.dataset.look = look;
+  if (look && !offered().includes(current)) current = order.find((name) => offered().includes(name));
   const image = $('after'), key = on ? `${current} ${state.removals}` : '';
   const source = (path) => url(path, current, `&v=${state.removals}`);
-  const photo = on ? source('before.jpg') : url('photo.jpg', current);
+  const filled = () => url('filled.jpg', current, `&v=${state.removals}-${state.painting.count}`);
+  const photo = on ? source('before.jpg') : look ? filled() : url('photo.jpg', current);
   if ($('photo').getAttribute('src') !== photo) {
     $('photo').src = photo;
     $('photo').alt = `Photograph ${current}`;
@@ -514,9 +525,27 @@ function crosshair() {
 }
 
 function step(by) {
-  const all = compares() ? order.filter((name) => state.compare.includes(name)) : order;
+  const all = order.filter((name) => offered().includes(name));
   const i = all.indexOf(current);
   if (all.length) show(all[(i + by + all.length) % all.length], true);
+}
+
+// Keys that serve to mark and to repaint: whether it was one.
+function free(e, arrows) {
+  if (arrows && e.shiftKey) {
+    const [w, h] = view().size;
+    const far = (e.altKey ? 0.002 : 0.02) * Math.max(w, h);
+    cross = clip(cross ? cross.map((v, i) => v + arrows[i] * far / (i ? h : w)) : [0.5, 0.5]);
+    crosshair();
+  } else if (arrows && arrows[0]) step(arrows[0]);
+  else if (e.key === '[' || e.key === ']') thickness().value = Number(thickness().value) + (e.key === ']' ? 5 : -5);
+  else if (e.key === 'Escape') { cross = corner = drag = undefined; corners = []; $('rubber').hidden = true; crosshair(); }
+  else if (e.key === '+' || e.key === '=') magnify(1.4);
+  else if (e.key === '-') magnify(1 / 1.4);
+  else if (e.key === '0') { zoom = 1; place(); }
+  else return false;
+  e.preventDefault();
+  return true;
 }
 
 addEventListener('keydown', (e) => {
@@ -525,15 +554,15 @@ addEventListener('keydown', (e) => {
   const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[e.key];
   const onButton = e.target.closest?.('button') && !e.target.closest('.thumb');
   if (command && compares()) return;
+  if (repaints()) {
+    if (paintKey(e, command)) e.preventDefault();
+    else if (!command) free(e, arrows);
+    return;
+  }
   if (command && e.key.toLowerCase() === 'z') (e.shiftKey ? redo : undo)();
   else if (command && e.key.toLowerCase() === 'y') redo();
   else if (command || (compares() && !(arrows?.[0] && !e.shiftKey) && !'+=-0'.includes(e.key))) return;
-  else if (arrows && e.shiftKey) {
-    const [w, h] = view().size;
-    const far = (e.altKey ? 0.002 : 0.02) * Math.max(w, h);
-    cross = clip(cross ? cross.map((v, i) => v + arrows[i] * far / (i ? h : w)) : [0.5, 0.5]);
-    crosshair();
-  } else if (arrows && arrows[0]) step(arrows[0]);
+  else if (free(e, arrows)) return;
   else if (e.key === 'Enter' && cross && !onButton && document.activeElement === stage) add({ kind: e.shiftKey ? 'background' : 'object', at: cross });
   else if ((e.key === 'Backspace' || e.key === 'Delete') && cross) add({ kind: 'background', at: cross });
   else if (e.key.toLowerCase() === 'b' && cross) {
@@ -548,12 +577,7 @@ addEventListener('keydown', (e) => {
   else if (e.key.toLowerCase() === 'o' && !['working', 'done'].includes(document.body.dataset.phase)) {
     if (e.shiftKey) another();
     else choose(state.objects[(placeOf(object) + 1) % state.objects.length].number);
-  } else if (e.key === '[' || e.key === ']') $('radius').value = Number($('radius').value) + (e.key === ']' ? 5 : -5);
-  else if (e.key === 'PageUp' || e.key === 'PageDown') resize(e.key === 'PageUp' ? 1 : -1);
-  else if (e.key === 'Escape') { cross = corner = drag = undefined; corners = []; $('rubber').hidden = true; crosshair(); }
-  else if (e.key === '+' || e.key === '=') magnify(1.4);
-  else if (e.key === '-') magnify(1 / 1.4);
-  else if (e.key === '0') { zoom = 1; place(); }
+  } else if (e.key === 'PageUp' || e.key === 'PageDown') resize(e.key === 'PageUp' ? 1 : -1);
   else return;
   e.preventDefault();
 });
@@ -621,6 +645,7 @@ function show(name, focus) {
   if (!view(name)) return;
   if (name !== current) {
     current = name;
+    unbrush();
     zoom = 1;
     cross = corner = undefined;
     corners = [];
@@ -659,19 +684,22 @@ function draw() {
   $('title').textContent = done ? gone : `Remove ${what} from ${state.title}`;
   document.title = `${state.title}: ${done ? gone.toLowerCase() : `remove ${what}`}`;
   const busy = waiting.has(keyOf(current, object)) || v?.busy;
-  const compared = done && state.compare.length > 0 && document.querySelector('input[name=look]:checked').value === 'compare';
-  const drawing = compare(compared);
+  const look = done && state.compare.length ? document.querySelector('input[name=look]:checked').value : 'around';
+  const compared = look === 'compare';
+  const drawing = compare(look === 'around' ? '' : look);
+  drawRepaint(repaints());
   $('looks').hidden = !done || !state.compare.length;
-  $('thinking').hidden = !(drawing || (busy && !working && !done));
-  $('thinking').textContent = drawing ? 'drawing it without the object' : 'finding the outline';
+  const paintBusy = done && state.painting.busy;
+  $('thinking').hidden = !(drawing || paintBusy || (busy && !working && !done));
+  $('thinking').textContent = paintBusy ? 'repainting' : drawing ? 'drawing it without the object' : 'finding the outline';
   $('name').textContent = several() && !working && !done ? `${named()} in ${current}` : current ?? '';
-  $('name').hidden = done && !compared;
+  $('name').hidden = done && look === 'around';
   if (v) {
     const key = v.overlay ? `${v.name} ${v.overlay}` : '';
     overlay($('overlay'), url('overlay.png', v.name, `&v=${v.overlay}`), working || done ? '' : key);
     const shown = working || done ? [] : marksOf();
     const sketched = $('lines').querySelector('.sketch');
-    $('lines').replaceChildren(...shown.filter((m) => m.kind === 'lasso').map((m) => line(m.points, 'lasso')), ...(sketched ? [sketched] : []));
+    $('lines').replaceChildren(...shown.filter((m) => m.kind === 'lasso').map((m) => line(m.points, 'lasso')), ...(repaints() ? painted() : []), ...(sketched ? [sketched] : []));
     $('marks').replaceChildren(...shown.filter((m) => m.at || m.bounds).map((m) => {
       const element = document.createElement(m.kind === 'box' ? 'b' : 'i');
       if (m.kind === 'box') lay(element, m.bounds);
@@ -699,6 +727,7 @@ function draw() {
   const more = kept.length ? ` What is not ticked is still there: tick ${kept.join(' or ')} to remove that as well.` : '';
   const advice = working ? 'You can leave this page open or close it: the work goes on, and this page finds it again.'
     : compared ? 'The photograph is on the left, the scene without the object on the right: drag across the picture or use the slider. Arrow keys and the pictures below show it from elsewhere.'
+    : repaints() ? `Where a hole is filled wrong, brush over it and press Repaint: it is filled anew from what is around it, in all photographs. For a patch from elsewhere take “Take from” and drag from there onto it${touch ? '' : ', or hold Shift'}.`
     : done ? `Look around: drag turns, the wheel goes nearer, the slider shows the photograph.${more}`
     : state.problems.length ? 'Something speaks against going on. Mend what is named, or go on anyway.'
     : empty ? `Nothing was found there. Draw a line around the object, or ${click} in the middle of it.`
@@ -739,7 +768,7 @@ function draw() {
   const shows = $('viewer').hasAttribute('src');
   if (done && !shows) $('viewer').src = 'result/?noui';
   if (!done && shows) $('viewer').removeAttribute('src');
-  $('viewer').hidden = !done || compared;
+  $('viewer').hidden = !done || look !== 'around';
   $('files').hidden = !done;
   if (done && $('files').childElementCount !== state.files.length) {
     $('files').replaceChildren(...state.files.map((file) => {
@@ -755,7 +784,7 @@ function draw() {
   for (const o of state.views) {
     const thumb = thumbs.get(o.name);
     thumb.button.setAttribute('aria-current', o.name === current);
-    thumb.button.hidden = compared && !state.compare.includes(o.name);
+    thumb.button.hidden = !offered().includes(o.name);
     const key = o.overlay ?? '';
     if (key !== thumb.key) {
       thumb.key = key;
@@ -854,5 +883,6 @@ async function watch() {
   setTimeout(watch, 1000);
 }
 
+setUpRepaint();
 poll();
 watch();

@@ -18,6 +18,7 @@ use crate::view::server::{Answer, Body, Refusal, Resource, Site};
 const PAGE: &str = include_str!("page.html");
 const STYLE: &str = include_str!("page.css");
 const PROGRAM: &str = include_str!("page.js");
+const REPAINT: &str = include_str!("repaint.js");
 /// Width of a thumbnail, pixels.
 const THUMB: u32 = 240;
 /// Colours of a mask's inside and rim.
@@ -226,6 +227,11 @@ impl Session {
         field(query, "view").and_then(|name| self.number(&name)).ok_or(Refusal::NotFound)
     }
 
+    /// The photograph of this name.
+    pub(super) fn view(&self, name: &str) -> Result<usize, Refused> {
+        self.number(name).ok_or_else(|| (Refusal::NotFound, format!("no photograph is called {name:?}")))
+    }
+
     /// A photograph at another size.
     fn decoded(&self, path: &Path, size: [u32; 2]) -> Result<image::RgbImage, scene::Error> {
         // Large photographs are decoded one at a time.
@@ -261,11 +267,13 @@ impl Session {
 
     /// The state as the page reads it. That of the views is made when it changes, not when it is asked for.
     pub(super) fn status(&self) -> String {
-        let (files, compare): (Vec<_>, Vec<_>) = {
+        let (files, compare, filled): (Vec<_>, Vec<_>, Vec<_>) = {
             let results = read(&self.results);
             let size = |path: &Path| std::fs::metadata(path).map_or(0, |file| file.len());
             let files = results.files.iter().map(|(name, path)| json!({ "name": name, "bytes": size(path) })).collect();
-            (files, results.before.keys().map(|number| self.photos[*number].name.as_str()).collect())
+            let name = |number: &usize| self.photos[*number].name.as_str();
+            let filled = results.filled.iter().flat_map(|(_, views)| views).map(name);
+            (files, results.before.keys().map(name).collect(), filled.collect())
         };
         let steps = read(&self.live).as_ref().map(|board| board.steps().map(u64::from));
         let (views, status) = {
@@ -289,7 +297,7 @@ impl Session {
                 "of": views.next.as_ref().map(|(.., object)| object),
                 "problems": state.problems, "error": state.error,
                 "live": steps.is_some() && state.phase == Phase::Working, "files": files,
-                "compare": compare, "removals": state.removals,
+                "compare": compare, "removals": state.removals, "filled": filled, "painting": state.painting(),
             });
             (views, status)
         };
@@ -329,6 +337,7 @@ impl Site for Session {
             "/" => Ok(text("text/html; charset=utf-8", PAGE)),
             "/page.css" => Ok(text("text/css", STYLE)),
             "/page.js" => Ok(text("text/javascript", PROGRAM)),
+            "/repaint.js" => Ok(text("text/javascript", REPAINT)),
             "/api/state" => Ok(owned("application/json", self.status().into_bytes())),
             "/photo.jpg" => {
                 let number = self.named(query)?;
@@ -340,6 +349,10 @@ impl Site for Session {
                 let path = read(&self.results).before.get(&number).cloned().ok_or(Refusal::NotFound)?;
                 let picture = self.decoded(&path, working(self.photos[number].size));
                 Ok(owned("image/jpeg", jpeg(&picture.map_err(|_| Refusal::NotFound)?, 90)?))
+            }
+            "/filled.jpg" => {
+                let filled = self.filled(self.named(query)?).ok_or(Refusal::NotFound)?;
+                Ok(owned("image/jpeg", jpeg(&filled, 92)?))
             }
             "/after.jpg" => Ok(owned("image/jpeg", self.after(self.named(query)?)?)),
             "/thumb.jpg" => Ok(owned("image/jpeg", self.thumbnail(self.named(query)?)?)),
@@ -363,12 +376,10 @@ impl Site for Session {
         match path {
             "/api/marks" => {
                 let Marked { object, view, marks } = parsed(body)?;
-                let number = self
-                    .number(&view)
-                    .ok_or_else(|| (Refusal::NotFound, format!("no photograph is called {view:?}")))?;
-                self.mark(object, number, marks)?;
+                self.mark(object, self.view(&view)?, marks)?;
             }
             "/api/objects" => self.change(parsed::<Change>(body)?)?,
+            "/api/repaint" => self.repaint(parsed(body)?)?,
             "/api/remove" => self.remove(parsed::<Removed>(body)?.despite)?,
             "/api/stop" => {
                 parsed::<serde_json::Map<String, serde_json::Value>>(body)?;

@@ -4,6 +4,7 @@ use std::net::{SocketAddr, TcpStream};
 use image::{Luma, Rgb};
 use serde_json::{Value, json};
 
+use super::repaint::Repainting;
 use super::*;
 use crate::scene::doctor::iou;
 use crate::view::server::{self, Secret};
@@ -276,6 +277,7 @@ fn nonsense_is_refused_in_a_sentence() {
     let (status, _) = send("/api/marks", &format!("{}{}", " ".repeat(1 << 19), CLICK));
     assert_eq!(status, 413);
     assert_eq!(send("/api/other", "{}").0, 404);
+    assert_eq!(send("/api/repaint", r#"{"undo":{}}"#), (409, "remove the object first\n".into()));
     let (status, said) = send("/api/remove", "{}");
     assert_eq!((status, said.as_str()), (409, "nothing is marked yet; draw around what is to be removed\n"));
     assert_eq!(state(address)["revision"], 1);
@@ -421,6 +423,38 @@ fn views_without_the_object_are_drawn_when_they_are_looked_at() {
     assert!(matches!(session.wish(Duration::ZERO), Wish::Remove(false)));
     assert_eq!(get(address, "/after.jpg?view=b").0, 404);
     assert!(matches!(session.wish(Duration::ZERO), Wish::Nothing));
+}
+
+/// Once the object is gone a part is repainted at a time, and the page is told what came of it until the scene is trained again.
+#[test]
+fn a_part_is_repainted_at_a_time() {
+    let place = Place::new();
+    let session = place.open();
+    let address = serve(&session);
+    session.done(Results::default());
+    let stroke = r#"{"kind":"brush","object":true,"radius":0.1,"points":[[0.5,0.5]]}"#;
+    let paint = |strokes: &str, offset: &str| {
+        let body = format!(r#"{{"paint":{{"view":"a","strokes":[{strokes}],"offset":{offset}}}}}"#);
+        post(address, "/api/repaint", &body).0
+    };
+    let erase = stroke.replace("true", "false");
+    let bad = [("", "null"), (erase.as_str(), "null"), (stroke, "[0.1,1.5]")];
+    assert!(bad.iter().all(|(strokes, offset)| paint(strokes, offset) == 400));
+    assert_eq!((paint(stroke, "[-0.5,0]"), paint(stroke, "null")), (200, 409), "one at a time");
+    let Wish::Repaint(Repainting::Paint(0, brush, offset)) = session.wish(Duration::ZERO) else { panic!("no wish") };
+    let ([w, h], count) = (photograph().dimensions().into(), brush.as_raw().iter().filter(|v| **v != 0).count());
+    assert_eq!((brush.dimensions(), offset), ((w, h), Some([-(w as i32) / 2, 0])));
+    let disc = std::f64::consts::PI * (0.1 * f64::from(w.max(h))).powi(2);
+    assert!((count as f64 / disc - 1.0).abs() < 0.1, "{count} of {disc}");
+    session.repainted(Some("beside the hole".into()));
+    let told = || state(address)["painting"].clone();
+    assert_eq!(told(), json!({ "busy": false, "count": 0, "untrained": false, "refused": "beside the hole" }));
+    assert_eq!(post(address, "/api/repaint", r#"{"undo":{}}"#).0, 200);
+    assert!(matches!(session.wish(Duration::ZERO), Wish::Repaint(Repainting::Undo)));
+    session.repainted(None);
+    assert_eq!(told(), json!({ "busy": false, "count": 1, "untrained": true, "refused": null }));
+    session.done(Results::default());
+    assert_eq!(told()["untrained"], json!(false));
 }
 
 /// The bytes of all files in a folder and the folders below it, by their path.

@@ -2,10 +2,12 @@
 // remove.mjs CHROMIUM URL PICTURES X,Y X,Y,... where the positions, 0 to 1, are clicked in the photograph that is shown; what
 // it sees goes into the folder PICTURES. Prints JSON: the masks' shares of two photographs, the files' sizes, and pictures of
 // two views without the object.
+import { repaint } from './repaint.mjs';
 import { visit } from './visit.mjs';
 
 const [chromium, url, pictures, ...clicks] = process.argv.slice(2);
-const { browser, page, problems, shoot, until, server, click, carried, remove, fail } = await visit(chromium, url, pictures);
+const visited = await visit(chromium, url, pictures);
+const { browser, page, problems, shoot, until, server, click, carried, remove, fail } = visited;
 try {
   await shoot('open');
   for (const [i, place] of clicks.entries()) {
@@ -40,6 +42,7 @@ try {
   await frame.waitForFunction(() => document.documentElement.dataset.state, { timeout: 60_000 });
   await new Promise((resolve) => setTimeout(resolve, 1500));
   await shoot('done');
+  await repaint(visited, marked, clicks[0].split(',').map(Number));
   // Before and after, at two cameras, by the keys and by the mouse.
   const named = () => page.evaluate(() => document.getElementById('name').textContent);
   const split = () => page.evaluate(() => Number(getComputedStyle(document.getElementById('picture')).getPropertyValue('--split')));

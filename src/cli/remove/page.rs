@@ -18,12 +18,14 @@ use crate::cli::train::{self, Stop};
 use crate::cli::{shared, view};
 use crate::gpu::Gpu;
 use crate::model::stored::Stored;
-use crate::prepare::Fitted;
 use crate::prepare::depth::DepthMap;
 use crate::prepare::fit::Fit;
+use crate::prepare::hole::repaint;
 use crate::prepare::masks::{self, Shares, Votes};
 use crate::prepare::poses::Capture;
 use crate::prepare::splats::Splats;
+use crate::prepare::{self, Fitted, Request, Silent, Step};
+use crate::remove::repaint::Repainting;
 use crate::remove::{Masked, Results, Session, Wish, objects};
 use crate::render::view::Renderer;
 use crate::scene::doctor::{Finding, Report, Severity};
@@ -136,6 +138,11 @@ fn attend(job: &Job<'_>, gpu: &Gpu, session: &Arc<Session>, capture: &Capture) -
                 }
                 session.drew(number, drawn.ok());
             }
+            Wish::Repaint(what) => {
+                let refused = repaint(job, gpu, session, what).err().map(|error| format!("{error:#}"));
+                refused.iter().for_each(|why| eprintln!("repaint: {why}"));
+                session.repainted(refused);
+            }
             Wish::Carry(revision, given) => carrier.carry(session, revision, &given)?,
             Wish::Remove(despite) => {
                 after = None;
@@ -167,9 +174,28 @@ fn remove(job: &Job<'_>, gpu: &Gpu, session: &Session, capture: &Capture, despit
     job.work(gpu, objects, despite, &Visitors(session), began)?;
     session.begin("page", 0);
     let page = view::page_of(&job.places.root).context("the object is gone, but it cannot be shown")?;
-    session.done(Results::new(page.resources(), job.places.files(), before(job, session)?));
+    let Places { scene, .. } = &job.places;
+    let before = before(job, session)?;
+    let has_hole = |number: &usize| repaint::has_hole(scene, &session.photos()[*number].name);
+    let filled = before.keys().copied().filter(has_hole).collect();
+    session.done(Results::new(page.resources(), job.places.files(), before).filled(scene.clone(), filled));
     job.say(&names);
     Ok(())
+}
+
+/// Repaints a part of the scene's holes, or takes the last one back.
+fn repaint(job: &Job<'_>, gpu: &Gpu, session: &Session, what: Repainting) -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let repaint = match what {
+        Repainting::Undo => repaint::Wish::Undo,
+        Repainting::Paint(number, mask, offset) => {
+            let (view, brush) = (session.photos()[number].name.clone(), folder.path().join("brush.png"));
+            mask.save(&brush)?;
+            repaint::Wish::Another(repaint::Repaint { view, brush, offset })
+        }
+    };
+    let request = Request { only: vec![Step::Repaint], repaint, ..job.request(vec![]) };
+    Ok(prepare::prepare(gpu, &request, &mut Silent)?)
 }
 
 /// The scene's photographs of the views that the trained model can be drawn at; none where nothing was trained.

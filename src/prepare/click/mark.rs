@@ -188,6 +188,13 @@ impl Mark {
         all
     }
 
+    /// What strokes of brushes cover of a picture of this size.
+    pub fn brushed(strokes: &[Self], [w, h]: [u32; 2]) -> GrayImage {
+        let (mut mask, picture) = (GrayImage::new(w, h), RgbImage::new(w, h));
+        strokes.iter().for_each(|stroke| stroke.hold(&mut mask, &picture, strokes));
+        mask
+    }
+
     /// What it says of a mask for certain, made so.
     pub(super) fn hold(&self, mask: &mut GrayImage, picture: &RgbImage, marks: &[Self]) {
         let object = match self {

@@ -450,6 +450,23 @@ pub(in crate::prepare) fn inputs(folder: &Folder, repaints: &Brushed, seed: u64)
     repaints.iter().fold(inputs, one).finish()
 }
 
+/// Whether the hole was made anew since it was repainted.
+///
+/// # Errors
+/// A file that cannot be read.
+pub(in crate::prepare) fn is_undone(folder: &Folder) -> Result<bool, Error> {
+    let painted: BTreeMap<_, _> = folder.made(Step::Repaint).collect();
+    for (path, made) in
+        folder.made(Step::Reference).filter(|(path, made)| painted.get(path).is_some_and(|p| p.hash != made.hash))
+    {
+        let file = folder.root().join(path);
+        if file.is_file() && record::hash(&file)? == made.hash {
+            return Ok(true);
+        }
+    }
+    Ok(false)
+}
+
 impl Task<'_> {
     /// Where a file of the hole is as it was made; nothing where it was changed by hand.
     fn base(&self, path: &str) -> Result<Option<PathBuf>, Error> {
