@@ -419,7 +419,7 @@ fn repaints_are_kept_and_taken_back() {
     }
     let first = format!("--repaint {view}=brush.png");
     let said = done(&first);
-    assert!(said.contains("1 parts of holes are made anew by hand"), "{said}");
+    assert!(said.contains("repaint: 1 made by hand, seen in "), "{said}");
     let once = files();
     let changed =
         |name: &str| once[0][&PathBuf::from(format!("{name}.png"))] != before[0][&PathBuf::from(format!("{name}.png"))];

@@ -10,6 +10,7 @@
 //! - `color`: what photographs show of it, and what views that were filled before show of it (`relief`).
 //! - `guess`: what nobody shows is filled with pieces of the same surface, seen straight on (`texture`), lines and straight
 //!   borders of what looks different first (`lines`, `regions`), or by a network.
+//! - [`repaint`]: what is filled wrong the user makes anew, for all views.
 //!
 //! One view is the reference: its picture goes to `reference/`, where a better one may take its place. All other views'
 //! holes are filled from the same surface, into `hole/`.
@@ -236,7 +237,7 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
                     "the surface behind the object, filled once for all views",
                 );
                 let camera = &task.scene.train[i].camera;
-                let depth = known_depth(&sights.0[i], camera, task.scene.unit);
+                let depth = known_depth(&sights.0[i], camera, task.scene.unit, |_| true);
                 batch.npy(behind_path(name), camera.size, depth, "depth of the surface behind the object");
             }
             if made.contains(&true) {
@@ -396,7 +397,7 @@ fn of_reference(
         batch.npy(
             format!("reference/{name}_depth.npy"),
             camera.size,
-            known_depth(&sights.0[of], camera, task.scene.unit),
+            known_depth(&sights.0[of], camera, task.scene.unit, |site| sights.0[of].grid.confirmed[site]),
             "depth measured between the photographs; in the hole that of the surface behind the object",
         );
     }
@@ -415,14 +416,14 @@ fn of_reference(
     Ok(())
 }
 
-/// `[pixel]` depth z of a view without the object at the size of a camera: in the hole that of its surface, elsewhere what
-/// other views confirm; NaN where they do not. In the model's units, of which the sight counts `unit` as one.
-fn known_depth(sight: &Sight, camera: &Camera, unit: f64) -> Vec<f32> {
+/// `[pixel]` depth z of a view without the object at the size of a camera: in the hole that of its surface, elsewhere that of sites
+/// that are `known`; NaN at others. In the model's units, of which the sight counts `unit` as one.
+fn known_depth(sight: &Sight, camera: &Camera, unit: f64, known: impl Fn(usize) -> bool + Sync) -> Vec<f32> {
     let w = camera.size[0] as usize;
     let one = |i: usize| {
         let place = sight.grid.place(camera.unproject([(i % w) as f64 + 0.5, (i / w) as f64 + 0.5])?);
         let site = sight.grid.site(place[0].floor() as i64, place[1].floor() as i64)?;
-        (sight.hole[site] || sight.grid.confirmed[site]).then(|| (sight.depth_at(place) * unit) as f32)
+        (sight.hole[site] || known(site)).then(|| (sight.depth_at(place) * unit) as f32)
     };
     (0..w * camera.size[1] as usize).into_par_iter().map(|i| one(i).unwrap_or(f32::NAN)).collect()
 }

@@ -5,6 +5,7 @@
 //! colour that it has there. Brushes lie in `prepare/repaint/`, holes as they were without them in `prepare/unpainted/`.
 
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -60,7 +61,7 @@ impl Default for Wish {
     }
 }
 
-/// A repaint as the record has it; its brush is in a file, see [`brush_path`].
+/// A repaint as the record has it; its brush lies in `prepare/repaint/`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Recorded {
     /// See [`Repaint::view`].
@@ -379,7 +380,7 @@ fn refill(texture: &mut Texture, seed: u64) {
     };
     let spared = |square: [usize; 2]| {
         let hash = blake3::hash(&[seed, square[0] as u64, square[1] as u64].map(u64::to_le_bytes).concat());
-        hash.as_bytes()[0] % 2 == 0 && !touches(square)
+        hash.as_bytes()[0] < 128 && !touches(square)
     };
     let squares = texture.size.map(|n| n.div_ceil(side));
     let spared: Vec<bool> = (0..squares[0] * squares[1]).map(|s| spared([s % squares[0], s / squares[0]])).collect();
@@ -519,6 +520,49 @@ impl Task<'_> {
         Ok(Opened { view, base })
     }
 
+    /// Makes a repaint of this number in the views that are open, after these: those that were painted in are.
+    fn paint(
+        &self,
+        open: &mut BTreeMap<usize, Opened>,
+        paints: &[Paint],
+        (number, (Recorded { view: name, offset }, brush)): (usize, &(Recorded, GrayImage)),
+    ) -> Result<Paint, Error> {
+        let at = self.scene.train.iter().position(|view| view.name == *name);
+        let at = at.ok_or_else(|| Error::Request(format!("{name}: the scene has no such view to repaint")))?;
+        let view = match open.entry(at) {
+            Entry::Occupied(there) => &mut there.into_mut().view,
+            Entry::Vacant(new) => {
+                let mut opened = self.open_to_paint(at)?;
+                paints.iter().for_each(|paint| opened.view.take(paint));
+                &mut new.insert(opened).view
+            }
+        };
+        let size @ [w, h] = view.camera.size.map(f64::from);
+        let small = resample::mask(brush, view.camera.size);
+        let brushed: Vec<bool> = small.as_raw().iter().zip(&view.hole).map(|(v, hole)| *v != 0 && *hole).collect();
+        let full = [brush.width(), brush.height()].map(f64::from);
+        let offset = offset.map(|by| [0, 1].map(|a| f64::from(by[a]) * size[a] / full[a]));
+        let is_patch = |i: usize| {
+            let [x, y] = view.camera.pixel_center(i);
+            offset.is_none_or(|by| (0.0..w).contains(&(x + by[0])) && (0.0..h).contains(&(y + by[1])))
+        };
+        if !brushed.contains(&true) {
+            let hole = hole_path(name);
+            return Err(Error::Request(format!(
+                "{name}: the brush is beside the hole; paint where {hole} is not transparent"
+            )));
+        }
+        if !(0..brushed.len()).any(|i| brushed[i] && is_patch(i)) {
+            let what = format!("{name}: the patch lies outside of the photograph; take it from within");
+            return Err(Error::Request(what));
+        }
+        view.paint(&brushed, offset, self.seed + number as u64 + 1);
+        let (camera, behind, gain) = (view.camera, view.behind.clone(), view.gain);
+        let paint = Paint { camera, behind, picture: view.picture(), brushed, gain };
+        open.iter_mut().filter(|(other, _)| **other != at).for_each(|(_, other)| other.view.take(&paint));
+        Ok(paint)
+    }
+
     /// Makes all repaints, of which so many were there before.
     ///
     /// # Errors
@@ -526,47 +570,15 @@ impl Task<'_> {
     pub fn make(&self, repaints: &Brushed, before: usize, watch: &mut dyn Watch) -> Result<Batch, Error> {
         let views = &self.scene.train;
         let mut batch = Batch::default();
-        let (mut open, mut paints): (BTreeMap<usize, Opened>, Vec<Paint>) = (BTreeMap::new(), vec![]);
-        for (number, (Recorded { view: name, offset }, brush)) in repaints.iter().enumerate() {
+        let (mut open, mut paints) = (BTreeMap::new(), vec![]);
+        for (number, repaint) in repaints.iter().enumerate() {
             watch.go_on()?;
-            batch.gray(brush_path(number), brush, format!("a brush in {name}"));
-            let refused = |what: String| if number < before { Ok(what) } else { Err(Error::Request(what)) };
-            let Some(at) = views.iter().position(|view| view.name == *name) else {
-                batch.notes.push(refused(format!("{name}: the scene has no such view to repaint"))?);
-                continue;
-            };
-            if let std::collections::btree_map::Entry::Vacant(vacant) = open.entry(at) {
-                match self.open_to_paint(at) {
-                    Err(Error::Request(what)) => {
-                        batch.notes.push(refused(what)?);
-                        continue;
-                    }
-                    opened => drop(vacant.insert(opened?)),
-                }
-            }
-            let view = &mut open.get_mut(&at).expect("it was just opened").view;
-            let size @ [w, h] = view.camera.size;
-            let small = resample::mask(brush, size);
-            let brushed: Vec<bool> = small.as_raw().iter().zip(&view.hole).map(|(v, hole)| *v != 0 && *hole).collect();
-            let full = [brush.width(), brush.height()];
-            let offset = offset.map(|by| [0, 1].map(|a| f64::from(by[a]) * f64::from(size[a]) / f64::from(full[a])));
-            let is_patch = |i: usize| {
-                let at = view.camera.pixel_center(i);
-                offset.is_none_or(|by| (0..2).all(|a| (0.0..f64::from([w, h][a])).contains(&(at[a] + by[a]))))
-            };
-            if !brushed.contains(&true) {
-                let what =
-                    format!("{name}: the brush is beside the hole; paint where {} is not transparent", hole_path(name));
-                batch.notes.push(refused(what)?);
-            } else if !(0..brushed.len()).any(|i| brushed[i] && is_patch(i)) {
-                let what = format!("{name}: the patch lies outside of the photograph; take it from within");
-                batch.notes.push(refused(what)?);
-            } else {
-                view.paint(&brushed, offset, self.seed + number as u64 + 1);
-                let (camera, behind, gain) = (view.camera, view.behind.clone(), view.gain);
-                let paint = Paint { camera, behind, picture: view.picture(), brushed, gain };
-                open.iter_mut().filter(|(other, _)| **other != at).for_each(|(_, other)| other.view.take(&paint));
-                paints.push(paint);
+            batch.gray(brush_path(number), &repaint.1, format!("a brush in {}", repaint.0.view));
+            match self.paint(&mut open, &paints, (number, repaint)) {
+                Ok(paint) => paints.push(paint),
+                // The hole may be another one than it was.
+                Err(Error::Request(what)) if number < before => batch.notes.push(what),
+                Err(error) => return Err(error),
             }
         }
         let mut changed: BTreeMap<String, Vec<u8>> = BTreeMap::new();
@@ -592,12 +604,9 @@ impl Task<'_> {
         let list = format!("{HOLE}/{MADE_WITH}");
         if let Some(path) = self.base(&list)?.filter(|_| !changed.is_empty()) {
             let text = std::fs::read_to_string(&path).map_err(|source| Error::Io { path, source })?;
-            let line = |line: &str| match line
-                .split_once(' ')
-                .and_then(|(_, path)| changed.get(path).map(|new| (new, path)))
-            {
-                Some((bytes, path)) => format!("{} {path}\n", blake3::hash(bytes).to_hex()),
-                None => format!("{line}\n"),
+            let line = |line: &str| {
+                let path = line.split_once(' ').map_or("", |(_, path)| path);
+                changed.get(path).map_or(format!("{line}\n"), |new| format!("{} {path}\n", blake3::hash(new).to_hex()))
             };
             changed.insert(list, text.lines().map(line).collect::<String>().into_bytes());
         }
@@ -613,11 +622,7 @@ impl Task<'_> {
                 batch.copy(path, &base, made.from.clone());
             }
         }
-        batch.notes.push(format!(
-            "{} parts of holes are made anew by hand, and seen in {seen} of {} views",
-            paints.len(),
-            views.len()
-        ));
+        batch.notes.push(format!("{} made by hand, seen in {seen} of {} views", paints.len(), views.len()));
         Ok(batch)
     }
 
