@@ -24,7 +24,7 @@ use crate::prepare::planes::{self, Plane};
 use crate::prepare::poses::{Capture, IMAGES};
 use crate::prepare::record::{self, Batch, Folder, Inputs};
 use crate::prepare::{Error, Step, Watch, picture_size};
-use crate::scene::{self, Camera, HOLE, MADE_WITH, RELIGHT, Scene, npy, resample};
+use crate::scene::{self, Camera, DOUBTFUL, HOLE, MADE_WITH, RELIGHT, Scene, npy, resample};
 
 /// Name of the way in which parts are repainted: a scene that was repainted in another way is repainted anew.
 const METHOD: &str = "on its plane's chart, carried by depth";
@@ -149,6 +149,7 @@ impl Asked {
 }
 
 /// Depth z of what a view shows without the object.
+#[derive(Clone)]
 struct Behind {
     size: [usize; 2],
     /// `[pixel]` its inverse; NaN where it is not known.
@@ -160,6 +161,20 @@ impl Behind {
     fn new(map: &npy::Map, unit: f64) -> Self {
         let inverse = map.values.iter().map(|z| unit / f64::from(*z)).collect();
         Self { size: map.size.map(|n| n as usize), inverse }
+    }
+
+    /// As the depth of pixels that are wrong goes on from around them, in a picture of this size.
+    fn mended(&self, wrong: &[bool], [w, _]: [usize; 2]) -> Self {
+        let size @ [columns, rows] = self.size;
+        let mut off = vec![false; columns * rows];
+        let h = wrong.len() / w;
+        (0..wrong.len())
+            .filter(|i| wrong[*i])
+            .for_each(|i| off[i / w * rows / h * columns + i % w * columns / w] = true);
+        let mut values: Vec<f32> = self.inverse.iter().map(|d| *d as f32).collect();
+        values.iter_mut().zip(&off).filter(|(_, off)| **off).for_each(|(value, _)| *value = f32::NAN);
+        planes::membrane(&mut values, size, |site| off[site]);
+        Self { size, inverse: values.into_iter().map(f64::from).collect() }
     }
 
     /// The depth at a place, 0 to 1 in both directions: linear in its inverse between what is of the nearest pixel's surface.
@@ -188,6 +203,9 @@ struct View {
     /// Its camera, at the size of the filled picture.
     camera: Camera,
     behind: Arc<Behind>,
+    /// `[pixel]` whether its depth is likely wrong, and what it may be there.
+    doubtful: Vec<bool>,
+    mended: Behind,
     /// `[pixel]` RGB, 0 to 1: what is filled, and around it what else is known.
     rgb: Vec<[f32; 3]>,
     /// `[pixel]` whether it is in the hole.
@@ -215,12 +233,6 @@ impl View {
     /// Depth z at a place in pixels.
     fn depth_at(&self, pixel: [f64; 2]) -> Option<f64> {
         self.behind.at(std::array::from_fn(|a| pixel[a] / f64::from(self.camera.size[a])))
-    }
-
-    /// The world point that a pixel shows.
-    fn point(&self, i: usize) -> Option<[f64; 3]> {
-        let pixel = self.camera.pixel_center(i);
-        self.camera.lift(pixel, self.depth_at(pixel)?)
     }
 
     /// The colours as bytes.
@@ -333,10 +345,15 @@ impl View {
         let [w, h] = paint.camera.size;
         let gain: [f32; 3] = std::array::from_fn(|c| (self.gain[c] / paint.gain[c]) as f32);
         let color = |i: usize| -> Option<(bool, [f32; 3])> {
-            let point = self.point(i)?;
-            let pixel = paint.camera.within(point)?;
-            let z = paint.behind.at([pixel[0] / f64::from(w), pixel[1] / f64::from(h)])?;
-            ((z / paint.camera.to_camera(point)[2] - 1.0).abs() <= SAME).then_some(())?;
+            let own = self.camera.pixel_center(i);
+            let place = [0, 1].map(|a| own[a] / f64::from(self.camera.size[a]));
+            let seen = |behind: &Behind| {
+                let point = self.camera.lift(own, behind.at(place)?)?;
+                let pixel = paint.camera.within(point)?;
+                let z = paint.behind.at([pixel[0] / f64::from(w), pixel[1] / f64::from(h)])?;
+                ((z / paint.camera.to_camera(point)[2] - 1.0).abs() <= SAME).then_some(pixel)
+            };
+            let pixel = seen(&self.behind).or_else(|| self.doubtful[i].then(|| seen(&self.mended))?)?;
             let at = |x: usize, y: usize| paint.picture.get_pixel(x as u32, y as u32).0.map(|v| f32::from(v) / 255.0);
             let color = color::sample(at, paint.camera.size, pixel)?;
             let brushed = paint.brushed[pixel[1] as usize * w as usize + pixel[0] as usize];
@@ -488,9 +505,12 @@ impl Task<'_> {
         let Some(path) = self.base(&hole_path(name))? else { return Ok(None) };
         let base = scene::decode(&path)?.into_rgba8();
         let behind = Behind::new(&npy::read(&self.folder.root().join(behind_path(name)))?, self.scene.unit);
+        let doubtful: Vec<bool> = base.pixels().map(|p| p.0[3] == DOUBTFUL).collect();
         let view = View {
             camera: camera.scaled([base.width(), base.height()]),
+            mended: behind.mended(&doubtful, [base.width(), base.height()].map(|n| n as usize)),
             behind: Arc::new(behind),
+            doubtful,
             rgb: base.pixels().map(|p| [0, 1, 2].map(|c| f32::from(p.0[c]) / 255.0)).collect(),
             hole: base.pixels().map(|p| p.0[3] != 0).collect(),
             painted: vec![false; base.pixels().len()],
@@ -622,7 +642,9 @@ impl Task<'_> {
                 batch.copy(path, &base, made.from.clone());
             }
         }
-        batch.notes.push(format!("{} made by hand, seen in {seen} of {} views", paints.len(), views.len()));
+        if !paints.is_empty() {
+            batch.notes.push(format!("{} made by hand, seen in {seen} of {} views", paints.len(), views.len()));
+        }
         Ok(batch)
     }
 
@@ -678,6 +700,8 @@ mod tests {
         View {
             camera,
             behind: Arc::new(Behind::new(&map, 1.0)),
+            doubtful: vec![false; w * h],
+            mended: Behind::new(&map, 1.0),
             rgb: (0..w * h).map(|i| color(i % w, i / w)).collect(),
             hole: vec![true; w * h],
             painted: vec![false; w * h],
@@ -717,6 +741,29 @@ mod tests {
         let color = other.rgb[25 * w + 38];
         assert!((color[0] - 0.1).abs() < 0.01 && (color[2] - 0.3).abs() < 0.01, "{color:?}");
         assert!((other.rgb[35 * w + 38][2] - 0.25).abs() < 1e-6);
+    }
+
+    /// Where depth is doubtful what goes on there from around it counts as well.
+    #[test]
+    fn what_is_doubtful_is_painted_with_what_is_around_it() {
+        let blue = square(40..60, 20..40);
+        let paint = painted(&view(0.0, |_, _| [0.2, 0.2, 0.6]), blue);
+        let wrong = square(30..40, 20..30);
+        for doubtful in [false, true] {
+            let mut other = view(0.5, |_, _| [0.5; 3]);
+            let behind = Arc::get_mut(&mut other.behind).expect("it is its own");
+            let columns = behind.size[0];
+            let sites = (0..behind.inverse.len())
+                .filter(|site| wrong[site / columns * 2 * SIZE[0] as usize + site % columns * 2]);
+            sites.collect::<Vec<_>>().into_iter().for_each(|site| behind.inverse[site] = 0.1);
+            if doubtful {
+                other.doubtful.copy_from_slice(&wrong);
+                other.mended = other.behind.mended(&wrong, other.size());
+            }
+            other.take(&paint);
+            assert!((0..wrong.len()).filter(|i| wrong[*i]).all(|i| other.painted[i] == doubtful), "{doubtful}");
+            assert!(other.painted[36 * SIZE[0] as usize + 36]);
+        }
     }
 
     /// On a wall that is red at its left and blue at its right, in stripes: a patch from the right is blue, and has its stripes.
