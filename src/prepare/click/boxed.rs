@@ -30,7 +30,7 @@ pub fn from_box(picture: &RgbImage, bounds: [u32; 4], cues: &Cues<'_>) -> Option
         let share = mask.as_raw().iter().filter(|v| **v != 0).count() as f64 / area;
         filled(&mask, bounds).map(|part| (mask, part, share))
     };
-    let of_page = |cues: &Cues<'_>| within(found(picture, &[mark.clone()], cues));
+    let of_page = |cues: &Cues<'_>| within(found(picture, std::slice::from_ref(&mark), cues));
     let page = of_page(cues);
     // What is solid is so wherever in its box it is likely.
     let solid =
