@@ -35,9 +35,11 @@ pub fn from_box(picture: &RgbImage, bounds: [u32; 4], cues: &Cues<'_>) -> Option
     // What is solid is so wherever in its box it is likely.
     let solid =
         of_page(&Cues { anywhere: true, ..*cues }).is_some_and(|(_, part, share)| part >= FILLED || share >= SOLID);
-    let thin = SMOOTHNESS[1..].iter().filter(|_| !solid).filter_map(|s| within(thin(picture, bounds, *s)?));
-    let leaves = thin.into_iter().find(|(_, part, share)| *part >= FILLED && *share <= THIN);
-    leaves.or(page).map(|(mask, ..)| mask)
+    let thin: Vec<_> =
+        SMOOTHNESS[1..].iter().filter(|_| !solid).filter_map(|s| within(thin(picture, bounds, *s)?)).collect();
+    let leaves = thin.iter().position(|(_, part, share)| *part >= FILLED && *share <= THIN);
+    let taken = if leaves.is_some() { None } else { page };
+    taken.or_else(|| thin.into_iter().nth(leaves.unwrap_or(0))).map(|(mask, ..)| mask)
 }
 
 /// The cheapest cut where borders cost little.
