@@ -65,6 +65,8 @@ const CORNER: f64 = 1.0;
 const ROUND: f64 = 0.95;
 /// So far from a lasso's line, in roots of what it encloses, is as likely the object as not.
 const MARGIN: f64 = 0.08;
+/// The part of that weight that being at a lasso's line has against the object: a close one cuts into it.
+const AT_LINE: f64 = 0.3;
 /// A box's side so near to the picture's is that.
 const EDGE: f64 = 0.005;
 /// Colours that differ by less, of 255, are touched by the same click.
@@ -140,7 +142,7 @@ impl Mark {
                 let far = off(at[0], *x0, *x1).powi(2) + off(at[1], *y0, *y1).powi(2);
                 (AMID[0] * (1.0 - far / ROUND.powi(2))).max(-CORNER)
             }
-            Self::Lasso { .. } => AMID[1] * (deep / MARGIN - 1.0).clamp(-1.0, 1.0),
+            Self::Lasso { .. } => AMID[1] * (deep / MARGIN - 1.0).clamp(-AT_LINE, 1.0),
             _ => 0.0,
         }
     }
