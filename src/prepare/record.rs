@@ -14,7 +14,6 @@ use image::{GrayImage, ImageBuffer, ImageFormat, PixelWithColorType, RgbImage};
 use serde::{Deserialize, Serialize};
 use tempfile::TempDir;
 
-use super::hole::repaint::Recorded;
 use super::{Error, Step};
 use crate::folder;
 use crate::scene::npy;
@@ -54,10 +53,20 @@ pub struct Record {
     pub steps: BTreeMap<String, StepRecord>,
     /// What was repainted by hand, in its order.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub repaints: Vec<Recorded>,
+    pub repaints: Vec<Repainted>,
     /// Hashes of files that a step was about to write when this was written: they are the program's own, too.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub pending: BTreeMap<String, String>,
+}
+
+/// A repaint as the record has it; its brush lies in `prepare/repaint/`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Repainted {
+    /// The photograph that was brushed over.
+    pub view: String,
+    /// From where the patch is, pixels from what it is put onto; none where it was filled anew.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub offset: Option<[i32; 2]>,
 }
 
 /// blake3 of parts, each with its length, as hexadecimal digits.
@@ -283,7 +292,7 @@ impl Folder {
     ///
     /// # Errors
     /// A record that cannot be written.
-    pub fn repaint(&mut self, repaints: Vec<Recorded>) -> Result<(), Error> {
+    pub fn repaint(&mut self, repaints: Vec<Repainted>) -> Result<(), Error> {
         self.record.repaints = repaints;
         self.save()
     }

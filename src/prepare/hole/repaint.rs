@@ -12,7 +12,6 @@ use std::sync::Arc;
 use glam::{DMat3, DVec3};
 use image::{GrayImage, Rgb, RgbImage, Rgba, RgbaImage};
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 
 use super::color::{self, Filling, between};
 use super::guess::{self, AROUND, Chart};
@@ -22,7 +21,7 @@ use super::{behind_path, reference_path, texture};
 use crate::prepare::object::{no_such_view, read_mask};
 use crate::prepare::planes::{self, Plane};
 use crate::prepare::poses::{Capture, IMAGES};
-use crate::prepare::record::{self, Batch, Folder, Inputs};
+use crate::prepare::record::{self, Batch, Folder, Inputs, Repainted};
 use crate::prepare::{Error, Step, Watch, picture_size};
 use crate::scene::{self, Camera, DOUBTFUL, HOLE, MADE_WITH, RELIGHT, Scene, npy, resample};
 
@@ -61,16 +60,6 @@ impl Default for Wish {
     }
 }
 
-/// A repaint as the record has it; its brush lies in `prepare/repaint/`.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Recorded {
-    /// See [`Repaint::view`].
-    pub view: String,
-    /// See [`Repaint::offset`].
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub offset: Option<[i32; 2]>,
-}
-
 /// Where the brush of a repaint is, below the scene's folder.
 fn brush_path(number: usize) -> String {
     format!("prepare/repaint/{}.png", number + 1)
@@ -82,7 +71,7 @@ fn unpainted(path: &str) -> String {
 }
 
 /// Repaints with their brushes, in their order.
-type Brushed = Vec<(Recorded, GrayImage)>;
+type Brushed = Vec<(Repainted, GrayImage)>;
 
 /// A wish whose pictures are read.
 pub(in crate::prepare) struct Asked {
@@ -107,7 +96,7 @@ impl Asked {
                 let what = "the brush is empty; paint what is to be filled anew in any colour but black".into();
                 return Err(Error::File { path: brush.clone(), what });
             }
-            Ok((Recorded { view: name, offset: *offset }, mask))
+            Ok((Repainted { view: name, offset: *offset }, mask))
         };
         let (new, again) = match wish {
             Wish::With(all) => (all.as_slice(), false),
@@ -131,7 +120,7 @@ impl Asked {
         let count = recorded.len().checked_sub(self.undo.into());
         let count =
             count.ok_or_else(|| Error::Request("nothing has been repainted that could be taken back".into()))?;
-        let read = |(number, recorded): (usize, &Recorded)| {
+        let read = |(number, recorded): (usize, &Repainted)| {
             let path = folder.root().join(brush_path(number));
             if !path.is_file() {
                 let what =
@@ -462,7 +451,7 @@ pub fn has_hole(scene: &Path, view: &str) -> bool {
 pub(in crate::prepare) fn inputs(folder: &Folder, repaints: &Brushed, seed: u64) -> String {
     let files = folder.made(Step::Reference).map(|(_, file)| file.hash.as_str());
     let inputs = files.fold(Inputs::default().with(METHOD).with(seed.to_le_bytes()), Inputs::with);
-    let one = |inputs: Inputs, (Recorded { view, offset }, brush): &(Recorded, GrayImage)| {
+    let one = |inputs: Inputs, (Repainted { view, offset }, brush): &(Repainted, GrayImage)| {
         inputs.with(view).with(format!("{offset:?}")).with(brush.as_raw())
     };
     repaints.iter().fold(inputs, one).finish()
@@ -545,7 +534,7 @@ impl Task<'_> {
         &self,
         open: &mut BTreeMap<usize, Opened>,
         paints: &[Paint],
-        (number, (Recorded { view: name, offset }, brush)): (usize, &(Recorded, GrayImage)),
+        (number, (Repainted { view: name, offset }, brush)): (usize, &(Repainted, GrayImage)),
     ) -> Result<Paint, Error> {
         let at = self.scene.train.iter().position(|view| view.name == *name);
         let at = at.ok_or_else(|| Error::Request(format!("{name}: the scene has no such view to repaint")))?;
