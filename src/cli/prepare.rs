@@ -119,7 +119,7 @@ struct Marks {
     not: Vec<(String, Evidence)>,
 }
 
-/// What is repainted by hand.
+/// Options to repaint by hand.
 #[derive(Debug, Clone, Default, clap::Args)]
 pub(super) struct RepaintArgs {
     /// Part of a hole to be filled anew, in this view and all others: a picture that is not black there, and where a patch for it lies

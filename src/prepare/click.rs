@@ -398,7 +398,7 @@ impl Pixels {
         pixels
     }
 
-    /// What is [`AWAY`]: an object is about as deep as it is wide.
+    /// Places that are [`AWAY`] speak against the object: it is about as deep as it is wide.
     fn part_places(&mut self) {
         let inside = |i: &usize| !self.outside[*i] && self.outside.contains(&true);
         let all = || (0..self.places.len()).filter(inside).filter_map(|i| Some((i, self.places[i]?.0)));

@@ -190,7 +190,7 @@ impl Mark {
         all
     }
 
-    /// What strokes of brushes cover of a picture of this size.
+    /// Pixels that strokes of brushes cover in a picture of this size.
     pub fn brushed(strokes: &[Self], [w, h]: [u32; 2]) -> GrayImage {
         let (mut mask, picture) = (GrayImage::new(w, h), RgbImage::new(w, h));
         strokes.iter().for_each(|stroke| stroke.hold(&mut mask, &picture, strokes));

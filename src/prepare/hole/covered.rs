@@ -142,7 +142,7 @@ impl Sight {
         self.grid.colors[site].map(|v| f32::from(v) / 255.0)
     }
 
-    /// What is around a site, without the object; NaN in the middle of it. Of the four squares with the site in a corner, those at least
+    /// Surroundings of a site without the object; NaN in the middle of it. Of the four squares with the site in a corner, those at least
     /// half of which is there, the one that varies least (Kuwahara 1976): the others may reach over a border.
     pub fn look_around(&self, site: usize) -> Look {
         let at = |dx: i64, dy: i64| {

@@ -43,7 +43,7 @@ pub struct Repaint {
     pub offset: Option<[i32; 2]>,
 }
 
-/// What is asked for of the repaints that a scene has.
+/// A wish about the repaints that a scene has.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Wish {
     /// These are there, after all others: those of them that the last ones are already are not added.
