@@ -350,12 +350,17 @@ pub struct Filled {
     pub made: Vec<bool>,
     /// The view's surface, for the rays of others.
     relief: Relief,
+    /// The cells of the surface that hold all pixels that were made for it.
+    within: [[usize; 2]; 2],
 }
 
 impl Filled {
-    /// With these colours, of which these were made for it.
-    pub fn new(sight: &Sight, rgb: Vec<[f32; 3]>, made: Vec<bool>) -> Self {
-        Self { rgb, made, relief: Relief::new(sight) }
+    /// With these colours by a view's camera, of which these were made for it.
+    pub fn new(sight: &Sight, camera: &Camera, rgb: Vec<[f32; 3]>, made: Vec<bool>) -> Self {
+        let relief = Relief::new(sight);
+        let places = (0..made.len()).filter(|i| made[*i]).filter_map(|i| camera.unproject(camera.pixel_center(i)));
+        let within = relief.around(places.map(|ray| sight.grid.place(ray)));
+        Self { rgb, made, relief, within }
     }
 }
 
@@ -380,10 +385,11 @@ pub fn repaint(
     let repainted = |i: usize, beside: bool| -> Option<[f32; 3]> {
         let way = DVec3::from(own.camera.along(own.camera.unproject(own.camera.pixel_center(i))?, 1.0)) - eye;
         let near = shown(own, sight, i).map(|(_, point)| point);
-        filled.iter().zip(&ranges).find_map(|((view, Filled { rgb, made, relief }), range)| {
+        filled.iter().zip(&ranges).find_map(|((view, Filled { rgb, made, relief, within }), range)| {
             let (other, there) = (&photographs[*view], &sights.0[*view]);
             // Its surfaces end where they end there.
-            let met = || Some(eye + way / relief.meets(there, eye, way, (*range)?)?);
+            let within = if beside { relief.all() } else { *within };
+            let met = || Some(eye + way / relief.meets(there, eye, way, (*range)?, within)?);
             let point = near.filter(|point| there.has(*point, SAME)).or_else(met)?;
             let pixel = other.camera.project(point.to_array())?;
             let width = other.camera.size[0] as usize;
@@ -582,7 +588,7 @@ mod tests {
             .collect();
         let pixels = (SIZE[0] * SIZE[1]) as usize;
         let hole = |view: usize| photographs[view].hole.as_raw().iter().map(|v| *v != 0).collect::<Vec<bool>>();
-        let filled = [(2, Filled::new(&sights.0[2], vec![[0.5; 3]; pixels], hole(2)))];
+        let filled = [(2, Filled::new(&sights.0[2], &cameras[2], vec![[0.5; 3]; pixels], hole(2)))];
         let mut filling = Filling {
             rgb: vec![[0.0; 3]; pixels],
             guessed: hole(4),
@@ -622,8 +628,8 @@ mod tests {
             .collect();
         let hole = |view: usize| photographs[view].hole.as_raw().iter().map(|v| *v != 0).collect::<Vec<bool>>();
         let colors = |view: usize| (0..pixels).map(|i| pattern(&cameras[view], i)).collect::<Vec<_>>();
-        let blank = Filled::new(&sights.0[0], vec![[0.9, 0.1, 0.1]; pixels], vec![false; pixels]);
-        let filled = [(0, blank), (2, Filled::new(&sights.0[2], colors(2), hole(2)))];
+        let blank = Filled::new(&sights.0[0], &cameras[0], vec![[0.9, 0.1, 0.1]; pixels], vec![false; pixels]);
+        let filled = [(0, blank), (2, Filled::new(&sights.0[2], &cameras[2], colors(2), hole(2)))];
         let mut filling = Filling {
             rgb: colors(1),
             guessed: hole(1),

@@ -241,7 +241,7 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
                 batch.npy(behind_path(name), camera.size, depth, "depth of the surface behind the object");
             }
             if made.contains(&true) {
-                filled.push((i, Filled::new(&sights.0[i], filling.rgb, made)));
+                filled.push((i, Filled::new(&sights.0[i], &cameras[i], filling.rgb, made)));
             }
             done += 1;
             watch.turn(n + 1 + done)?;
