@@ -56,8 +56,11 @@ impl Texture {
         let (x, y) = (pixel % w, pixel / w);
         let rows = y.saturating_sub(reach)..(y + reach + 1).min(h);
         let near = rows.flat_map(|v| (x.saturating_sub(reach)..(x + reach + 1).min(w)).map(move |u| v * w + u));
-        let known: Vec<usize> = near.filter(|j| self.source[*j]).collect();
-        let n = known.len() as f32;
-        std::array::from_fn(|c| known.iter().map(|j| self.rgb[*j][c]).sum::<f32>() / n)
+        let (mut sum, mut n) = ([0f32; 3], 0f32);
+        for j in near.filter(|j| self.source[*j]) {
+            (0..3).for_each(|c| sum[c] += self.rgb[j][c]);
+            n += 1.0;
+        }
+        sum.map(|sum| sum / n)
     }
 }

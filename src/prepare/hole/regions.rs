@@ -7,6 +7,7 @@
 use std::collections::BTreeMap;
 
 use glam::DVec2;
+use rayon::prelude::*;
 
 use super::holed::Texture;
 use super::lines::{Line, Piece, middle_of};
@@ -134,7 +135,8 @@ impl Regions {
         let size = [columns.len(), rows.len()];
         let pixels: Vec<usize> = rows.flat_map(|y| columns.clone().map(move |x| y * w + x)).collect();
         let color = |i: usize| Some(texture.mean_within(i, REACH)).filter(|_| texture.source[i]);
-        let colors: Vec<Option<[f32; 3]>> = pixels.iter().map(|i| color(*i)).collect();
+        let all: Vec<Option<[f32; 3]>> = (0..w * h).into_par_iter().map(color).collect();
+        let colors: Vec<Option<[f32; 3]>> = pixels.iter().map(|i| all[*i]).collect();
         let known: Vec<[f32; 3]> = colors.iter().flatten().copied().collect();
         let mut means = if known.len() < FEWEST { vec![] } else { materials(&known) };
         means.truncate(REGIONS);
@@ -145,18 +147,18 @@ impl Regions {
             color.map_or(0.0, |color| f64::from(of_another(color, *mean) / MATERIAL).min(MOST))
         };
         let costs: Vec<Vec<f64>> =
-            means.iter().map(|mean| colors.iter().map(|color| cost(mean, color)).collect()).collect();
+            means.par_iter().map(|mean| colors.iter().map(|color| cost(mean, color)).collect()).collect();
         let found = planes::cheapest(&costs, &planes::Border { between: |_| BORDER, at: |_, _| 0.0 }, size);
         // Beyond by its own colour.
         let mut of: Vec<u8> =
-            (0..w * h).map(|i| color(i).and_then(|color| nearest(color, &means)).unwrap_or(0) as u8).collect();
+            all.par_iter().map(|color| color.and_then(|color| nearest(color, &means)).unwrap_or(0) as u8).collect();
         pixels.iter().zip(found).for_each(|(i, label)| of[*i] = label as u8);
         gradual(texture, &means, &mut of);
         let near = |i: usize| {
             let told = within(texture, i, BAND).filter(|j| texture.hole[*j] || texture.source[*j]);
             told.fold(0, |set: u16, j| set | 1 << of[j])
         };
-        let near = (0..w * h).map(near).collect();
+        let near = (0..w * h).into_par_iter().map(near).collect();
         Some(Self { means, of, near })
     }
 
@@ -290,7 +292,7 @@ impl Ways {
     /// The ways between two places, along one of whose ends the border is.
     fn all(&self) -> Vec<Way> {
         let some: Vec<DVec2> = self.near.iter().copied().step_by(self.near.len().div_ceil(PLACES).max(1)).collect();
-        let pairs = (0..some.len()).flat_map(|a| (0..a).map(move |b| [b, a]));
+        let pairs = (0..some.len()).into_par_iter().flat_map_iter(|a| (0..a).map(move |b| [b, a]));
         pairs.filter_map(|pair| self.through(pair.map(|k| some[k]))).collect()
     }
 

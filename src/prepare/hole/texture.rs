@@ -219,14 +219,14 @@ impl Texture {
             (true, false) => self.copy(materials, i, shifts[label]).map_or(NO_SOURCE, |from| unlike(i, from)),
         };
         let costs: Vec<Vec<f64>> =
-            (0..=none).map(|label| (0..n).map(|node| cost(label, pixel(node))).collect()).collect();
+            (0..=none).into_par_iter().map(|label| (0..n).map(|node| cost(label, pixel(node))).collect()).collect();
         // Not a number where there is nothing to copy.
         let color = |label: usize, i: usize| {
             let from = if label == none { self.source[i].then_some(i) } else { self.source(i, shifts[label]) };
             from.map_or([f32::NAN; 3], |from| self.rgb[from])
         };
         let colors: Vec<Vec<[f32; 3]>> =
-            (0..=none).map(|label| (0..n).map(|node| color(label, pixel(node))).collect()).collect();
+            (0..=none).into_par_iter().map(|label| (0..n).map(|node| color(label, pixel(node))).collect()).collect();
         let at = |node: usize, [a, b]: [usize; 2]| {
             let apart = apart(colors[a][node], colors[b][node]);
             // Known pixels have one colour; that a copy would have there is compared on the other side.
