@@ -52,6 +52,8 @@ pub(super) struct Args {
     #[arg(long, value_name = "STEP", value_parser = step)]
     only: Vec<Step>,
     #[command(flatten)]
+    poses: PosesArgs,
+    #[command(flatten)]
     shadow: ShadowArgs,
     /// Make no depth priors; otherwise they are the fit's own depth, nothing (NaN) where views disagree
     ///
@@ -168,6 +170,31 @@ enum Shadow {
     Remove,
     /// Left as it is
     Keep,
+}
+
+/// See [`PosesArgs`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
+enum Poses {
+    /// Once there are masks they are judged by what is around the object: parts of a model that the object has folded, for it looks
+    /// alike from two sides, are turned about it where what it stands on proves it
+    #[default]
+    Again,
+    /// They stay as the model has them
+    Given,
+}
+
+#[derive(Debug, Clone, Copy, Default, clap::Args)]
+pub(super) struct PosesArgs {
+    /// What to do about the cameras' poses
+    #[arg(long, value_name = "WHAT", value_enum, default_value_t = Poses::Again)]
+    poses: Poses,
+}
+
+impl PosesArgs {
+    /// For the request.
+    pub fn again(self) -> bool {
+        self.poses == Poses::Again
+    }
 }
 
 #[derive(Debug, Clone, Copy, Default, clap::Args)]
@@ -344,6 +371,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         repaint: args.repaint.wish(),
         only: args.only.clone(),
         depth: !args.no_depth,
+        again: args.poses.again(),
         shadow: args.shadow.answer(),
         inpaint_model: args.inpaint_model.clone(),
         depth_model: args.depth_model.clone(),

@@ -20,6 +20,7 @@ mod program;
 pub mod record;
 pub mod shadow;
 pub mod splats;
+mod unfold;
 pub mod video;
 
 use std::collections::BTreeMap;
@@ -189,6 +190,9 @@ pub struct Request {
     pub fit_side: u32,
     /// Whether depth priors are made of the fit, NaN where nothing is known; a scene that has its own keeps those alone.
     pub depth: bool,
+    /// Whether the model's cameras are judged by what is around the object once there are masks: parts of a model that the object has
+    /// folded are turned to where they belong. Otherwise they stay as they are given.
+    pub again: bool,
     /// What to do about the object's shadow.
     pub shadow: shadow::Answer,
     /// A network that fills what nobody saw, instead of pieces of what is around it: an ONNX file, see [`network`].
@@ -213,6 +217,7 @@ impl Request {
             fit_steps: 200,
             fit_side: 256,
             depth: true,
+            again: true,
             shadow: shadow::Answer::Remove,
             inpaint_model: None,
             depth_model: None,
@@ -345,7 +350,7 @@ fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(
     if request.only.iter().all(|step| *step == Step::Poses) && !request.only.is_empty() {
         return Ok(None);
     }
-    let scene = preparation.small()?;
+    let mut scene = preparation.small()?;
     if scene.train.len() < 3 {
         return Err(Error::Request(format!(
             "{}: {} photographs with a camera are too few; three are the least that can agree on anything",
@@ -360,10 +365,17 @@ fn steps(gpu: &Gpu, request: &Request, watch: &mut dyn Watch) -> Result<Option<(
         preparation.repaint(&scene, asked)?;
         return Ok(None);
     }
-    let fit = preparation.fit(&scene)?;
+    let mut fit = preparation.fit(&scene)?;
     let mut splats = Splats::new(gpu, &fit.model, &fit.settings.render)?;
     if request.wants(Step::Masks) {
         preparation.masks(&scene, &fit, &mut splats, &wanted)?;
+        if request.wants(Step::Poses) && preparation.unfold(&scene)? {
+            preparation.matched = None;
+            scene = preparation.small()?;
+            fit = preparation.fit(&scene)?;
+            splats = Splats::new(gpu, &fit.model, &fit.settings.render)?;
+            preparation.masks(&scene, &fit, &mut splats, &wanted)?;
+        }
     }
     if request.wants(Step::Shadow) {
         let masks = preparation.masks_on_disk(&scene)?;
@@ -468,7 +480,10 @@ impl Preparation<'_> {
     }
 
     fn poses(&mut self, capture: &Capture) -> Result<(), Error> {
-        let inputs = capture.inputs()?;
+        let mut inputs = capture.inputs()?;
+        if !self.request.again {
+            inputs.push_str(" as given");
+        }
         if self.skips(Step::Poses, &inputs)? {
             return Ok(());
         }
@@ -477,6 +492,63 @@ impl Preparation<'_> {
         self.write(Step::Poses, inputs, batch)?;
         self.watch.end();
         Ok(())
+    }
+
+    /// Whether parts of the model, which the object has folded, were turned to where they belong.
+    fn unfold(&mut self, scene: &Scene) -> Result<bool, Error> {
+        let root = self.folder.root().to_owned();
+        let made = || self.folder.made(Step::Poses);
+        let done = self.folder.record().steps.get(Step::Poses.name()).is_some_and(|s| s.figures.contains_key(TURNED));
+        if !self.request.again || done || self.request.ready.is_some() {
+            return Ok(false);
+        }
+        let model = scene::colmap::read(&root)?;
+        let masks = self.masks_on_disk(scene)?;
+        let Some(parts) = unfold::parts(&model, &masked(scene, &masks)) else { return Ok(false) };
+        let fine = masked(&self.load(unfold::PICTURES, false)?, &masks);
+        let turns = unfold::turns(&model, &fine, &parts, self.request.seed);
+        let turned: usize = turns.iter().map(|turn| parts.counts[turn.part]).sum();
+        let Some(first) = turns.first() else { return Ok(false) };
+        if !made().any(|(path, _)| path.starts_with(poses::MODEL)) {
+            self.watch.say(&format!(
+                "poses: the model is folded, {turned} of its photographs stand on the wrong side of the object; its files are yours and \
+                 stay: make the scene in another folder, with --out"
+            ));
+            return Ok(false);
+        }
+        let mut batch = Batch::default();
+        let kept: Vec<(String, String)> = (made().filter(|(path, _)| !path.starts_with(poses::MODEL)))
+            .map(|(path, file)| (path.clone(), file.from.clone()))
+            .collect();
+        kept.into_iter().for_each(|(path, from)| batch.copy(path.clone(), &root.join(path), from));
+        for (name, bytes) in unfold::files(&model, &parts, &turns, fine.unit) {
+            batch.bytes(
+                format!("{}/{name}", poses::MODEL),
+                bytes,
+                "the model that was given, its parts turned about the object",
+            );
+        }
+        let turned_by: Vec<String> =
+            turns.iter().map(|turn| format!("{} by {:.1} degrees", parts.counts[turn.part], turn.degrees)).collect();
+        let [alike, rival, was] = first.alike;
+        batch.notes.push(format!(
+            "the model is folded: {turned} photographs share nothing with {} others but the object, which looks alike from both sides; they \
+             are turned about it ({}), for so what it stands on is one (correlation {alike:.2}; at any other turn {rival:.2} at most, and \
+             {was:.2} before; --poses given leaves them)",
+            parts.counts[0],
+            turned_by.join(", ")
+        ));
+        let lost: Vec<&str> = (model.images.iter().zip(&parts.of))
+            .filter(|(_, part)| part.is_none())
+            .map(|(image, _)| scene::stem(&image.name))
+            .collect();
+        if !lost.is_empty() {
+            batch.notes.push(format!("{}: left out, for nothing tells to which side they belong", abridged(&lost)));
+        }
+        batch.figures.insert(TURNED.into(), turned as f64);
+        let inputs = self.folder.record().steps[Step::Poses.name()].inputs.clone();
+        self.write(Step::Poses, inputs, batch)?;
+        Ok(true)
     }
 
     /// The scene at the size of the fit, without anything but photographs, cameras and points.
@@ -729,6 +801,9 @@ impl Preparation<'_> {
 const USUAL: std::ops::Range<f64> = 0.125..16.0;
 /// See [`USUAL`].
 const SCALED: f64 = 4.0;
+
+/// Figure of the step poses: photographs whose cameras were turned.
+const TURNED: &str = "turned";
 
 /// A scene whose views have these masks.
 fn masked(scene: &Scene, masks: &[GrayImage]) -> Scene {

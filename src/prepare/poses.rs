@@ -25,7 +25,7 @@ use crate::statistics::median;
 
 /// Where a scene keeps its photographs and its model.
 pub const IMAGES: &str = "images";
-const MODEL: &str = "sparse/0";
+pub(super) const MODEL: &str = "sparse/0";
 /// COLMAP's numbers of its camera models.
 const PINHOLE: u32 = 1;
 const OPENCV: u32 = 4;
@@ -105,16 +105,16 @@ struct Lens {
 
 /// A camera of OPENCV's model and a pose, as COLMAP writes them.
 #[derive(Clone, Debug, PartialEq)]
-struct Shot {
+pub(super) struct Shot {
     /// The id of the photograph that a sparse model's tracks know, where there is one.
-    id: Option<u32>,
-    name: String,
-    size: [u32; 2],
+    pub id: Option<u32>,
+    pub name: String,
+    pub size: [u32; 2],
     /// fx fy cx cy k1 k2 p1 p2.
-    parameters: [f64; 8],
+    pub parameters: [f64; 8],
     /// World to camera.
-    rotation: DQuat,
-    translation: DVec3,
+    pub rotation: DQuat,
+    pub translation: DVec3,
 }
 
 /// Finds out what a folder of photographs comes with.
@@ -753,7 +753,7 @@ pub(crate) fn model_of<'a>(cameras: impl Iterator<Item = (&'a str, &'a Camera)>)
 }
 
 /// `cameras.bin` and `images.bin`, a camera for each photograph: unlike lines of text they hold any name.
-fn model_files_of(shots: &[Shot]) -> [(&'static str, Vec<u8>); 2] {
+pub(super) fn model_files_of(shots: &[Shot]) -> [(&'static str, Vec<u8>); 2] {
     let count = (shots.len() as u64).to_le_bytes().to_vec();
     let (mut cameras, mut images) = (count.clone(), count);
     for (id, shot) in (1u32..).zip(shots) {

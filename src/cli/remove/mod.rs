@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 
-use super::prepare::{ObjectArgs, RepaintArgs, ShadowArgs, VideoArgs};
+use super::prepare::{ObjectArgs, PosesArgs, RepaintArgs, ShadowArgs, VideoArgs};
 use super::shared::{DeviceArgs, SceneArgs};
 use super::{next, preset, signals, train};
 use crate::config::SettingsArgs;
@@ -84,6 +84,8 @@ pub(super) struct Args {
     reference: Option<String>,
     #[command(flatten)]
     repaint: RepaintArgs,
+    #[command(flatten)]
+    poses: PosesArgs,
     #[command(flatten)]
     shadow: ShadowArgs,
     /// Be done after about so many minutes, from Remove (or the command with --yes) to the files: training has what the rest leaves

@@ -202,7 +202,7 @@ impl Observer for Watched<'_, export::Bars> {
 impl Job<'_> {
     /// The request to `prepare`.
     pub fn request(&self, objects: Vec<Object>) -> Request {
-        let Args { reference, repaint, shadow, fit_steps, .. } = self.args;
+        let Args { reference, repaint, poses, shadow, fit_steps, .. } = self.args;
         // A splat's own Gaussians keep their shadow: only the hole changes.
         let shadow = if self.splat.is_some() { Answer::Keep } else { shadow.answer() };
         Request {
@@ -210,6 +210,7 @@ impl Job<'_> {
             ready: self.splat.as_ref().map(|splat| splat.ready.clone()),
             reference: reference.clone(),
             repaint: repaint.wish(),
+            again: poses.again(),
             shadow,
             fit_steps: *fit_steps,
             ..Request::new(&self.photographs, &self.places.scene)
