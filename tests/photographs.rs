@@ -7,6 +7,7 @@ use gscream_vk::prepare::{Evidence, Object, Request, Step, poses};
 use gscream_vk::scene;
 use image::{GrayImage, RgbImage};
 
+use crate::common::skip::{Lack, skip};
 use crate::nerfstudio::{of_nerfstudio, transforms};
 use crate::prepare::{VIEWS, capture, ious, mask, name, prepared, truth};
 
@@ -250,4 +251,44 @@ fn objects_are_marked_in_different_photographs() {
         alone == unnamed && alone != masks && said.iter().any(|line| line == "masks: nothing has changed"),
         "{said:?}"
     );
+}
+
+/// The can's photographs from two sides stand on one, for its label is on both: they are turned about it, once, and `--poses given` takes
+/// that back.
+#[test]
+fn a_folded_capture_is_unfolded() {
+    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
+    let can = std::env::var_os("GSCREAM_DATA").map_or(data, PathBuf::from).join("can");
+    if !can.is_dir() {
+        skip(Lack::Captures, &format!("no {} (GSCREAM_DATA names the folder of the captures)", can.display()));
+        return;
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut request = Request::new(&can, folder.path().join("scene"));
+    (request.fit_steps, request.fit_side) = (50, 128);
+    request.only = vec![Step::Poses, Step::Fit, Step::Masks];
+    request.objects[0].evidence = vec![("0000".into(), Evidence::Box([266, 316, 464, 788]))];
+    let out = request.out.clone();
+    let eyes = || -> Vec<[f64; 3]> {
+        let model = scene::colmap::read(&out).expect("a model");
+        model.images.iter().map(scene::colmap::Image::center).collect()
+    };
+    let given = scene::colmap::read(&can).expect("a model");
+    let said = prepared(&request);
+    assert!(said.iter().any(|line| line.starts_with("poses: the model is folded: 32 photographs")), "{said:?}");
+    let turned = eyes();
+    assert_eq!(turned.len(), given.images.len());
+    let stayed = turned
+        .iter()
+        .zip(&given.images)
+        .filter(|(eye, image)| (0..3).all(|a| (eye[a] - image.center()[a]).abs() < 1e-9));
+    assert_eq!(stayed.count(), 39);
+    let said = prepared(&request);
+    assert!(said.iter().filter(|line| line.contains("nothing has changed")).count() == 3, "{said:?}");
+    assert_eq!(eyes(), turned);
+    request.again = false;
+    let said = prepared(&request);
+    assert!(!said.iter().any(|line| line.contains("folded")), "{said:?}");
+    let back = scene::colmap::read(&request.out).expect("a model");
+    assert_eq!(back, given);
 }

@@ -27,6 +27,8 @@ const LINKS: u32 = 5;
 const LEAST: usize = 5;
 /// Share of a point's photographs that have it in their masks from which on it is the object's.
 const OBJECTS: f64 = 0.5;
+/// Points so near the object's middle, as a multiple of its size, are taken for the object's, whatever masks that end early say.
+const NEAR: f64 = 1.3;
 /// How far from the object its surface is looked for and drawn, as a multiple of the object's size.
 const REACH: f64 = 5.0;
 /// Side of a drawing, pixels.
@@ -84,17 +86,19 @@ impl Turn {
     }
 }
 
-/// `[point of the model]` its photographs, each once, and whether it is the object's, by the masks of a scene's train views.
+/// `[point of the model]` its photographs, each once, and whether it is the object's, by the masks of a scene's train views or by where
+/// it is.
 fn told(model: &Model, scene: &Scene) -> Vec<(Vec<usize>, bool)> {
     let number: BTreeMap<u32, usize> = model.images.iter().enumerate().map(|(at, image)| (image.id, at)).collect();
     let views: BTreeMap<&str, usize> = scene.train.iter().enumerate().map(|(at, v)| (v.name.as_str(), at)).collect();
     let view: Vec<Option<usize>> =
         model.images.iter().map(|image| views.get(crate::scene::stem(&image.name)).copied()).collect();
+    let place = |point: usize| model.points[point].position.map(|v| f64::from(v) / scene.unit);
     let one = |point: usize| {
         let mut images: Vec<usize> = model.tracks.of(point).iter().filter_map(|id| number.get(id).copied()).collect();
         images.sort_unstable();
         images.dedup();
-        let place = model.points[point].position.map(|v| f64::from(v) / scene.unit);
+        let place = place(point);
         let seen = images.iter().filter_map(|image| {
             let view = &scene.train[view[*image]?];
             let pixel = view.camera.pixel_of(place)?;
@@ -103,7 +107,14 @@ fn told(model: &Model, scene: &Scene) -> Vec<(Vec<usize>, bool)> {
         let (inside, all) = seen.fold((0.0, 0.0), |(a, b), inside| (a + f64::from(u8::from(inside)), b + 1.0));
         (images, inside > OBJECTS * all)
     };
-    (0..model.points.len().min(model.tracks.len())).into_par_iter().map(one).collect()
+    let mut told: Vec<(Vec<usize>, bool)> =
+        (0..model.points.len().min(model.tracks.len())).into_par_iter().map(one).collect();
+    let object: Vec<DVec3> = (0..told.len()).filter(|point| told[*point].1).map(|point| place(point).into()).collect();
+    if let Some((middle, size)) = plane::extent(&object) {
+        let near = |point: usize| DVec3::from(place(point)).distance(middle) < NEAR * size;
+        told.iter_mut().enumerate().for_each(|(point, (_, objects))| *objects |= near(point));
+    }
+    told
 }
 
 /// The parts of a model, by a scene of its photographs with masks; nothing where it is one.
@@ -134,6 +145,7 @@ pub fn parts(model: &Model, scene: &Scene) -> Option<Parts> {
         all.push(part);
     }
     all.retain(|part| part.len() >= LEAST);
+    log::debug!("unfold: parts of {:?} photographs", all.iter().map(Vec::len).collect::<Vec<_>>());
     all.sort_by_key(|part| std::cmp::Reverse(part.len()));
     if all.len() < 2 {
         return None;
@@ -276,6 +288,7 @@ fn turn(own: &Drawing, other: &Drawing) -> Option<(f64, DVec2, [f64; 3])> {
     };
     let rival = (0..turns.len()).filter(|k| apart(*k) > BESIDE).map(|k| scored[k].0).fold(-1.0, f64::max);
     let was = small.alike(&small_other, 0.0, DVec2::ZERO);
+    log::debug!("unfold: alike {best:.2} at {} degrees, {rival:.2} at others, {was:.2} as it is", turns[first]);
     if best < ONE || rival > RIVAL * best || was > RIVAL * best {
         return None;
     }
