@@ -448,8 +448,7 @@ mod tests {
         };
         let pillar = |point: DVec3| point.truncate().length() < 0.3 && (0.0..1.0).contains(&point.z);
         let mut views = vec![];
-        for k in 0..VIEWS {
-            let (rotation, translation) = truth[k];
+        for (k, (rotation, translation)) in truth.iter().copied().enumerate() {
             let eye = -(rotation.inverse() * translation);
             let shown = |x: u32, y: u32| {
                 let ray =
