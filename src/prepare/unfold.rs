@@ -587,7 +587,7 @@ mod tests {
         let (mut model, scene, _) = folded(0.0, false);
         for k in [VIEWS / 2 - 1, VIEWS - 1] {
             for step in 0..LINKS {
-                let position = [1.2 + 0.05 * step as f32, 0.0, 0.0];
+                let position = [0.0, 1.2 + 0.05 * step as f32, 0.0];
                 model.points.push(Point { position, color: [90; 3] });
                 model.tracks.push([k, (k + 1) % VIEWS].map(|k| k as u32 + 1));
             }
