@@ -229,8 +229,9 @@ impl<'a> Carrier<'a> {
             shares = votes.count(self.fit.positions(), &self.colors);
             carried = carry(&shares, splats)?;
         }
-        let outlines: Vec<(GrayImage, bool)> =
+        let mut outlines: Vec<(GrayImage, bool)> =
             others.par_iter().zip(&carried).map(|(at, carried)| refine(carried, *at)).collect();
+        self.clear(given, &others, &mut outlines);
         let moved = others.iter().zip(&outlines).filter(|(_, (_, moved))| *moved).map(|(at, _)| *at);
         let moved: Vec<usize> = moved.collect();
         let names: Vec<&str> = voters.iter().map(|view| view.name.as_str()).collect();
@@ -238,6 +239,25 @@ impl<'a> Carrier<'a> {
         let shown = masks.iter().filter(|(mask, _)| mask.as_raw().iter().any(|v| *v != 0)).count();
         let notes = misplaced.into_iter().chain(self.notes(shown, thin, &moved, object)).collect();
         Ok(Carried { masks, shown, notes })
+    }
+
+    /// Clears what others show beside the object from the outlines of the views that have no mask.
+    fn clear(&self, given: &BTreeMap<String, Given>, others: &[usize], outlines: &mut [(GrayImage, bool)]) {
+        let views = &self.scene.train;
+        if others.is_empty() || self.grids.len() != views.len() {
+            return;
+        }
+        let mut all: Vec<GrayImage> = views
+            .iter()
+            .map(|view| given.get(&view.name).map_or_else(GrayImage::default, |g| g.mask.clone()))
+            .collect();
+        others.iter().zip(&mut *outlines).for_each(|(at, (mask, _))| all[*at] = std::mem::take(mask));
+        let cameras: Vec<Camera> =
+            views.iter().zip(&all).map(|(view, mask)| view.camera.scaled(mask.dimensions().into())).collect();
+        let is_given: Vec<bool> = views.iter().map(|view| given.contains_key(&view.name)).collect();
+        let cleared = hole::complete::clear_strays(&self.grids, &cameras, &mut all, &is_given);
+        log::debug!("masks: parts of {cleared:?} show what others have beside the object");
+        others.iter().zip(outlines).for_each(|(at, (mask, _))| *mask = std::mem::take(&mut all[*at]));
     }
 
     /// `[view]` the given masks and the outlines of all others, carried `from` some, as large as the photographs, and what they were made

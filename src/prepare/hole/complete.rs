@@ -1,11 +1,14 @@
 //! The object as all views know it: masks that end before it does are completed, and views that have it elsewhere are found.
 
+use std::collections::BTreeSet;
+
 use glam::DVec3;
 use image::GrayImage;
 use rayon::prelude::*;
 
 use super::surface::{APART, HULL_VIEWS, framing, inside};
 use crate::multiview::DepthGrid;
+use crate::prepare::planes;
 use crate::scene::Camera;
 
 /// Sites from the mask's border from which on what it covers is the object.
@@ -22,6 +25,13 @@ const FEWEST_SITES: usize = 30;
 const OVERLAP: f64 = 0.8;
 /// One of so many views may have the object elsewhere.
 const MOST_ASTRAY: usize = 4;
+
+/// A point of which less than this share of the views that have it in the picture has it inside their masks is none of the object.
+const STRAY: f64 = 0.5;
+/// Share of the sites of a part of a mask whose depth must be known for it to be judged, and share of these that must be none of the
+/// object.
+const KNOWN: f64 = 0.125;
+const MOSTLY: f64 = 0.5;
 
 /// The sites of which this is said that hang together with what is inside.
 fn beside(grid: &DepthGrid, inside: &[bool], of: impl Fn(usize) -> bool) -> Vec<usize> {
@@ -142,6 +152,44 @@ pub fn complete(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage]
     grown
 }
 
+/// Clears parts of the masks (as large as the pictures of these cameras) that lie apart from the rest, and show what nearly all other
+/// views have outside their masks: what was behind the object where a mask was given. Of views that are `given` nothing is cleared.
+/// Returns the views whose masks shrank.
+pub fn clear_strays(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage], given: &[bool]) -> Vec<usize> {
+    let inside = inside(grids, cameras, masks);
+    let is_stray = |point: DVec3| {
+        let (framed, covered) = framing(grids.iter(), &inside, point);
+        framed >= HULL_VIEWS && (covered as f64) < STRAY * framed as f64
+    };
+    let strays = |view: usize| -> Vec<usize> {
+        let (grid, camera) = (&grids[view], &cameras[view]);
+        let size = camera.size.map(|n| n as usize);
+        let mut left: Vec<bool> = masks[view].as_raw().iter().map(|v| *v != 0).collect();
+        let parts = (0..left.len()).map(|first| planes::connected(first, &mut left, size));
+        let mut parts: Vec<Vec<usize>> = parts.filter(|part| !part.is_empty()).collect();
+        parts.sort_by_key(|part| std::cmp::Reverse(part.len()));
+        let site = |pixel: &usize| {
+            let [x, y] = grid.place(camera.unproject(camera.pixel_center(*pixel))?);
+            grid.site(x.floor() as i64, y.floor() as i64)
+        };
+        let apart = |part: &&Vec<usize>| {
+            let sites: BTreeSet<usize> = part.iter().filter_map(site).collect();
+            let known = sites.iter().filter(|site| grid.confirmed[**site]).filter_map(|site| grid.point(*site));
+            let strays: Vec<bool> = known.map(is_stray).collect();
+            let share = strays.iter().filter(|stray| **stray).count() as f64 / strays.len().max(1) as f64;
+            strays.len() as f64 >= KNOWN * sites.len() as f64 && share >= MOSTLY
+        };
+        parts.iter().skip(1).filter(apart).flatten().copied().collect()
+    };
+    let views: Vec<usize> = (0..grids.len()).filter(|view| !given[*view] && grids[*view].trusted).collect();
+    let found: Vec<(usize, Vec<usize>)> = views.into_par_iter().map(|view| (view, strays(view))).collect();
+    let found: Vec<(usize, Vec<usize>)> = found.into_iter().filter(|(_, strays)| !strays.is_empty()).collect();
+    for (view, strays) in &found {
+        strays.iter().for_each(|pixel| masks[*view].as_mut()[*pixel] = 0);
+    }
+    found.into_iter().map(|(view, _)| view).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::surface::tests::{SIZE, views};
@@ -162,6 +210,27 @@ mod tests {
         // Its rim is left, where no point of the object is deep enough in the others' masks.
         assert!(left.count() * 2 < missing, "of {missing}");
         assert!(masks.iter().zip(&whole).enumerate().all(|(view, (now, whole))| view == 3 || now == whole));
+    }
+
+    /// A piece of the wall in one mask, apart from the object, goes; a second piece of the object that something hides in two stays, and so
+    /// does what was given.
+    #[test]
+    fn what_others_show_beside_the_object_is_cleared() {
+        let (grids, cameras, whole) = views(0.4);
+        let mut masks = whole.clone();
+        let piece = |x: u32, y: u32| (2..8).contains(&x) && (2..9).contains(&y);
+        let with = |mask: &mut GrayImage| {
+            mask.enumerate_pixels_mut().filter(|(x, y, _)| piece(*x, *y)).for_each(|(.., pixel)| pixel.0 = [255]);
+        };
+        with(&mut masks[1]);
+        with(&mut masks[3]);
+        // What hides the object's middle.
+        masks[2].enumerate_pixels_mut().filter(|(_, y, _)| (15..17).contains(y)).for_each(|(.., pixel)| pixel.0 = [0]);
+        let before = masks.clone();
+        let given = [false, true, false, false, false];
+        assert_eq!(clear_strays(&grids, &cameras, &mut masks, &given), [3]);
+        assert_eq!(masks[3], whole[3]);
+        assert!((0..5).filter(|view| *view != 3).all(|view| masks[view] == before[view]));
     }
 
     /// A mask beside the object is of a wrong camera; one that ends too early is none, and two of five are too many.

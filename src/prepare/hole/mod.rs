@@ -3,7 +3,7 @@
 //! - `front`: what stands before the object stays.
 //! - `flat`: what is bare lies on the planes around it.
 //! - `residue`: what is left of a shadow that was taken out goes with the object.
-//! - `complete`: masks that end before the object does grow, and views that have it elsewhere are not asked.
+//! - [`complete`]: masks that end before the object does grow, and views that have it elsewhere are not asked.
 //! - `covered`: where depth does not tell surfaces apart, what they look like does (`material`).
 //! - `corner`: a surface whose edge goes into the hole ends at a right angle.
 //! - `surface`: the depth of what is behind the object, in all views, by what they know of a point (`witness`).
@@ -16,7 +16,7 @@
 //! holes are filled from the same surface, into `hole/`.
 
 mod color;
-mod complete;
+pub mod complete;
 mod corner;
 mod covered;
 mod flat;
@@ -70,7 +70,7 @@ pub const METHOD: &str = "one surface with smooth ends, nothing where others loo
      what is nearly one plane is one, copies nearly keep their hue, ends are where the first view has them, \
      nothing from views with the object elsewhere, nothing stands where the first view looks through, surfaces by what they are covered with, \
      straight borders go on, those that end in a hole too, surfaces end at right angles, grain is kept, floors end at their walls, planes have \
-     their materials, which have grain, and what is bare of the object refutes nothing";
+     their materials, which have grain, what is bare of the object refutes nothing, and the reference has no shadow";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 
@@ -357,8 +357,11 @@ fn of_reference(
     let guesser = if task.inpainting.is_some() { "an inpainting network" } else { "the surroundings" };
     // At the photograph's own size.
     let files = scene::pictures(&task.root.join(super::poses::IMAGES))?;
-    let mut picture = scene::photograph(&files[name], 1)?;
+    let picture = scene::photograph(&files[name], 1)?;
     let full = [picture.width(), picture.height()];
+    // What is left of the shadow beside the hole would be a dark line around it in a smaller picture.
+    let light = task.root.join(scene::RELIGHT).join(format!("{name}.png"));
+    let mut picture = scene::relit(light.is_file().then_some(light.as_path()), &picture, full)?;
     let bytes = as_exposed(task, of, &filling.rgb);
     let bytes = bytes.as_flattened().iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
     let large = enlarged_to(RgbImage::from_raw(size[0], size[1], bytes).expect("a colour per pixel"), full);
@@ -379,7 +382,7 @@ fn of_reference(
     batch.rgb(
         reference_path(name),
         &picture,
-        format!("the photograph; in the hole what other photographs show behind the object, and from {guesser} where none does"),
+        format!("the photograph without the object's shadow; in the hole what other photographs show behind the object, and from {guesser} where none does"),
     );
     batch.rgb(
         PROVENANCE,
