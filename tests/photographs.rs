@@ -292,3 +292,45 @@ fn a_folded_capture_is_unfolded() {
     let back = scene::colmap::read(&request.out).expect("a model");
     assert_eq!(back, given);
 }
+
+/// Where `relight/` has a shadow the reference picture is without it beside the hole, too: reduced, what is left of it would be a dark
+/// line around the hole.
+#[test]
+fn the_reference_has_no_shadow() {
+    let folder = capture();
+    let mut request = Request::new(folder.path().join("photos"), folder.path().join("scene"));
+    (request.fit_steps, request.fit_side) = (30, 64);
+    request.only = vec![Step::Poses, Step::Fit, Step::Masks];
+    request.objects[0].evidence = vec![(name(4), Evidence::Mask(truth(&folder, 4)))];
+    prepared(&request);
+    fs::create_dir(request.out.join("relight")).expect("writable");
+    let photographs = scene_pictures(&request.out.join("images"));
+    for (name, picture) in &photographs {
+        let light = RgbImage::from_pixel(picture.width(), picture.height(), image::Rgb([204; 3]));
+        light.save(request.out.join("relight").join(format!("{name}.png"))).expect("writable");
+    }
+    request.only = vec![Step::Reference];
+    prepared(&request);
+    let references = scene_pictures(&request.out.join("reference"));
+    let (name, reference) = references.iter().next().expect("a reference");
+    let provenance = image::open(request.out.join("prepare/provenance.png")).expect("a picture").into_rgb8();
+    let lit = |v: u8| (f64::from(v) / 0.8).round().min(255.0) as u8;
+    let mut beside = 0;
+    for ((x, y, from), own) in provenance.enumerate_pixels().zip(reference.pixels()) {
+        if from.0 == [0; 3] {
+            assert_eq!(own.0, photographs[name].get_pixel(x, y).0.map(lit), "{x}, {y}");
+            beside += 1;
+        }
+    }
+    assert!(beside > 100, "{beside}");
+}
+
+/// Pictures of a folder by name.
+fn scene_pictures(folder: &Path) -> std::collections::BTreeMap<String, RgbImage> {
+    let pictures = files(folder).into_iter().filter(|path| path.extension().is_some_and(|e| e == "png" || e == "jpg"));
+    let open = |path: PathBuf| {
+        let name = path.file_stem().expect("a name").to_string_lossy().into_owned();
+        (name, image::open(path).expect("a picture").into_rgb8())
+    };
+    pictures.map(open).collect()
+}
