@@ -185,7 +185,7 @@ enum Poses {
 
 #[derive(Debug, Clone, Copy, Default, clap::Args)]
 pub(super) struct PosesArgs {
-    /// What to do about the cameras' poses
+    /// Whether the cameras' poses are judged again
     #[arg(long, value_name = "WHAT", value_enum, default_value_t = Poses::Again)]
     poses: Poses,
 }

@@ -503,6 +503,9 @@ impl Preparation<'_> {
             return Ok(false);
         }
         let model = scene::colmap::read(&root)?;
+        if model.tracks.is_empty() {
+            return Ok(false);
+        }
         let masks = self.masks_on_disk(scene)?;
         let Some(parts) = unfold::parts(&model, &masked(scene, &masks)) else { return Ok(false) };
         let fine = masked(&self.load(unfold::PICTURES, false)?, &masks);

@@ -57,7 +57,12 @@ pub struct Parts {
     pub of: Vec<Option<usize>>,
     /// How many photographs each has.
     pub counts: Vec<usize>,
+    /// `[point of the model]` see [`told`].
+    told: Vec<Told>,
 }
+
+/// The photographs of a point, each once, and whether it is the object's.
+type Told = (Vec<usize>, bool);
 
 /// A part, turned about the object.
 #[derive(Clone, Copy, Debug)]
@@ -88,7 +93,7 @@ impl Turn {
 
 /// `[point of the model]` its photographs, each once, and whether it is the object's, by the masks of a scene's train views or by where
 /// it is.
-fn told(model: &Model, scene: &Scene) -> Vec<(Vec<usize>, bool)> {
+fn told(model: &Model, scene: &Scene) -> Vec<Told> {
     let number: BTreeMap<u32, usize> = model.images.iter().enumerate().map(|(at, image)| (image.id, at)).collect();
     let views: BTreeMap<&str, usize> = scene.train.iter().enumerate().map(|(at, v)| (v.name.as_str(), at)).collect();
     let view: Vec<Option<usize>> =
@@ -107,8 +112,7 @@ fn told(model: &Model, scene: &Scene) -> Vec<(Vec<usize>, bool)> {
         let (inside, all) = seen.fold((0.0, 0.0), |(a, b), inside| (a + f64::from(u8::from(inside)), b + 1.0));
         (images, inside > OBJECTS * all)
     };
-    let mut told: Vec<(Vec<usize>, bool)> =
-        (0..model.points.len().min(model.tracks.len())).into_par_iter().map(one).collect();
+    let mut told: Vec<Told> = (0..model.points.len().min(model.tracks.len())).into_par_iter().map(one).collect();
     let object: Vec<DVec3> = (0..told.len()).filter(|point| told[*point].1).map(|point| place(point).into()).collect();
     if let Some((middle, size)) = plane::extent(&object) {
         let near = |point: usize| DVec3::from(place(point)).distance(middle) < NEAR * size;
@@ -121,7 +125,8 @@ fn told(model: &Model, scene: &Scene) -> Vec<(Vec<usize>, bool)> {
 pub fn parts(model: &Model, scene: &Scene) -> Option<Parts> {
     let n = model.images.len();
     let mut links = vec![0u32; n * n];
-    for (images, _) in told(model, scene).iter().filter(|(_, objects)| !objects) {
+    let told = told(model, scene);
+    for (images, _) in told.iter().filter(|(_, objects)| !objects) {
         let pairs = images.iter().flat_map(|a| images.iter().map(move |b| (*a, *b)));
         pairs.for_each(|(a, b)| links[a * n + b] += u32::from(a != b));
     }
@@ -163,7 +168,7 @@ pub fn parts(model: &Model, scene: &Scene) -> Option<Parts> {
         of[image] = Some(shared[0].1).filter(|_| shared[0].0 > 2 * shared[1].0);
     }
     let counts = (0..all.len()).map(|number| of.iter().filter(|own| **own == Some(number)).count()).collect();
-    Some(Parts { of, counts })
+    Some(Parts { of, counts, told })
 }
 
 /// A surface seen from above; NaN where nobody sees it.
@@ -195,7 +200,7 @@ impl Drawing {
         Self { side: SIDE, values: (0..SIDE * SIDE).into_par_iter().map(one).collect() }.without_light()
     }
 
-    /// Sums and counts of what is known so near each pixel, to each side.
+    /// The mean of what is known so near each pixel, to each side.
     fn means(&self, reach: usize) -> Vec<f32> {
         let n = self.side;
         let mean = |i: usize| {
@@ -211,7 +216,7 @@ impl Drawing {
         (0..n * n).into_par_iter().map(mean).collect()
     }
 
-    /// What differs from its surroundings.
+    /// The drawing without its light: the difference of each pixel from the mean around it.
     fn without_light(self) -> Self {
         let around = self.means(AROUND);
         let values = self.values.iter().zip(around).map(|(v, around)| (v - around).clamp(-MOST, MOST)).collect();
@@ -308,9 +313,9 @@ fn turn(own: &Drawing, other: &Drawing) -> Option<(f64, DVec2, [f64; 3])> {
 
 /// The parts that have to be turned about the object to stand where the largest one stands; the scene has masks.
 pub fn turns(model: &Model, scene: &Scene, parts: &Parts, seed: u64) -> Vec<Turn> {
-    let told = told(model, scene);
     let points = |objects: bool| -> Vec<DVec3> {
-        let some = told.iter().zip(&model.points).filter(|((images, own), _)| *own == objects && images.len() > 1);
+        let some =
+            parts.told.iter().zip(&model.points).filter(|((images, own), _)| *own == objects && images.len() > 1);
         some.map(|(_, point)| DVec3::from(point.position.map(f64::from)) / scene.unit).collect()
     };
     let object = points(true);
