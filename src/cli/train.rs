@@ -219,9 +219,6 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
 /// The settings of a training that goes on from a splat.
 fn begun_from(path: &Path) -> anyhow::Result<Vec<String>> {
     let splat = splat::read::read(path)?;
-    if splat.cloud.antialiased {
-        eprintln!("warning: {}", splat::read::ANTIALIASED);
-    }
     let absolute = std::path::absolute(path).with_context(|| path.display().to_string())?;
     let name = toml::Value::String(absolute.to_string_lossy().into_owned());
     // Room to grow by a half.

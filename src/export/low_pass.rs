@@ -7,10 +7,11 @@ use crate::render::widen::variance;
 use crate::scene::Camera;
 
 /// Widens all Gaussians for pictures `larger` times as large as those of the `cameras`, which are in the cloud's axes. A
-/// pixel's size at a Gaussian is the mean over the cameras whose picture it lies in, of its square.
+/// pixel's size at a Gaussian is the mean over the cameras whose picture it lies in, of its square. Those trained for
+/// antialiasing stay: they are as wide as they are to be.
 pub fn widen(cloud: &mut Cloud, cameras: &[Camera], larger: f64) {
     let variance = variance(larger.min(LARGEST));
-    if variance == 0.0 {
+    if variance == 0.0 || cloud.antialiased {
         return;
     }
     for (position, log_scale) in cloud.position.iter().zip(&mut cloud.log_scale) {

@@ -26,7 +26,7 @@ pub struct Cloud {
     /// \[gaussian, coefficient\] rgb, `(degree + 1)^2` coefficients: see [`crate::math::harmonics`].
     pub harmonics: Vec<[f32; 3]>,
     /// Whether the opacities were trained for antialiasing (Mip-Splatting), where a Gaussian that is smaller than a pixel is
-    /// fainter. Files keep it; pictures here are drawn without.
+    /// fainter: see [`crate::render::compensate`].
     pub antialiased: bool,
 }
 
@@ -155,6 +155,8 @@ pub struct Static {
     /// What a coefficient beyond the first is of what is learnt of it. A step of Adam has a length of its own whatever the
     /// gradient's: it moves these coefficients by so much less.
     pub higher: f32,
+    /// As [`Cloud::antialiased`].
+    pub antialiased: bool,
 }
 
 impl Static {
@@ -190,6 +192,7 @@ impl Static {
             logit: parameter(Group::Opacity, NAMES[3], 1, &cloud.logit)?,
             harmonics: parameter(Group::Harmonics, NAMES[4], 3 * each as u32, harmonics.as_flattened())?,
             higher,
+            antialiased: cloud.antialiased,
         })
     }
 
@@ -230,7 +233,7 @@ impl Static {
             logit: read(&self.logit)?,
             degree: self.degree,
             harmonics,
-            antialiased: false,
+            antialiased: self.antialiased,
         })
     }
 }

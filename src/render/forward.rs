@@ -1,13 +1,14 @@
 //! The forward stages, from what is learnt to the tiles' lists.
 
 use super::bin::{Bin, Binned};
+use super::compensate::{self, Compensate};
 use super::decode::Decode;
 use super::method::Method;
 use super::project::{Gaussians, Project, Projected};
 use super::slots::Slots;
 use super::visible::Visible;
 use super::widen;
-use crate::gpu::{Error, Gpu, Recorder};
+use crate::gpu::{Buffer, Error, Gpu, Recorder};
 use crate::primitives::limit::Limits;
 pub use crate::representation::{Capacity, Front, Representation};
 use crate::scene::Camera;
@@ -19,6 +20,8 @@ pub struct Forward {
     pub front: Front,
     /// Gaussians on the picture.
     pub project: Project,
+    /// What is drawn of their opacity, of a model that was trained for antialiasing.
+    pub compensate: Option<Compensate>,
     /// Tiles' lists.
     pub bin: Bin,
     /// Slots of Gaussians that there is room for.
@@ -46,6 +49,10 @@ impl Forward {
         Ok(Self {
             front: model.front(gpu, capacity, cull)?,
             project: gpu.stage(stage::PROJECT, || Project::new(gpu, rows, offsets))?,
+            compensate: model
+                .antialiased()
+                .then(|| gpu.stage(stage::PROJECT, || Compensate::new(gpu, slots)))
+                .transpose()?,
             bin: gpu.stage(stage::BIN, || Bin::new(gpu, method, slots, capacity.pairs, size))?,
             slots,
             larger: 1.0,
@@ -88,7 +95,32 @@ impl Forward {
     pub fn projected(&self) -> Projected<'_> {
         let (slots, existing, _, opacity, color) = self.front.drawn();
         let Project { mean, covariance, depth } = &self.project;
+        let opacity = self.compensate.as_ref().map_or(opacity, |compensate| &compensate.drawn);
         Projected { slots, existing, mean, covariance, depth, opacity, color }
+    }
+
+    /// Records the Gaussians that exist onto the picture.
+    pub fn project(&self, rec: &mut Recorder<'_>, camera: &Camera, near: f32) {
+        let (_, existing, gaussians, opacity, _) = self.front.drawn();
+        self.project.record(rec, existing, gaussians, camera, near);
+        if let Some(compensate) = &self.compensate {
+            compensate.record(rec, existing, &self.project.covariance, opacity);
+        }
+    }
+
+    /// Records what makes gradients of the opacity that is drawn, in their place, those of the opacity; those of the
+    /// covariance's factors get their share.
+    pub fn uncompensate(
+        &self,
+        rec: &mut Recorder<'_>,
+        drawn: &Slots,
+        grad_covariance: &Buffer<[f32; 3]>,
+        grad_opacity: &Buffer<f32>,
+    ) {
+        if self.compensate.is_some() {
+            let of = (&self.project.covariance, self.front.drawn().3);
+            compensate::backward(rec, drawn, of, (grad_covariance, grad_opacity));
+        }
     }
 
     /// Records everything before the picture: which rows are in view, their Gaussians, and the tiles' lists.
@@ -105,8 +137,10 @@ impl Forward {
     ) -> Binned<'s> {
         model.cull(rec, &self.front, camera, near, limits);
         model.decode(rec, &self.front, None, camera, limits);
-        widen::record(rec, self.existing(), self.gaussians(), camera, self.larger);
-        self.project.record(rec, self.existing(), self.gaussians(), camera, near);
+        if self.compensate.is_none() {
+            widen::record(rec, self.existing(), self.gaussians(), camera, self.larger);
+        }
+        self.project(rec, camera, near);
         self.bin.record(rec, self.projected(), camera.size, limits)
     }
 }

@@ -2,6 +2,7 @@
 
 pub mod activate;
 pub mod bin;
+pub mod compensate;
 pub mod config;
 pub mod cull;
 pub mod decode;

@@ -26,6 +26,10 @@ impl Representation for Static {
         1
     }
 
+    fn antialiased(&self) -> bool {
+        self.antialiased
+    }
+
     fn rows(&self) -> Vec<&Parameter> {
         self.parameters().to_vec()
     }

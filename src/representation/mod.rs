@@ -32,6 +32,11 @@ pub trait Representation: Send + Sync {
     /// Gaussians of a row.
     fn offsets(&self) -> u32;
 
+    /// Whether a Gaussian that is smaller than a pixel is drawn fainter: see [`crate::render::compensate`].
+    fn antialiased(&self) -> bool {
+        false
+    }
+
     /// The parameters with a value for each row.
     fn rows(&self) -> Vec<&Parameter>;
 

@@ -50,10 +50,6 @@ const MOST_LOGIT: f32 = 20.0;
 /// Natural logarithms of standard deviations that are drawn, scene units; files have minus infinity for flat Gaussians.
 const LOG_SCALES: [f32; 2] = [-30.0, 20.0];
 
-/// What is said of a splat whose [`Cloud::antialiased`] is set.
-pub const ANTIALIASED: &str = "this splat was trained with antialiasing and is drawn without: Gaussians smaller than a pixel \
-                               look heavier than its own program shows them";
-
 /// Whether the file has a splat's name.
 pub fn is_splat(path: &Path) -> bool {
     path.is_file() && EXTENSIONS.contains(&extension(path).as_str())

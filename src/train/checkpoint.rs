@@ -69,6 +69,8 @@ pub struct Model {
     pub offsets: u32,
     /// Anchors or plain Gaussians.
     pub anchors: u32,
+    /// As [`Cloud::antialiased`].
+    pub antialiased: bool,
     arrays: BTreeMap<String, Values>,
 }
 
@@ -131,7 +133,8 @@ impl Model {
             arrays.insert(WAITING.to_owned(), Values::Float(initial.clone()));
         }
         let offsets = step.learnt.anchors().map_or(PLAIN, |anchors| anchors.offsets);
-        Ok(Self { capacity: step.capacity(), voxel: step.voxel, offsets, anchors: step.learnt.count(), arrays })
+        let (capacity, anchors) = (step.capacity(), step.learnt.count());
+        Ok(Self { capacity, voxel: step.voxel, offsets, anchors, antialiased: step.learnt.antialiased(), arrays })
     }
 
     fn float(&self, name: &str) -> &[f32] {
@@ -163,7 +166,7 @@ impl Model {
             logit: self.float("logit").to_vec(),
             degree: self.degree().unwrap_or(0),
             harmonics: triples("harmonics"),
-            antialiased: false,
+            antialiased: self.antialiased,
         }
     }
 
@@ -309,6 +312,8 @@ struct Metadata {
     voxel: u64,
     offsets: u32,
     anchors: u32,
+    #[serde(default)]
+    antialiased: bool,
 }
 
 impl Metadata {
@@ -329,6 +334,7 @@ impl Metadata {
             voxel: model.voxel.to_bits(),
             offsets: model.offsets,
             anchors: model.anchors,
+            antialiased: model.antialiased,
         }
     }
 
@@ -660,6 +666,7 @@ pub fn read(path: &Path, owner: &Owner) -> Result<State, Refusal> {
         voxel: f64::from_bits(stored.voxel),
         offsets: stored.offsets,
         anchors: stored.anchors,
+        antialiased: stored.antialiased,
         arrays,
     };
     model.check().map_err(refuse)?;

@@ -68,9 +68,6 @@ pub fn open(args: &Args, places: &Places) -> anyhow::Result<Source> {
         bail!("{}: what is made would be written over it: choose another --out", path.display());
     }
     let splat = read::read(path)?;
-    if splat.cloud.antialiased {
-        eprintln!("warning: {}", read::ANTIALIASED);
-    }
     let from = args.cameras.clone().or_else(|| cameras::beside(path)).ok_or_else(|| {
         Error::Request(format!(
             "{}: there is no cameras.json beside it; name one, or the folder of a COLMAP model, with --cameras",

@@ -408,6 +408,19 @@ pub const TABLE: &[Formula] = &[
         },
     },
     Formula {
+        pass: "render/compensate",
+        variants: &[],
+        derivation: "per Gaussian its place in the list 4, covariance 12, opacity 4 and what is drawn of it 4 B; 11 operations",
+        work: |c, _| work(24.0 * c.gaussians, 11.0 * c.gaussians, 0.0),
+    },
+    Formula {
+        pass: "render/compensate_backward",
+        variants: &[],
+        derivation: "per Gaussian drawn its place in the list 4, covariance 12, opacity 4 B, gradients of both, read and written, \
+                     32 B; 30 operations",
+        work: |c, _| work(52.0 * c.drawn, 30.0 * c.drawn, 0.0),
+    },
+    Formula {
         pass: "render/project_backward",
         variants: &["color"],
         derivation: "per Gaussian drawn its place in the list 4, position 12, scale 12, rotation 16 and their gradients 40, \

@@ -95,8 +95,8 @@ pub fn of_passes<'a>(passes: impl IntoIterator<Item = &'a str>) -> Vec<Stage> {
             "render" if stem.starts_with("cull") => Stage::Cull,
             "render" if stem.starts_with("decode_backward") => Stage::DecodeBackward,
             "render" if stem.starts_with("decode") => Stage::Decode,
-            "render" if stem.starts_with("project_backward") => Stage::ProjectBackward,
-            "render" if stem.starts_with("project") => Stage::Project,
+            "render" if stem.starts_with("project_backward") || stem == "compensate_backward" => Stage::ProjectBackward,
+            "render" if stem.starts_with("project") || stem == "compensate" => Stage::Project,
             "render" if stem.starts_with("bin") => Stage::Bin,
             "render" if stem.starts_with("rasterize_backward") || stem.starts_with("rasterize_gather") => {
                 Stage::RasterizeBackward

@@ -278,7 +278,7 @@ impl Step {
         rec.stage(stage::DECODE);
         learnt.decode(rec, front, feature, camera, limits);
         rec.stage(stage::PROJECT);
-        forward.project.record(rec, forward.existing(), forward.gaussians(), camera, *near);
+        forward.project(rec, camera, *near);
         rec.stage(stage::BIN);
         let binned = forward.bin.record(rec, forward.projected(), camera.size, limits);
         rec.stage(stage::RASTERIZE);
@@ -298,6 +298,7 @@ impl Step {
             depth: gradient.depth.and(backward.grad_depth.as_ref()),
         };
         rec.stage(stage::PROJECT_BACKWARD);
+        forward.uncompensate(rec, binned.drawn, &backward.grad_covariance, &backward.grad_opacity);
         project_backward.record(rec, binned.drawn, forward.gaussians(), splats, camera, *near);
         rec.stage(stage::DECODE_BACKWARD);
         let gradients = GaussianGradients {
