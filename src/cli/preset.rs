@@ -58,6 +58,10 @@ fn describe(preset: &str, device: &DeviceInfo, settings: &Settings) -> String {
         1 => "the pictures' own size".to_owned(),
         n => format!("1/{n} of the pictures' size"),
     };
+    let size = match train.coarse.until {
+        0 => size,
+        until => format!("{size}, the first {until} at half of that"),
+    };
     let run = format!("{} steps at {size}", train.iterations);
     match preset {
         "gscream" => {
@@ -114,7 +118,7 @@ mod tests {
         let mut args =
             Probe::try_parse_from(["probe", "s", "--set", "scene.downscale=2", "--seed", "3"]).expect("parses");
         args.scene.settings.preset = Some("lavapipe".into());
-        args.scene.settings.reduced = Some(7);
+        args.scene.settings.fitted = vec!["scene.downscale=7".into()];
         let settings = args.scene.settings.resolve().expect("settings that make sense");
         assert_eq!((settings.scene.downscale, settings.train.iterations, settings.train.seed), (2, 4500, 3));
         assert_eq!(

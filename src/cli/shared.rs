@@ -12,6 +12,8 @@ use crate::work::{Loaded, SYNTHETIC, load_scene};
 
 /// Longer side of the pictures that a CPU trains on in minutes, pixels: a quarter of SPIn-NeRF's 1008.
 const SIDE: f64 = 252.0;
+/// Part of the steps of plain Gaussians that see pictures of half the size (`src/train/README.md`, "Larger pictures last").
+const COARSE: f64 = 0.8;
 
 /// Which device to compute on, and how closely to watch it.
 #[derive(Debug, Clone, Default, clap::Args)]
@@ -109,10 +111,12 @@ impl SceneArgs {
     /// The settings for this scene: a preset for CPUs reduces its pictures to the size that such a device has time for.
     ///
     /// # Errors
-    /// Settings that make no sense.
+    /// Settings that make no sense; a scene that cannot be read.
     pub fn resolve(&self) -> anyhow::Result<Settings> {
-        let reduced = downscale(self.settings.preset.as_deref(), || scene::longest_side(&self.scene));
-        Ok(SettingsArgs { reduced, ..self.settings.clone() }.resolve()?)
+        let asked = self.settings.resolve()?;
+        let preset = self.settings.preset.as_deref();
+        let fitted = fitted(preset, asked.train.iterations, || scene::longest_side(&self.scene));
+        Ok(SettingsArgs { fitted, ..self.settings.clone() }.resolve()?)
     }
 
     /// The scene as a run's record names it.
@@ -126,12 +130,21 @@ impl SceneArgs {
     }
 }
 
-/// How far a preset reduces pictures whose longer side is `longest` pixels: those for CPUs to about [`SIDE`]. Nothing
-/// where the preset's own setting holds; no picture is looked at then.
-fn downscale(preset: Option<&str>, longest: impl FnOnce() -> Option<u32>) -> Option<u32> {
-    let reduces = matches!(preset, Some("gaussians" | "lavapipe"));
-    let longest = reduces.then(longest).flatten();
-    longest.map(|side| (f64::from(side) / SIDE).round().max(1.0) as u32)
+/// What a preset for CPUs says of pictures whose longer side is `longest` pixels, in runs of so many steps: with anchors they are
+/// reduced to about [`SIDE`]; with plain Gaussians to twice that, after [`COARSE`] of the steps on half of it. Nothing where
+/// the preset's own setting holds; no picture is looked at then.
+fn fitted(preset: Option<&str>, iterations: u32, longest: impl FnOnce() -> Option<u32>) -> Vec<String> {
+    let last = match preset {
+        Some("lavapipe") => SIDE,
+        Some("gaussians") => 2.0 * SIDE,
+        _ => return vec![],
+    };
+    let Some(longest) = longest().map(f64::from) else { return vec![] };
+    let downscale = (longest / last).round().max(1.0);
+    // Nor are pictures halved that are small as they are.
+    let coarse = last > SIDE && longest / downscale >= 1.5 * SIDE;
+    let until = coarse.then(|| format!("train.coarse.until={}", (COARSE * f64::from(iterations)) as u32));
+    std::iter::once(format!("scene.downscale={downscale}")).chain(until).collect()
 }
 
 /// A step that is measured, and how often.
@@ -229,14 +242,18 @@ mod tests {
 
     #[test]
     fn presets_for_a_cpu_reduce_by_the_pictures_size() {
-        for (longest, n) in
-            [(Some(1008), Some(4)), (Some(4032), Some(16)), (Some(256), Some(1)), (Some(32), Some(1)), (None, None)]
-        {
-            assert_eq!(downscale(Some("gaussians"), || longest), n, "{longest:?}");
-            assert_eq!(downscale(Some("lavapipe"), || longest), n, "{longest:?}");
-            assert_eq!(downscale(Some("paper"), || longest), None, "{longest:?}");
-            assert_eq!(downscale(None, || longest), None, "{longest:?}");
+        let of = |preset: &'static str, longest: Option<u32>| fitted(Some(preset), 1000, || longest).join(" ");
+        for (longest, by) in [(1008, 4), (4032, 16), (256, 1), (32, 1)] {
+            assert_eq!(of("lavapipe", Some(longest)), format!("scene.downscale={by}"), "{longest}");
         }
+        for (longest, by) in [(1008, 2), (4032, 8), (800, 2), (512, 1), (378, 1)] {
+            let want = format!("scene.downscale={by} train.coarse.until=800");
+            assert_eq!(of("gaussians", Some(longest)), want, "{longest}");
+        }
+        // Small pictures are not halved.
+        assert_eq!([of("gaussians", Some(377)), of("gaussians", Some(32))], ["scene.downscale=1"; 2]);
+        assert_eq!([of("gaussians", None), of("lavapipe", None), of("paper", Some(1008))], [""; 3]);
+        assert!(fitted(None, 1000, || unreachable!("no preset, no picture")).is_empty());
     }
 
     #[test]

@@ -46,9 +46,9 @@ pub struct SettingsArgs {
     /// photograph would say.
     #[arg(long, value_name = "FILE", requires = "truth_reference")]
     pub truth_prior: Option<PathBuf>,
-    /// `scene.downscale` in place of the preset's own, below a file and single settings
+    /// Settings in place of the preset's own, below a file and single settings
     #[arg(skip)]
-    pub reduced: Option<u32>,
+    pub fitted: Vec<String>,
 }
 
 impl SettingsArgs {
@@ -67,7 +67,7 @@ impl SettingsArgs {
             path.to_string_lossy().into_owned()
         };
         let preset = self.preset.iter().cloned().map(Source::Preset);
-        let reduced = self.reduced.map(|n| Source::Set(format!("scene.downscale={n}")));
+        let fitted = self.fitted.iter().cloned().map(Source::Set);
         let file = self.config.iter().cloned().map(Source::File);
         let set = self.set.iter().cloned().map(Source::Set);
         let flags = [
@@ -77,7 +77,7 @@ impl SettingsArgs {
             text("--truth-reference", "scene.truth_reference", self.truth_reference.clone()),
             text("--truth-prior", "scene.truth_prior", self.truth_prior.as_ref().map(place)),
         ];
-        preset.chain(reduced).chain(file).chain(set).chain(flags.into_iter().flatten()).collect()
+        preset.chain(fitted).chain(file).chain(set).chain(flags.into_iter().flatten()).collect()
     }
 
     /// The settings these arguments ask for.

@@ -173,7 +173,7 @@ mod tests {
         let options = synthetic::Options { width: 64, height: 48, train_views: 5, points: 400, ..Default::default() };
         synthetic::write(&dir, &options).expect("a scene");
         let scene = load(&dir, &Config::default()).expect("it loads");
-        let pictures: Vec<Picture> = scene.train.iter().map(Picture::new).collect();
+        let pictures: Vec<Picture> = scene.train.iter().map(|view| Picture::new(view, 1)).collect();
         let near = &neighbors::choose(&pictures, 5, &scene.points).of[2];
         assert_eq!(near.len(), 4);
         let gpu = testing::gpu();

@@ -140,7 +140,7 @@ impl Matched {
     /// # Errors
     /// When the device has no room or is lost.
     pub fn new(gpu: &Gpu, scene: &Scene) -> Result<Self, Error> {
-        let pictures: Vec<Picture> = scene.train.par_iter().map(Picture::new).collect();
+        let pictures: Vec<Picture> = scene.train.par_iter().map(|view| Picture::new(view, 1)).collect();
         let neighbors = neighbors::choose(&pictures, pictures.len(), &scene.points);
         let maps = depth::estimate(gpu, &pictures, &neighbors.of, &scene.points)?;
         let confirmed = fuse::confirm(&pictures, &neighbors.of, &maps);
@@ -152,7 +152,7 @@ impl Matched {
 
     /// Points that the photographs add to those of the sparse model, none of views whose cameras are wrong.
     pub fn points(&self, scene: &Scene) -> Vec<Point> {
-        let pictures: Vec<Picture> = scene.train.par_iter().map(Picture::new).collect();
+        let pictures: Vec<Picture> = scene.train.par_iter().map(|view| Picture::new(view, 1)).collect();
         let wrong = agree::wrong(&agree::shares(&pictures, &self.neighbors, &self.confirmed));
         let known = |(surface, wrong): (&fuse::Surface, bool)| match wrong {
             true => vec![f64::NAN; surface.len()],
@@ -164,7 +164,7 @@ impl Matched {
 
     /// [`depths`] of the same views, with the masks that they have in this scene.
     pub fn depths(&self, scene: &Scene) -> Vec<DepthGrid> {
-        let pictures = scene.train.par_iter().map(Picture::new).collect();
+        let pictures = scene.train.par_iter().map(|view| Picture::new(view, 1)).collect();
         grids(pictures, self)
     }
 }

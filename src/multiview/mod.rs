@@ -110,18 +110,19 @@ pub struct Stereo {
     pub note: String,
 }
 
-/// Points that the scene's photographs add to those of its sparse model, and the views that contradict the others.
+/// Points that the scene's photographs, at one part of their size in `reduction` at most, add to those of its sparse model, and
+/// the views that contradict the others.
 ///
 /// Masked pixels, which show the object, add none, and neither do places on the object.
 ///
 /// # Errors
 /// When the device has no room or is lost.
-pub fn look(gpu: &Gpu, scene: &Scene) -> Result<Stereo, Error> {
+pub fn look(gpu: &Gpu, scene: &Scene, reduction: u32) -> Result<Stereo, Error> {
     use rayon::prelude::*;
     // Test views are asked for their place alone: no other view is compared with them.
     let views: Vec<&View> = scene.train.iter().chain(&scene.test).collect();
     let train = scene.train.len();
-    let pictures: Vec<Picture> = views.par_iter().map(|view| Picture::new(view)).collect();
+    let pictures: Vec<Picture> = views.par_iter().map(|view| Picture::new(view, reduction)).collect();
     let neighbors = neighbors::choose(&pictures, train, &scene.points);
     let maps = depth::estimate(gpu, &pictures, &neighbors.of, &scene.points)?;
     let surfaces = fuse::confirm(&pictures, &neighbors.of, &maps);
@@ -196,7 +197,7 @@ mod tests {
         let gpu = testing::gpu();
         let mut scene = built_in(&synthetic::Options { train_views: 16, test_views: 4, ..Default::default() });
         scene.train.append(&mut scene.test);
-        let pictures: Vec<Picture> = scene.train.iter().map(Picture::new).collect();
+        let pictures: Vec<Picture> = scene.train.iter().map(|view| Picture::new(view, 1)).collect();
         let neighbors = neighbors::choose(&pictures, pictures.len(), &scene.points);
         let maps = depth::estimate(&gpu, &pictures, &neighbors.of, &scene.points).expect("a device");
         let surfaces = fuse::confirm(&pictures, &neighbors.of, &maps);
@@ -244,18 +245,18 @@ mod tests {
             ..Default::default()
         };
         let scene = built_in(&options);
-        let found = look(&gpu, &scene).expect("a device");
+        let found = look(&gpu, &scene, 1).expect("a device");
         let Stereo { points, note, .. } = &found;
         assert!(points.len() > 50 && points.len() <= 8 * 80 * 60 / PIXELS_PER_POINT, "{note}");
         assert!(note.contains("(scene.dense)"), "{note}");
         let on_object = crate::scene::on_object(&scene.train);
         assert!(!points.iter().any(on_object));
-        assert_eq!(look(&gpu, &scene).expect("a device"), found);
+        assert_eq!(look(&gpu, &scene, 1).expect("a device"), found);
         // One view has no neighbours, and nothing is found without any points to begin with.
         let alone = Scene { train: scene.train[..1].to_vec(), references: vec![], ..scene.clone() };
-        assert_eq!(look(&gpu, &alone).expect("a device").points, []);
+        assert_eq!(look(&gpu, &alone, 1).expect("a device").points, []);
         let blind = Scene { points: vec![], ..scene };
-        assert_eq!(look(&gpu, &blind).expect("a device").points, []);
+        assert_eq!(look(&gpu, &blind, 1).expect("a device").points, []);
     }
 
     /// A camera turned away by some degrees sees what no other view confirms; all the others stay, and so does it in its place.
@@ -264,7 +265,7 @@ mod tests {
         let gpu = testing::gpu();
         let options = synthetic::Options { train_views: 16, test_views: 4, ..Default::default() };
         let mut scene = built_in(&options);
-        assert_eq!(look(&gpu, &scene).expect("a device").wrong, [""; 0]);
+        assert_eq!(look(&gpu, &scene, 1).expect("a device").wrong, [""; 0]);
         let turn = |view: &mut View| {
             let (sin, cos) = 0.12_f32.sin_cos();
             let [x, y, z] = view.camera.rotation;
@@ -277,6 +278,6 @@ mod tests {
         turn(&mut scene.train[at]);
         turn(&mut scene.test[2]);
         let names = [scene.train[at].name.clone(), scene.test[2].name.clone()];
-        assert_eq!(look(&gpu, &scene).expect("a device").wrong, names);
+        assert_eq!(look(&gpu, &scene, 1).expect("a device").wrong, names);
     }
 }

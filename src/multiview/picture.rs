@@ -22,9 +22,10 @@ pub(super) struct Picture {
 }
 
 impl Picture {
-    pub fn new(view: &View) -> Self {
+    /// Of a photograph at one part of its size in `reduction`, at most.
+    pub fn new(view: &View, reduction: u32) -> Self {
         let [w, h] = view.camera.size;
-        let ratio = w.max(h).div_ceil(LONGEST);
+        let ratio = w.max(h).div_ceil(LONGEST).max(reduction);
         let size = [w, h].map(|n| (n / ratio).max(STRIDE));
         let image = resample::photograph(&view.image, size);
         let lens = view.camera.scaled(size);
@@ -137,7 +138,7 @@ mod tests {
             };
             let name = String::new();
             let view = View { name, camera, image: image.clone(), mask: None, weight: None, prior: None, depth: None };
-            let picture = Picture::new(&view);
+            let picture = Picture::new(&view, 1);
             let mut shown = 0;
             for site in (0..picture.sites.len()).filter(|site| picture.shown[*site]) {
                 let point = picture.lift(picture.pixel(site), 2.5);

@@ -88,7 +88,8 @@ impl Loaded {
     pub fn ready(mut self, gpu: &Gpu) -> anyhow::Result<Ready> {
         while self.settings.scene.dense {
             let Self { scene, settings, .. } = &mut self;
-            let found = multiview::look(gpu, scene)?;
+            // By the pictures that training begins with.
+            let found = multiview::look(gpu, scene, settings.train.coarse.reduction(1))?;
             let views = scene.train.len() + scene.test.len();
             if found.wrong.is_empty() || views - found.wrong.len() < FEWEST_VIEWS {
                 eprintln!("scene: {}", found.note);

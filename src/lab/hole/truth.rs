@@ -141,7 +141,7 @@ fn wrong(gpu: &Gpu, set: &Path) -> Result<Vec<String>, Error> {
     let mut scene = bare(&load(set, LOOK_SIDE)?);
     let mut wrong = vec![];
     loop {
-        let found = multiview::look(gpu, &scene)?.wrong;
+        let found = multiview::look(gpu, &scene, 1)?.wrong;
         if found.is_empty() || scene.train.len() - found.len() < FEWEST_VIEWS {
             return Ok(wrong);
         }
