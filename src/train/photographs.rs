@@ -57,6 +57,23 @@ pub fn mask_box(mask: &GrayImage) -> Option<[u32; 4]> {
     })
 }
 
+/// What of a mask is not trained on: what was filled is, as the photograph is.
+fn left<'m>(mask: &'m GrayImage, filled: Option<&GrayImage>) -> Cow<'m, GrayImage> {
+    let Some(filled) = filled else { return Cow::Borrowed(mask) };
+    let mut left = mask.clone();
+    left.iter_mut().zip(filled.as_raw()).filter(|(_, f)| **f != 0).for_each(|(m, _)| *m = 0);
+    Cow::Owned(left)
+}
+
+/// A mask at another size, not smaller than it was.
+fn smaller_mask(mask: &GrayImage, size: [u32; 2]) -> Cow<'_, GrayImage> {
+    if mask.dimensions() == (size[0], size[1]) {
+        Cow::Borrowed(mask)
+    } else {
+        Cow::Owned(resample::largest(mask, size))
+    }
+}
+
 /// Uploads all training views, reduced by this factor (1: as they are). Priors stay behind that no loss looks at.
 ///
 /// # Errors
@@ -75,26 +92,9 @@ pub fn upload(gpu: &Gpu, scene: &Scene, plan: &Plan, reduction: u32) -> Result<V
         let size = reduced(full, reduction);
         let smaller = size != full;
         let picture = if smaller { Cow::Owned(resample::photograph(picture, size)) } else { Cow::Borrowed(picture) };
-        let mask = match view.blend() {
-            Some(mask) if smaller => Some(Cow::Owned(resample::largest(mask, size))),
-            mask => mask.map(Cow::Borrowed),
-        };
-        let bounds = mask.as_deref().and_then(mask_box);
-        // What was filled is trained on as the photograph is.
-        let mask = match (mask, hole) {
-            (Some(mask), Some(hole)) => {
-                let filled = if smaller {
-                    Cow::Owned(resample::largest(&hole.filled, size))
-                } else {
-                    Cow::Borrowed(&hole.filled)
-                };
-                let mut left = mask.into_owned();
-                left.iter_mut().zip(filled.as_raw()).filter(|(_, f)| **f != 0).for_each(|(m, _)| *m = 0);
-                Some(Cow::Owned(left))
-            }
-            (mask, _) => mask,
-        };
-        let mask = mask.as_deref();
+        let bounds = view.blend().and_then(|mask| mask_box(&smaller_mask(mask, size)));
+        let mask = view.blend().map(|mask| smaller_mask(&left(mask, hole.map(|hole| &hole.filled)), size).into_owned());
+        let mask = mask.as_ref();
         let prior = match prior.filter(|_| plan.depth_losses(reference.is_some()).any()) {
             Some(prior) => {
                 let reduced = smaller.then(|| resample::map(&prior.values, full, size));
@@ -142,6 +142,18 @@ mod tests {
             let depth = line[0] * p + line[1];
             assert!((scale * depth + shift - (p - range[0]) / range[1]).abs() < 1e-12);
         }
+    }
+
+    /// A pixel of a reduced picture that shows some of the object is not trained on, though another part of it was filled.
+    #[test]
+    fn a_reduced_hole_shows_nothing_of_the_object() {
+        let mask = GrayImage::from_fn(8, 4, |x, _| image::Luma([if x < 5 { 255 } else { 0 }]));
+        let filled = GrayImage::from_fn(8, 4, |x, _| image::Luma([if x < 3 { 255 } else { 0 }]));
+        let of = |filled| smaller_mask(&left(&mask, filled), [4, 2]).into_owned().into_raw();
+        assert_eq!(of(Some(&filled)), [0, 255, 255, 0, 0, 255, 255, 0]);
+        assert_eq!(of(Some(&mask)), [0; 8]);
+        assert_eq!(of(None), [255, 255, 255, 0, 255, 255, 255, 0]);
+        assert_eq!(*smaller_mask(&mask, [8, 4]), mask);
     }
 
     #[test]

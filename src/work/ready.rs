@@ -38,6 +38,16 @@ pub fn load_scene(path: &Path, settings: &Settings) -> anyhow::Result<Scene> {
     Ok(scene)
 }
 
+/// By how much stereo reduces photographs: as training does to begin with, where they are many. From larger ones come more points,
+/// and what ends sharp begins with these.
+fn reduction(scene: &Scene, settings: &Settings) -> u32 {
+    let pixels: usize = scene.train.iter().map(|view| view.image.as_raw().len() / 3).sum();
+    if pixels <= MOST_PIXELS { 1 } else { settings.train.coarse.reduction(1) }
+}
+
+/// Pixels of all photographs that stereo looks at as they are: some twenty seconds on two cores.
+const MOST_PIXELS: usize = 12_000_000;
+
 /// A scene that was read, and the settings that it was read with. Stereo has not run: what needs no points of it needs
 /// no more than this.
 #[derive(Debug)]
@@ -88,8 +98,7 @@ impl Loaded {
     pub fn ready(mut self, gpu: &Gpu) -> anyhow::Result<Ready> {
         while self.settings.scene.dense {
             let Self { scene, settings, .. } = &mut self;
-            // By the pictures that training begins with.
-            let found = multiview::look(gpu, scene, settings.train.coarse.reduction(1))?;
+            let found = multiview::look(gpu, scene, reduction(scene, settings))?;
             let views = scene.train.len() + scene.test.len();
             if found.wrong.is_empty() || views - found.wrong.len() < FEWEST_VIEWS {
                 eprintln!("scene: {}", found.note);

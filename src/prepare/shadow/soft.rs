@@ -20,8 +20,9 @@ use crate::statistics::median;
 
 /// Gaps of this share of the object's height are closed in its foot.
 const GAPS: f64 = 0.12;
-/// The shadow reaches at most so many times the object's size, the larger one of its foot's width and [`TALL`] of its height.
-const REACH: f64 = 1.0;
+/// The shadow reaches at most so many times the object's size, the larger one of its foot's width and [`TALL`] of its height; one
+/// that does not end there is looked for as far as the second of them.
+const REACH: [f64; 2] = [1.0, 1.5];
 const TALL: f64 = 0.6;
 /// The light is fitted on what lies so many times as far away.
 const AROUND: f64 = 2.0;
@@ -63,17 +64,26 @@ const TINT: f64 = 0.4;
 /// A surface leaves at least so much of the light in its shadow.
 const LEFT: f64 = 0.2;
 
+/// A shadow that is longer than what was looked at.
+const OPEN_ENDED: &str = "what is darker around its foot does not end";
+
 /// Looks for it; a clause that says why there is none otherwise.
 ///
 /// # Errors
 /// There is none.
 pub fn find(ground: &Ground<'_>) -> Result<Shadow, String> {
+    let found = within(ground, REACH[0]);
+    if found.as_ref().is_err_and(|why| why == OPEN_ENDED) { within(ground, REACH[1]) } else { found }
+}
+
+/// [`find`] within so many times the object's size.
+fn within(ground: &Ground<'_>, times: f64) -> Result<Shadow, String> {
     let no = |why: &str| why.to_owned();
     let side = ground.side;
     let foot = closed(&low(ground), side, GAPS * ground.height + 2.0);
     let width = width(&foot, side).ok_or_else(|| no("nothing of it is near the surface"))?;
     let size = width.max(TALL * ground.height);
-    let reach = (REACH * size).ceil() as u32;
+    let reach = (times * size).ceil() as u32;
     let far = (AROUND * f64::from(reach)).ceil() as u32;
     let away = distances(&foot, side, far);
     let colors: Vec<Color> = ground.log.iter().map(|log| color(*log)).collect();
@@ -112,7 +122,7 @@ pub fn find(ground: &Ground<'_>) -> Result<Shadow, String> {
         return Err(no("what is around its foot is not darker than the surface"));
     }
     if area > MOST * size * size || all < LEAST_RING * size * size || at_end > OPEN * all {
-        return Err(no("what is darker around its foot does not end"));
+        return Err(no(OPEN_ENDED));
     }
     let mut amounts = faded(&off, &region, &foot, side, (FADE * size).ceil() as u32);
     amounts.iter_mut().zip(&other).filter(|(_, other)| **other).for_each(|(amount, _)| *amount = 0.0);
