@@ -111,7 +111,7 @@ impl SceneArgs {
     /// The settings for this scene: a preset for CPUs reduces its pictures to the size that such a device has time for.
     ///
     /// # Errors
-    /// Settings that make no sense; a scene that cannot be read.
+    /// Settings that make no sense.
     pub fn resolve(&self) -> anyhow::Result<Settings> {
         let asked = self.settings.resolve()?;
         let preset = self.settings.preset.as_deref();
@@ -130,9 +130,9 @@ impl SceneArgs {
     }
 }
 
-/// What a preset for CPUs says of pictures whose longer side is `longest` pixels, in runs of so many steps: with anchors they are
-/// reduced to about [`SIDE`]; with plain Gaussians to twice that, after [`COARSE`] of the steps on half of it. Nothing where
-/// the preset's own setting holds; no picture is looked at then.
+/// Settings of a preset for CPUs that depend on the pictures' longer side, `longest` pixels, and the number of steps: anchors see
+/// pictures reduced to about [`SIDE`], plain Gaussians to twice that, after [`COARSE`] of the steps on half of it. None where
+/// the preset's own settings hold; no picture is looked at then.
 fn fitted(preset: Option<&str>, iterations: u32, longest: impl FnOnce() -> Option<u32>) -> Vec<String> {
     let last = match preset {
         Some("lavapipe") => SIDE,

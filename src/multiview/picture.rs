@@ -22,7 +22,7 @@ pub(super) struct Picture {
 }
 
 impl Picture {
-    /// Of a photograph at one part of its size in `reduction`, at most.
+    /// The photograph of a view, at one part of its size in `reduction` at most.
     pub fn new(view: &View, reduction: u32) -> Self {
         let [w, h] = view.camera.size;
         let ratio = w.max(h).div_ceil(LONGEST).max(reduction);

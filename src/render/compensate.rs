@@ -2,8 +2,8 @@
 //!
 //! Pictures are drawn through a low-pass: every Gaussian has `DILATION` px^2 more variance than it has. In 3D Gaussian
 //! Splatting it keeps its opacity, so that one far below a pixel gives more light the farther away it is seen from, or the
-//! smaller the picture. Here it keeps its light (Mip-Splatting, Yu et al. 2024, equation 9, of which this is the variant
-//! without the smoothing in space; gsplat and PlayCanvas draw files with their tag so):
+//! smaller the picture. Here it keeps its light (Mip-Splatting, Yu et al. 2024, equation 9, without the smoothing in
+//! space, which a file's Gaussians have in them):
 //!
 //! `drawn = opacity sqrt(det S / det C)`, `C = S + DILATION I`,
 //!

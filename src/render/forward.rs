@@ -20,7 +20,7 @@ pub struct Forward {
     pub front: Front,
     /// Gaussians on the picture.
     pub project: Project,
-    /// What is drawn of their opacity, of a model that was trained for antialiasing.
+    /// The opacities that are drawn, where the model was trained for antialiasing.
     pub compensate: Option<Compensate>,
     /// Tiles' lists.
     pub bin: Bin,

@@ -57,7 +57,7 @@ pub fn mask_box(mask: &GrayImage) -> Option<[u32; 4]> {
     })
 }
 
-/// What of a mask is not trained on: what was filled is, as the photograph is.
+/// The part of a mask that is not trained on: what was filled is, as the photograph is.
 fn left<'m>(mask: &'m GrayImage, filled: Option<&GrayImage>) -> Cow<'m, GrayImage> {
     let Some(filled) = filled else { return Cow::Borrowed(mask) };
     let mut left = mask.clone();
