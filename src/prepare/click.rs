@@ -20,6 +20,7 @@ use super::depth::DepthMap;
 use super::graph_cut::{self, COMPONENTS, Mixture, SMOOTHNESS, UNIT, some};
 use super::masks;
 use super::min_cut::{Grid, SHIFTS};
+use super::planes;
 use crate::scene::resample;
 use crate::statistics::{median, quantile};
 
@@ -75,6 +76,15 @@ const OUTLINED: f64 = 1.0;
 const AWAY: f64 = 6.0;
 const NEARER_PART: f64 = 0.35;
 const AS_DEEP: [f64; 2] = [0.5, 0.75];
+/// The weight of lying on a plane that goes on outside a box, and of being as deep as what is in it but off all of these, in nats. Such a
+/// plane has at least this share of what is known around the box, within the first part of its depth, and what is within the second is
+/// on it.
+const ON_GROUND: f64 = 4.0;
+const RAISED: f64 = 2.0;
+const GROUND_SHARE: f64 = 0.02;
+const GROUND_THICKNESS: [f64; 2] = [0.007, 0.015];
+/// Planes say nothing where less than this part of a box's middle is off them: a picture on a wall.
+const LEAST_OFF: f64 = 0.2;
 /// The weight of being nearer to a click than to anything else, in nats.
 const NEAR: f64 = 4.0;
 /// The weight of being within the segment that a click means, in nats.
@@ -334,6 +344,8 @@ struct Pixels {
     outside: Vec<bool>,
     /// By how much where it lies within boxes and lassos speaks for the object, in nats.
     amid: Vec<f64>,
+    /// By how much where it lies off planes that go on outside a box speaks for the object, in nats; below zero on one.
+    raised: Vec<f64>,
 }
 
 impl Pixels {
@@ -392,21 +404,22 @@ impl Pixels {
             touched,
             outside,
             amid,
+            raised: vec![0.0; count],
         };
-        pixels.part_places();
+        let deep = pixels.part_places();
+        if let Some((middle, wide)) = deep.filter(|_| outlines.iter().all(|mark| matches!(mark, Mark::Box { .. }))) {
+            pixels.raised = pixels.raised(middle, wide);
+        }
         pixels.scale_places();
         pixels
     }
 
     /// Places that are [`AWAY`] speak against the object: it is about as deep as it is wide.
-    fn part_places(&mut self) {
+    /// Returns how deep and how wide that is.
+    fn part_places(&mut self) -> Option<(f64, f64)> {
         let inside = |i: &usize| !self.outside[*i] && self.outside.contains(&true);
         let all = || (0..self.places.len()).filter(inside).filter_map(|i| Some((i, self.places[i]?.0)));
-        let Some(middle) =
-            quantile(all().filter(|(i, _)| self.amid[*i] >= 0.0).map(|(_, place)| place[2]), NEARER_PART)
-        else {
-            return;
-        };
+        let middle = quantile(all().filter(|(i, _)| self.amid[*i] >= 0.0).map(|(_, place)| place[2]), NEARER_PART)?;
         let side = |k: usize| {
             let slopes = all().map(|(_, place)| place[k] / place[2]);
             slopes.clone().fold(f64::NEG_INFINITY, f64::max) - slopes.fold(f64::INFINITY, f64::min)
@@ -418,6 +431,38 @@ impl Pixels {
                 *amid -= AWAY * ((off - AS_DEEP[0]) / (AS_DEEP[1] - AS_DEEP[0])).clamp(0.0, 1.0);
             }
         }
+        Some((middle, wide))
+    }
+
+    /// What planes that go on outside the boxes say of each pixel, where the object is so deep and so wide: on one is what the object
+    /// stands on, and what is off all of them in the object's depth stands on it.
+    fn raised(&self, middle: f64, wide: f64) -> Vec<f64> {
+        let count = self.places.len();
+        let away = |i: usize| self.places[i].map(|(place, _)| (place[2] - middle).abs() / wide);
+        let place = |i: usize| self.places[i].filter(|_| away(i) <= Some(AS_DEEP[1])).map(|(place, _)| place);
+        let rays: Vec<Option<[f64; 2]>> = (0..count).map(|i| place(i).map(|[x, y, z]| [x / z, y / z])).collect();
+        let disparity: Vec<f32> = (0..count).map(|i| place(i).map_or(f32::NAN, |[.., z]| z.recip() as f32)).collect();
+        let inside: Vec<bool> = self.outside.iter().map(|outside| !outside).collect();
+        // Depth bleeds over a box that is drawn tightly.
+        let beyond = resample::distances(&self.picture(|i| inside[i]), BLEEDS[1] + 1);
+        let mut on_plane = vec![false; count];
+        for plane in planes::within(&disparity, &rays, &inside, GROUND_SHARE, GROUND_THICKNESS[0]) {
+            let off = |i: usize| Some((place(i)?[2] * planes::on(&plane, rays[i]?) - 1.0).abs());
+            let mut left: Vec<bool> =
+                (0..count).map(|i| off(i).is_some_and(|off| off <= GROUND_THICKNESS[1])).collect();
+            for first in (0..count).filter(|i| beyond[*i] > BLEEDS[1]) {
+                if left[first] {
+                    planes::connected(first, &mut left, self.size).into_iter().for_each(|i| on_plane[i] = true);
+                }
+            }
+        }
+        let core = || (0..count).filter(|i| inside[*i] && self.amid[*i] >= 0.0 && place(*i).is_some());
+        let off = core().filter(|i| !on_plane[*i]).count() as f64;
+        if !on_plane.contains(&true) || off < LEAST_OFF * core().count() as f64 {
+            return vec![0.0; count];
+        }
+        let near = |i: usize| away(i).map_or(0.0, |away| (1.0 - away / AS_DEEP[0]).max(0.0));
+        (0..count).map(|i| if on_plane[i] { -ON_GROUND } else { RAISED * near(i) }).collect()
     }
 
     /// Brings places into units of the depth's roughness where the object is.
@@ -582,9 +627,11 @@ fn solve(
         let most = if pixels.outside.contains(&true) { OUTLINED } else { MOST[1] };
         let behind = behind(&of(false).iter().filter_map(|i| Some(pixels.places[*i]?.0)).collect::<Vec<_>>());
         // By how much a pixel's place speaks for the object: how far it is from where the background goes on.
-        let off = |i: usize| match (&behind, pixels.places[i]) {
-            (Some(behind), Some((place, _))) => (0.5 * (behind.distance(place) - OFF)).clamp(-most, most),
-            _ => 0.0,
+        let off = |i: usize| match (&behind, pixels.places[i], pixels.raised[i]) {
+            (Some(behind), Some((place, _)), raised) if raised >= 0.0 => {
+                (0.5 * (behind.distance(place) - OFF)).clamp(-most, most) + raised
+            }
+            (_, _, raised) => raised,
         };
         let mut off: Vec<f64> = (0..count).map(off).collect();
         if pixels.outside.contains(&true) {
@@ -668,7 +715,7 @@ fn cut(
             (Some(before), ..) => before[i],
             (None, Some(within), _) => within[i],
             (None, None, Some(enclosed)) => enclosed[i] > 0.0,
-            _ if boxed => !pixels.outside[i] && pixels.amid[i] >= 0.0,
+            _ if boxed => !pixels.outside[i] && pixels.amid[i] >= 0.0 && pixels.raised[i] >= 0.0,
             _ => near.as_ref().is_some_and(|near| near[i] > NEARER),
         })
         .collect();

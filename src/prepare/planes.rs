@@ -103,11 +103,12 @@ fn fitted(points: &[([f64; 2], f64)]) -> Option<Plane> {
     solved.is_finite().then(|| solved.to_array())
 }
 
-/// The largest planes among pixels (ray, inverse depth), the largest first.
-fn planes(mut points: Vec<([f64; 2], f64)>, rng: &mut Pcg64) -> Vec<Plane> {
-    let least = (LEAST * points.len() as f64).ceil().max(12.0) as usize;
+/// The largest planes among pixels (ray, inverse depth), the largest first, of at least this part of these, within this part of the
+/// inverse depth.
+fn planes(mut points: Vec<([f64; 2], f64)>, least: f64, thickness: f64, rng: &mut Pcg64) -> Vec<Plane> {
+    let least = (least * points.len() as f64).ceil().max(12.0) as usize;
     let mut found = vec![];
-    let fits = |plane: &Plane, (ray, d): &([f64; 2], f64)| (on(plane, *ray) - d).abs() <= THICKNESS * d;
+    let fits = |plane: &Plane, (ray, d): &([f64; 2], f64)| (on(plane, *ray) - d).abs() <= thickness * d;
     while found.len() < PLANES && points.len() >= least {
         let mut best: (usize, Plane) = (0, [0.0; 3]);
         for _ in 0..TRIES {
@@ -133,13 +134,28 @@ fn planes(mut points: Vec<([f64; 2], f64)>, rng: &mut Pcg64) -> Vec<Plane> {
     found
 }
 
-/// The largest planes around a hole, the largest first, by what [`Hole`] says of its pixels. The same seed finds the same.
-pub fn around(disparity: &[f32], rays: &[Option<[f64; 2]>], unknown: &[bool], seed: u64) -> Vec<Plane> {
+/// Known pixels that take part in the search, at most [`SAMPLES`].
+fn known(disparity: &[f32], rays: &[Option<[f64; 2]>], unknown: &[bool]) -> Vec<([f64; 2], f64)> {
     let known = |i: usize| !unknown[i] && disparity[i] > 0.0 && disparity[i].is_finite();
     let all: Vec<usize> = (0..rays.len()).filter(|i| known(*i) && rays[*i].is_some()).collect();
     let every = all.len().div_ceil(SAMPLES).max(1);
-    let points = all.iter().step_by(every).filter_map(|i| Some((rays[*i]?, f64::from(disparity[*i]))));
-    planes(points.collect(), &mut Pcg64::new(seed.into(), 41))
+    all.iter().step_by(every).filter_map(|i| Some((rays[*i]?, f64::from(disparity[*i])))).collect()
+}
+
+/// The largest planes around a hole, the largest first, by what [`Hole`] says of its pixels. The same seed finds the same.
+pub fn around(disparity: &[f32], rays: &[Option<[f64; 2]>], unknown: &[bool], seed: u64) -> Vec<Plane> {
+    planes(known(disparity, rays, unknown), LEAST, THICKNESS, &mut Pcg64::new(seed.into(), 41))
+}
+
+/// Likewise, of at least this share of the known pixels, within this part of the inverse depth.
+pub fn within(
+    disparity: &[f32],
+    rays: &[Option<[f64; 2]>],
+    unknown: &[bool],
+    share: f64,
+    thickness: f64,
+) -> Vec<Plane> {
+    planes(known(disparity, rays, unknown), share, thickness, &mut Pcg64::new(0, 41))
 }
 
 /// Continues these planes, and what is beside them, in a hole.
