@@ -22,6 +22,8 @@ const BESIDE: [usize; 2] = [2, 4];
 /// Length of each end that is looked at, as a part of what is hidden between them, and at least, pixels.
 const END: f64 = 0.35;
 const LEAST_END: f64 = 12.0;
+/// An end may be this part of that long where the other is so much longer: what the line is on ends there.
+const SHORT: f64 = 0.5;
 /// Shortest way through the hole that counts, pixels.
 const LEAST_GAP: usize = 4;
 /// How many times as strong a line is as what this share of the surroundings does not exceed, and its least strength, summed over
@@ -57,6 +59,8 @@ pub struct Line {
     pub beside: f64,
     /// Length of each end that was looked at.
     pub known: f64,
+    /// Which end, if any, may be on something else beyond that: nothing is copied from it.
+    pub short: [bool; 2],
     /// How much it differs from what is beside it, summed over the channels.
     pub strength: f64,
 }
@@ -185,7 +189,9 @@ impl Turned {
                 let off = self.along.perp() * (row as f64 - self.half[1] as f64);
                 let place = |column: usize| self.middle + off + self.along * (column as f64 - self.half[0] as f64);
                 let ends = [place(first - 1), place(last + 1)];
-                found.push(Line { ends, known: known as f64, beside: beside as f64, strength });
+                let short = known.map(|n| n < known[0].max(known[1]));
+                let known = known[0].min(known[1]) as f64;
+                found.push(Line { ends, known, short, beside: beside as f64, strength });
             }
         }
         found
@@ -227,14 +233,27 @@ impl<'a> Row<'a> {
     }
 }
 
-/// The length of the ends of a line that is hidden between two columns, and its strength, if it is one of at least this. It lies
+/// The lengths of both ends of a line that is hidden between two columns, and its strength, if it is one of at least this. It lies
 /// here or, where it is not straight, in the rows beside.
-fn line(nearly: &Row<'_>, here: &Row<'_>, [first, last]: [usize; 2], least: f64) -> Option<(usize, f64)> {
+fn line(nearly: &Row<'_>, here: &Row<'_>, [first, last]: [usize; 2], least: f64) -> Option<([usize; 2], f64)> {
     if last - first < LEAST_GAP {
         return None;
     }
     let known = (END * (last - first) as f64).max(LEAST_END).ceil() as usize;
-    let (before, behind) = (first.checked_sub(known)?..first, last + 1..last + 1 + known);
+    let short = (SHORT * known as f64).ceil() as usize;
+    let ends = [[known; 2], [short, 2 * known - short], [2 * known - short, short]];
+    ends.into_iter().find_map(|ends| with_ends(nearly, here, [first, last], ends, least))
+}
+
+/// Likewise, by so much of what is before and behind.
+fn with_ends(
+    nearly: &Row<'_>,
+    here: &Row<'_>,
+    [first, last]: [usize; 2],
+    known: [usize; 2],
+    least: f64,
+) -> Option<([usize; 2], f64)> {
+    let (before, behind) = (first.checked_sub(known[0])?..first, last + 1..last + 1 + known[1]);
     let strength = here.mean(&before)?.abs().min(here.mean(&behind)?.abs());
     if strength < least {
         return None;
@@ -290,7 +309,7 @@ fn across(grey: &Grey, hole: &[bool], [low, high]: [DVec2; 2]) -> Vec<Line> {
     };
     let least = BESIDE.map(|beside| (STRONGER * usual(beside)).max(LEAST));
     // The line may be hidden by other parts, too.
-    let columns = ((2.0 + 2.0 * END) * reach + LEAST_END).ceil() as usize + 2;
+    let columns = ((2.0 + (4.0 - 2.0 * SHORT) * END) * reach + (2.0 - SHORT) * LEAST_END).ceil() as usize + 2;
     let rows = reach.ceil() as usize + BESIDE[1] + 2;
     let directions = (DIRECTIONS * std::f64::consts::PI * reach).ceil() as usize;
     let in_direction = |k: usize| {
@@ -454,6 +473,18 @@ mod tests {
         assert_eq!(found(|x, _| dark(x - 57.0)).len(), 1);
     }
 
+    /// One that ends at a wall soon beyond the hole is, where the other end is so much longer.
+    #[test]
+    fn a_line_may_end_at_a_wall() {
+        let floor = |x: f64| if (x - 57.0).abs() <= 1.0 { 0.4 } else { 0.7 };
+        let short = |wall: f64| found(|x, y| if y < wall { 0.2 } else { floor(x) });
+        let lines = short(20.0);
+        assert_eq!(lines.len(), 1, "{lines:?}");
+        let [a, b] = lines[0].ends.map(|end| end.y);
+        assert_eq!(lines[0].short, [a < b, b < a]);
+        assert_eq!(short(27.0).len(), 0);
+    }
+
     /// Leaves of all sizes, at many seeds: hardly any way through them is a line.
     #[test]
     fn leaves_have_none() {
@@ -481,7 +512,7 @@ mod tests {
             let grey = Grey::new(Picture { rgb: &rgb, known: &known, size: SIZE });
             for aside in [-3.0, -1.0, 0.0, 2.0, 3.0] {
                 let ends = [-1.0, 1.0].map(|end| through + along * 17.0 * end + along.perp() * aside * end);
-                let line = Line { ends, beside: 9.0, known: 14.0, strength: 0.9 };
+                let line = Line { ends, beside: 9.0, known: 14.0, short: [false; 2], strength: 0.9 };
                 for end in refined(&grey, &line, 4.5).ends {
                     assert!(off(end).abs() <= 0.5, "{k}, {aside}: {end} is {} off", off(end));
                 }

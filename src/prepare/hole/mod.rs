@@ -66,7 +66,7 @@ const LEAST_HOLE: f64 = 0.4;
 const AT_ONCE: usize = 16;
 /// Name of the way in which holes are filled: a scene that was filled in another way is filled anew.
 pub const METHOD: &str = "one surface with smooth ends, nothing where others look through it, no colour from a rim that looks like nothing near it, \
-     lights joined, doubts left to training, nothing stands on what only crosses the floor, lines go on through holes, \
+     lights joined, doubts left to training, nothing stands on what only crosses the floor, lines go on through holes and to walls behind, \
      what is nearly one plane is one, copies nearly keep their hue, ends are where the first view has them, \
      nothing from views with the object elsewhere, nothing stands where the first view looks through, surfaces by what they are covered with, \
      straight borders go on, those that end in a hole too, surfaces end at right angles, grain is kept, floors end at their walls, planes have \

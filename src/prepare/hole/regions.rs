@@ -300,7 +300,7 @@ impl Ways {
         if ends[0].distance(ends[1]) < 0.5 * LEAST_END {
             return None;
         }
-        let line = Line { ends, beside: 1.0, known: 0.0, strength: 0.0 };
+        let line = Line { ends, beside: 1.0, known: 0.0, short: [false; 2], strength: 0.0 };
         let inside = self.part.iter().map(|at| line.place(*at)).filter(|[_, aside]| aside.abs() <= 0.75);
         let (from, to) = inside.fold((f64::MAX, f64::MIN), |(from, to), [at, _]| (from.min(at), to.max(at)));
         (to - from >= LEAST_GAP).then_some(())?;

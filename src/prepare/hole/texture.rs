@@ -429,13 +429,13 @@ fn along(texture: &mut Texture, found: &[(Line, f64, [Piece; 2])]) {
             let [from_first, aside] = line.place(lines::middle_of(i, texture.size[0]));
             let inside = [from_first, line.length() - from_first];
             let is_on = aside.abs() <= *half && inside.iter().all(|inside| *inside >= -1.0);
-            is_on.then_some((aside.abs(), inside, pieces))
+            is_on.then_some((aside.abs(), inside, pieces, line.short))
         });
-        let (_, inside, pieces) = on.min_by(|a, b| a.0.total_cmp(&b.0))?;
+        let (_, inside, pieces, short) = on.min_by(|a, b| a.0.total_cmp(&b.0))?;
         // From the nearer end, but where much more is known of the other.
         let near = usize::from(inside[0] > inside[1]);
         let near = if 2.0 * pieces[near].length < pieces[1 - near].length { 1 - near } else { near };
-        [near, 1 - near].into_iter().find_map(|end| {
+        [near, 1 - near].into_iter().filter(|end| !short[*end]).find_map(|end| {
             let mut shifts = (0..3).map(|again| pieces[end].shift(inside[end], again));
             shifts.find_map(|shift| texture.source(i, shift))
         })
@@ -682,6 +682,23 @@ mod tests {
         let wrong = |i: &usize| (0..3).any(|c| (floor.rgb[*i][c] - truth[*i][c]).abs() > 0.06);
         let inside = || (0..truth.len()).filter(|i| before[*i]);
         assert!(inside().filter(wrong).count() * 20 < inside().count(), "{}", inside().filter(wrong).count());
+    }
+
+    /// The joint that comes out of a hole shortly before a wall goes through it, and nothing of the wall comes into it.
+    #[test]
+    fn a_joint_goes_on_to_the_wall() {
+        let hole = |x: usize, y: usize| (110..190).contains(&x) && (90..190).contains(&y);
+        let color = |x: usize, y: usize| match (y < 70, x.abs_diff(150) < 2 || y.abs_diff(225) < 2) {
+            (true, _) => [0.3, 0.3, 0.32],
+            (_, true) => [0.5; 3],
+            _ => [0.75, 0.73, 0.7],
+        };
+        let (mut floor, truth) = texture([300, 260], hole, color);
+        let before = floor.hole.clone();
+        assert!(fill(&mut floor));
+        let wrong = |i: &usize| (0..3).any(|c| (floor.rgb[*i][c] - truth[*i][c]).abs() > 0.06);
+        let inside = || (0..truth.len()).filter(|i| before[*i]);
+        assert!(inside().filter(wrong).count() * 100 < inside().count(), "{}", inside().filter(wrong).count());
     }
 
     /// A straight border between two plain colours runs straight through the hole, and no colour is there that is not around.

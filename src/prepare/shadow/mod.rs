@@ -46,7 +46,7 @@ pub struct Ground<'a> {
 pub const SIDE: u32 = 1024;
 /// Name of the way in which it is looked for: where that was another one it is looked for anew.
 pub const METHOD: &str = "on the plane of measured depth, soft ones of many views too, to their end, below what is round, by \
-                          parts where they differ";
+                          parts where they differ, none where nothing is seen";
 /// A picture of what was found, below the scene's folder.
 pub const PICTURE: &str = "prepare/shadow.png";
 /// Places that are looked at, of the object and of what is around it.

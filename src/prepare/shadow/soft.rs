@@ -125,7 +125,11 @@ fn within(ground: &Ground<'_>, times: f64) -> Result<Shadow, String> {
         return Err(no(OPEN_ENDED));
     }
     let mut amounts = faded(&off, &region, &foot, side, (FADE * size).ceil() as u32);
-    amounts.iter_mut().zip(&other).filter(|(_, other)| **other).for_each(|(amount, _)| *amount = 0.0);
+    // What nobody sees is passed, and nothing is given back there: behind the end of a desk stands a wall.
+    let rim = (LINE * size).round() as u32;
+    let seen = distances(&same, side, rim);
+    let is_it = |i: usize| !other[i] && seen[i] <= rim;
+    amounts.iter_mut().enumerate().filter(|(i, _)| !is_it(*i)).for_each(|(_, amount)| *amount = 0.0);
     let most = amounts.iter().copied().fold(0.0, f64::max);
     if (-most).exp() < LEFT {
         return Err(no("what is darker around its foot is no shadow by its ratio"));
@@ -505,6 +509,19 @@ mod tests {
         assert_eq!(most(&|_, y| y > 79.0), 0.0, "the wall");
         // What it takes there is at most the lighter place between both and as much as it may get darker again.
         assert!(most(&|x, y| (x - 22.0).hypot(y - 60.0) < 3.0) < 0.1, "the other's");
+    }
+
+    /// A desk ends behind the object, and beyond its end nothing of its plane is seen: there no light is given back.
+    #[test]
+    fn no_light_is_given_back_where_nothing_is_seen() {
+        let desk = |x: f64, y: f64| if y < 66.0 { 0.8 * (1.0 - shade(x, y)) } else { f64::NAN };
+        let shadow = look(|x, y| [desk(x, y); 3]).expect("a shadow");
+        let most = |of: &dyn Fn(f64, f64) -> bool| {
+            let cells = (0..SIDE * SIDE).filter(|i| of((i % SIDE) as f64, (i / SIDE) as f64));
+            cells.map(|i| shadow.amount[i]).fold(0.0, f32::max)
+        };
+        assert!(most(&|x, y| (x - 46.0).hypot(y - 60.0) < 3.0) > 0.8);
+        assert_eq!(most(&|_, y| y > 69.0), 0.0, "beyond the end");
     }
 
     /// An even floor, light that falls off, and a stain of another colour have none.
