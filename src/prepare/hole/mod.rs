@@ -25,6 +25,7 @@ mod gradient;
 pub mod ground;
 mod guess;
 mod holed;
+mod island;
 mod lines;
 mod material;
 mod regions;
@@ -70,7 +71,8 @@ pub const METHOD: &str = "one surface with smooth ends, nothing where others loo
      what is nearly one plane is one, copies nearly keep their hue, ends are where the first view has them, \
      nothing from views with the object elsewhere, nothing stands where the first view looks through, surfaces by what they are covered with, \
      straight borders go on, those that end in a hole too, surfaces end at right angles, grain is kept, floors end at their walls, planes have \
-     their materials, which have grain, what is bare of the object refutes nothing, and the reference has no shadow";
+     their materials, which have grain, what is bare of the object refutes nothing, the reference has no shadow, and no \
+     small piece hangs in a hole";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 

@@ -715,6 +715,7 @@ impl Sights {
         let rank = self.0.iter().filter(|sight| sight.solved).count();
         if rank == 0 || !own.around.is_empty() || unknown.iter().filter(|unknown| **unknown).count() > FEW {
             (surface, found_planes) = self.continued(of, &unknown, &mut disparity, seed);
+            super::island::sink(&own.hole, size, &found_planes, |site| own.ray(site), &mut surface, &mut disparity);
         }
         planes::membrane(&mut disparity, size, |site| own.hole[site]);
         let own = &mut self.0[of];
