@@ -406,17 +406,17 @@ impl Pixels {
             amid,
             raised: vec![0.0; count],
         };
-        let deep = pixels.part_places();
-        if let Some((middle, wide)) = deep.filter(|_| outlines.iter().all(|mark| matches!(mark, Mark::Box { .. }))) {
-            pixels.raised = pixels.raised(middle, wide);
+        let away = pixels.part_places();
+        if let Some(away) = away.filter(|_| outlines.iter().all(|mark| matches!(mark, Mark::Box { .. }))) {
+            pixels.raised = pixels.raised(&away);
         }
         pixels.scale_places();
         pixels
     }
 
     /// Places that are [`AWAY`] speak against the object: it is about as deep as it is wide.
-    /// Returns how deep and how wide that is.
-    fn part_places(&mut self) -> Option<(f64, f64)> {
+    /// Returns how far each is from the middle of its depth, in its widths; infinite where that is not known.
+    fn part_places(&mut self) -> Option<Vec<f64>> {
         let inside = |i: &usize| !self.outside[*i] && self.outside.contains(&true);
         let all = || (0..self.places.len()).filter(inside).filter_map(|i| Some((i, self.places[i]?.0)));
         let middle = quantile(all().filter(|(i, _)| self.amid[*i] >= 0.0).map(|(_, place)| place[2]), NEARER_PART)?;
@@ -425,28 +425,26 @@ impl Pixels {
             slopes.clone().fold(f64::NEG_INFINITY, f64::max) - slopes.fold(f64::INFINITY, f64::min)
         };
         let wide = side(0).max(side(1)) * middle;
-        for (amid, place) in self.amid.iter_mut().zip(&self.places) {
-            if let Some((place, _)) = place {
-                let off = (place[2] - middle).abs() / wide;
-                *amid -= AWAY * ((off - AS_DEEP[0]) / (AS_DEEP[1] - AS_DEEP[0])).clamp(0.0, 1.0);
-            }
+        let off = |place: &Option<([f64; 3], f64)>| place.map_or(f64::INFINITY, |(p, _)| (p[2] - middle).abs() / wide);
+        let away: Vec<f64> = self.places.iter().map(off).collect();
+        for (amid, off) in self.amid.iter_mut().zip(&away).filter(|(_, off)| off.is_finite()) {
+            *amid -= AWAY * ((off - AS_DEEP[0]) / (AS_DEEP[1] - AS_DEEP[0])).clamp(0.0, 1.0);
         }
-        Some((middle, wide))
+        Some(away)
     }
 
-    /// What planes that go on outside the boxes say of each pixel, where the object is so deep and so wide: on one is what the object
-    /// stands on, and what is off all of them in the object's depth stands on it.
-    fn raised(&self, middle: f64, wide: f64) -> Vec<f64> {
+    /// The weight of planes that go on outside the boxes, for the object, in nats: it stands on them, and is what is off all of them in
+    /// its depth, from whose middle pixels are so far `away`.
+    fn raised(&self, away: &[f64]) -> Vec<f64> {
         let count = self.places.len();
-        let away = |i: usize| self.places[i].map(|(place, _)| (place[2] - middle).abs() / wide);
-        let place = |i: usize| self.places[i].filter(|_| away(i) <= Some(AS_DEEP[1])).map(|(place, _)| place);
+        let place = |i: usize| self.places[i].filter(|_| away[i] <= AS_DEEP[1]).map(|(place, _)| place);
         let rays: Vec<Option<[f64; 2]>> = (0..count).map(|i| place(i).map(|[x, y, z]| [x / z, y / z])).collect();
         let disparity: Vec<f32> = (0..count).map(|i| place(i).map_or(f32::NAN, |[.., z]| z.recip() as f32)).collect();
         let inside: Vec<bool> = self.outside.iter().map(|outside| !outside).collect();
         // Depth bleeds over a box that is drawn tightly.
         let beyond = resample::distances(&self.picture(|i| inside[i]), BLEEDS[1] + 1);
         let mut on_plane = vec![false; count];
-        for plane in planes::within(&disparity, &rays, &inside, GROUND_SHARE, GROUND_THICKNESS[0]) {
+        for plane in planes::within(&disparity, &rays, &inside, [GROUND_SHARE, GROUND_THICKNESS[0]], 0) {
             let off = |i: usize| Some((place(i)?[2] * planes::on(&plane, rays[i]?) - 1.0).abs());
             let mut left: Vec<bool> =
                 (0..count).map(|i| off(i).is_some_and(|off| off <= GROUND_THICKNESS[1])).collect();
@@ -461,7 +459,7 @@ impl Pixels {
         if !on_plane.contains(&true) || off < LEAST_OFF * core().count() as f64 {
             return vec![0.0; count];
         }
-        let near = |i: usize| away(i).map_or(0.0, |away| (1.0 - away / AS_DEEP[0]).max(0.0));
+        let near = |i: usize| (1.0 - away[i] / AS_DEEP[0]).max(0.0);
         (0..count).map(|i| if on_plane[i] { -ON_GROUND } else { RAISED * near(i) }).collect()
     }
 

@@ -134,28 +134,24 @@ fn planes(mut points: Vec<([f64; 2], f64)>, least: f64, thickness: f64, rng: &mu
     found
 }
 
-/// Known pixels that take part in the search, at most [`SAMPLES`].
-fn known(disparity: &[f32], rays: &[Option<[f64; 2]>], unknown: &[bool]) -> Vec<([f64; 2], f64)> {
-    let known = |i: usize| !unknown[i] && disparity[i] > 0.0 && disparity[i].is_finite();
-    let all: Vec<usize> = (0..rays.len()).filter(|i| known(*i) && rays[*i].is_some()).collect();
-    let every = all.len().div_ceil(SAMPLES).max(1);
-    all.iter().step_by(every).filter_map(|i| Some((rays[*i]?, f64::from(disparity[*i])))).collect()
-}
-
 /// The largest planes around a hole, the largest first, by what [`Hole`] says of its pixels. The same seed finds the same.
 pub fn around(disparity: &[f32], rays: &[Option<[f64; 2]>], unknown: &[bool], seed: u64) -> Vec<Plane> {
-    planes(known(disparity, rays, unknown), LEAST, THICKNESS, &mut Pcg64::new(seed.into(), 41))
+    within(disparity, rays, unknown, [LEAST, THICKNESS], seed)
 }
 
-/// Likewise, of at least this share of the known pixels, within this part of the inverse depth.
+/// The largest planes of at least this share of the known pixels, within this part of the inverse depth, the largest first.
 pub fn within(
     disparity: &[f32],
     rays: &[Option<[f64; 2]>],
     unknown: &[bool],
-    share: f64,
-    thickness: f64,
+    [share, thickness]: [f64; 2],
+    seed: u64,
 ) -> Vec<Plane> {
-    planes(known(disparity, rays, unknown), share, thickness, &mut Pcg64::new(0, 41))
+    let known = |i: usize| !unknown[i] && disparity[i] > 0.0 && disparity[i].is_finite();
+    let all: Vec<usize> = (0..rays.len()).filter(|i| known(*i) && rays[*i].is_some()).collect();
+    let every = all.len().div_ceil(SAMPLES).max(1);
+    let points = all.iter().step_by(every).filter_map(|i| Some((rays[*i]?, f64::from(disparity[*i]))));
+    planes(points.collect(), share, thickness, &mut Pcg64::new(seed.into(), 41))
 }
 
 /// Continues these planes, and what is beside them, in a hole.
@@ -389,10 +385,21 @@ pub fn neighbours(i: usize, [w, h]: [usize; 2]) -> impl Iterator<Item = usize> {
 
 /// The pixels that hang together with one, by their sides, of those that are left; they are left no more.
 pub fn connected(first: usize, left: &mut [bool], size: [usize; 2]) -> Vec<usize> {
+    connected_if(first, left, size, |_, _| true)
+}
+
+/// The pixels that hang together with one through neighbours that are joined, of those that are left; they are left no more.
+pub fn connected_if(
+    first: usize,
+    left: &mut [bool],
+    size: [usize; 2],
+    joined: impl Fn(usize, usize) -> bool,
+) -> Vec<usize> {
     let mut part: Vec<usize> = Some(first).filter(|i| std::mem::take(&mut left[*i])).into_iter().collect();
     let mut at = 0;
     while at < part.len() {
-        part.extend(neighbours(part[at], size).filter(|i| std::mem::take(&mut left[*i])));
+        let own = part[at];
+        part.extend(neighbours(own, size).filter(|i| joined(own, *i) && std::mem::take(&mut left[*i])));
         at += 1;
     }
     part

@@ -80,7 +80,7 @@ mod tests {
     use crate::prepare::graph_cut::tests::{disc, wrong};
     use crate::scene::Camera;
 
-    /// Of 200 x 150 pixels, in the world's origin.
+    /// A camera of 200 x 150 pixels in the world's origin.
     fn camera() -> Camera {
         Camera {
             rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],

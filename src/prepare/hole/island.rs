@@ -1,11 +1,11 @@
 //! Small pieces of surface that hang in a hole: of another depth than all that is around them, and none of it beside the hole.
 //!
 //! A bare wall is matched anywhere, and a few sites of it at the depth of what stands beside the object; then they are coloured by that.
-//! What really is there, wholly behind the object, is seen from elsewhere, and is larger than a few sites.
+//! A thing that really is there, wholly behind the object, is seen from elsewhere, and is larger than a few sites.
 
 use crate::prepare::planes::{self, Plane, neighbours};
 
-/// Depths differ by at most this part within a piece.
+/// Depths of neighbours in one piece differ by at most this part.
 const SAME: f64 = 0.03;
 /// A piece of at most this part of its hole is taken away.
 const SMALL: f64 = 0.03;
@@ -27,20 +27,8 @@ pub fn sink(
     let mut left: Vec<bool> = (0..hole.len()).map(|i| hole[i] && disparity[i].is_finite()).collect();
     let mut pieces = vec![];
     for first in 0..left.len() {
-        if !std::mem::take(&mut left[first]) {
-            continue;
-        }
-        let (mut piece, mut next) = (vec![first], 0);
-        while next < piece.len() {
-            for j in neighbours(piece[next], size) {
-                if left[j] && alike(piece[next], j, disparity) {
-                    left[j] = false;
-                    piece.push(j);
-                }
-            }
-            next += 1;
-        }
-        if piece.len() as f64 <= SMALL * all as f64 {
+        let piece = planes::connected_if(first, &mut left, size, |i, j| alike(i, j, disparity));
+        if !piece.is_empty() && piece.len() as f64 <= SMALL * all as f64 {
             pieces.push(piece);
         }
     }
@@ -62,12 +50,9 @@ pub fn sink(
             };
             beside.iter().filter(is).count()
         };
-        let Some((count, plane)) = (0..planes.len()).map(|plane| (on(plane), plane)).max_by_key(|(n, _)| *n) else {
-            return;
-        };
-        if (count as f64) < MOST * beside.len() as f64 {
+        let Some(plane) = (0..planes.len()).find(|plane| on(*plane) as f64 >= MOST * beside.len() as f64) else {
             continue;
-        }
+        };
         for i in piece {
             disparity[i] = planes::on(&planes[plane], ray(i)) as f32;
             surface[i] = plane as u8;

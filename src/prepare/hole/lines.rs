@@ -245,7 +245,7 @@ fn line(nearly: &Row<'_>, here: &Row<'_>, [first, last]: [usize; 2], least: f64)
     ends.into_iter().find_map(|ends| with_ends(nearly, here, [first, last], ends, least))
 }
 
-/// Likewise, by so much of what is before and behind.
+/// Looks for a line by ends of these lengths.
 fn with_ends(
     nearly: &Row<'_>,
     here: &Row<'_>,

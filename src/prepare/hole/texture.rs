@@ -626,6 +626,13 @@ mod tests {
         (Texture { size, rgb, hole, source }, truth)
     }
 
+    /// Pixels of what was a hole that have another colour than the truth, and all of them.
+    fn wrong(filled: &Texture, before: &[bool], truth: &[[f32; 3]]) -> [usize; 2] {
+        let inside = || (0..truth.len()).filter(|i| before[*i]);
+        let is_wrong = |i: &usize| (0..3).any(|c| (filled.rgb[*i][c] - truth[*i][c]).abs() > 0.06);
+        [inside().filter(is_wrong).count(), inside().count()]
+    }
+
     /// Tiles of 23 x 17 pixels with joints of two, light falling off to one side: joints cross the hole where they would.
     #[test]
     fn tiles_go_on_and_so_does_the_light() {
@@ -642,9 +649,7 @@ mod tests {
             let (mut tiles, truth) = texture(size, hole, color);
             let before = tiles.hole.clone();
             assert!(fill(&mut tiles) && !tiles.hole.contains(&true));
-            let inside = || (0..truth.len()).filter(|i| before[*i]);
-            let wrong = inside().filter(|i| (0..3).any(|c| (tiles.rgb[*i][c] - truth[*i][c]).abs() > 0.06)).count();
-            let all = inside().count();
+            let [wrong, all] = wrong(&tiles, &before, &truth);
             assert!(wrong * 50 < all, "{wrong} of {all} at {size:?}");
         }
     }
@@ -679,9 +684,8 @@ mod tests {
         let (mut floor, truth) = texture([160, 130], hole, color);
         let before = floor.hole.clone();
         assert!(fill(&mut floor));
-        let wrong = |i: &usize| (0..3).any(|c| (floor.rgb[*i][c] - truth[*i][c]).abs() > 0.06);
-        let inside = || (0..truth.len()).filter(|i| before[*i]);
-        assert!(inside().filter(wrong).count() * 20 < inside().count(), "{}", inside().filter(wrong).count());
+        let [wrong, all] = wrong(&floor, &before, &truth);
+        assert!(wrong * 20 < all, "{wrong} of {all}");
     }
 
     /// The joint that comes out of a hole shortly before a wall goes through it, and nothing of the wall comes into it.
@@ -696,9 +700,8 @@ mod tests {
         let (mut floor, truth) = texture([300, 260], hole, color);
         let before = floor.hole.clone();
         assert!(fill(&mut floor));
-        let wrong = |i: &usize| (0..3).any(|c| (floor.rgb[*i][c] - truth[*i][c]).abs() > 0.06);
-        let inside = || (0..truth.len()).filter(|i| before[*i]);
-        assert!(inside().filter(wrong).count() * 100 < inside().count(), "{}", inside().filter(wrong).count());
+        let [wrong, all] = wrong(&floor, &before, &truth);
+        assert!(wrong * 100 < all, "{wrong} of {all}");
     }
 
     /// A straight border between two plain colours runs straight through the hole, and no colour is there that is not around.

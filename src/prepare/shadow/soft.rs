@@ -448,6 +448,12 @@ mod tests {
         x.rem_euclid(30.0) < 2.0 || y.rem_euclid(30.0) < 2.0
     }
 
+    /// Most of what it takes of the light where this is so.
+    fn most(shadow: &Shadow, of: &dyn Fn(f64, f64) -> bool) -> f32 {
+        let cells = (0..SIDE * SIDE).filter(|i| of((i % SIDE) as f64, (i / SIDE) as f64));
+        cells.map(|i| shadow.amount[i]).fold(0.0, f32::max)
+    }
+
     /// A soft shadow to the left of the foot takes this share of the light.
     fn shade(x: f64, y: f64) -> f64 {
         0.35 * (-((x - 46.0) / 9.0).powi(2) - ((y - 60.0) / 9.0).powi(2)).exp()
@@ -501,10 +507,7 @@ mod tests {
             tone.map(|v| v * (1.0 - shade(x, y)) * (1.0 - next(x, y)))
         });
         let shadow = shadow.expect("a shadow");
-        let most = |of: &dyn Fn(f64, f64) -> bool| {
-            let cells = (0..SIDE * SIDE).filter(|i| of((i % SIDE) as f64, (i / SIDE) as f64));
-            cells.map(|i| shadow.amount[i]).fold(0.0, f32::max)
-        };
+        let most = |of: &dyn Fn(f64, f64) -> bool| most(&shadow, of);
         assert!(most(&|x, y| (x - 46.0).hypot(y - 60.0) < 3.0) > 0.8);
         assert_eq!(most(&|_, y| y > 79.0), 0.0, "the wall");
         // What it takes there is at most the lighter place between both and as much as it may get darker again.
@@ -516,10 +519,7 @@ mod tests {
     fn no_light_is_given_back_where_nothing_is_seen() {
         let desk = |x: f64, y: f64| if y < 66.0 { 0.8 * (1.0 - shade(x, y)) } else { f64::NAN };
         let shadow = look(|x, y| [desk(x, y); 3]).expect("a shadow");
-        let most = |of: &dyn Fn(f64, f64) -> bool| {
-            let cells = (0..SIDE * SIDE).filter(|i| of((i % SIDE) as f64, (i / SIDE) as f64));
-            cells.map(|i| shadow.amount[i]).fold(0.0, f32::max)
-        };
+        let most = |of: &dyn Fn(f64, f64) -> bool| most(&shadow, of);
         assert!(most(&|x, y| (x - 46.0).hypot(y - 60.0) < 3.0) > 0.8);
         assert_eq!(most(&|_, y| y > 69.0), 0.0, "beyond the end");
     }
