@@ -175,7 +175,7 @@ fn an_export_is_the_model() {
     assert!(ply::encode(&made(options).cloud) == bytes);
     // Upright it is another file of the same pictures, but for roundings.
     let upright = made(ExportOptions { upright: true, screen: 1, ..options });
-    let loss = upright.yardstick.of_cloud(&gpu, &upright.cloud, 1, &settings.render).expect("pictures");
+    let (loss, _) = upright.yardstick.of_cloud(&gpu, &upright.cloud, 1, &settings.render).expect("pictures");
     let psnr = loss.anchors.expect("test views").metrics.full.psnr;
     assert!(psnr > 50.0, "{psnr}");
 }

@@ -441,12 +441,13 @@ pub(super) fn export(
         };
         let mut made = export::make(gpu, &model, &scene, &settings, &options, observer)?;
         // All files are made before the first is written.
-        let mut written = vec![];
+        let (mut written, mut drawn) = (vec![], u32::MAX);
         for format in &args.formats() {
             let bytes = format.encode(&made.cloud, args.spz_version)?;
             let read_back = format.decode(&bytes)?;
             let times = low_pass::measured(made.larger);
-            let loss = made.yardstick.of_cloud(gpu, &read_back, times, &settings.render)?;
+            let (loss, fits) = made.yardstick.of_cloud(gpu, &read_back, times, &settings.render)?;
+            drawn = drawn.min(fits);
             let name = format.file();
             made.losses.push((format!("{name}, {}", size(bytes.len())), loss));
             let hash = blake3::hash(&bytes).to_hex().to_string();
@@ -460,7 +461,7 @@ pub(super) fn export(
         // What lists the files is there before them: whenever it ends, they are known for those of an export.
         let named: Vec<_> = std::iter::once((folder.join(FIGURES), text.as_bytes())).chain(named).collect();
         export::write(&named)?;
-        report(&made, &figures, &args.formats());
+        report(&made, &figures, &args.formats(), drawn);
         let names: Vec<&str> = figures.files.iter().map(|file| file.name.as_str()).collect();
         println!("wrote {}, {FIGURES} in {}", names.join(", "), folder.display());
         Ok(())
@@ -511,7 +512,7 @@ fn size(bytes: usize) -> String {
     format!("{:.1} MB", bytes as f64 / 1e6)
 }
 
-fn report(made: &Export, figures: &Figures, formats: &[Format]) {
+fn report(made: &Export, figures: &Figures, formats: &[Format], drawn: u32) {
     println!("{}", measure::table(&made.losses));
     if made.poses == [0, 0] {
         println!("measured on {}; {} Gaussians; {:.0} s", figures.measured_on, figures.gaussians, figures.seconds);
@@ -528,10 +529,8 @@ fn report(made: &Export, figures: &Figures, formats: &[Format]) {
     }
     if widen::variance(made.larger) > 0.0 {
         println!(
-            "widened for pictures of {} pixels, {:.1} times the training's size; the files were drawn {} times as large",
-            figures.screen,
-            made.larger,
-            low_pass::measured(made.larger)
+            "widened for pictures of {} pixels, {:.1} times the training's size; the files were drawn {drawn} times as large",
+            figures.screen, made.larger,
         );
     }
     let cut = spz::beyond_range(&made.cloud);

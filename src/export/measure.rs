@@ -8,11 +8,11 @@ use serde::Serialize;
 use super::draw::Drawer;
 use super::{Cloud, Error, low_pass};
 use crate::evaluate::{self, Mean, Report, ViewMetrics};
-use crate::gpu::Gpu;
+use crate::gpu::{self, Gpu};
 use crate::model::gaussians::Static;
 use crate::render::Config;
-use crate::render::config::BACKGROUND;
-use crate::render::view::{Renderer, to_rgb8};
+use crate::render::forward::Capacity;
+use crate::render::view::{Painter, Renderer, to_rgb8};
 use crate::scene::{Camera, Scene};
 
 /// A pose to measure at.
@@ -97,12 +97,22 @@ impl Yardstick {
         Ok(Loss { anchors: None, photographs: self.mean(|pose| Some((&pose.anchors, pose.photograph.as_ref()?)))? })
     }
 
-    /// These Gaussians, on `times` as many pixels each way as the pictures have, reduced to those.
+    /// These Gaussians, on `times` as many pixels each way as the pictures have, reduced to those, or on fewer where the device
+    /// has no room for so many; and how many times as many it were.
     ///
     /// # Errors
-    /// When the device has no room, or is lost.
-    pub fn of_cloud(&self, gpu: &Gpu, cloud: &Cloud, times: u32, config: &Config) -> Result<Loss, Error> {
-        self.of_drawing(&mut Drawer::new(gpu, Static::upload(gpu, cloud)?, config, BACKGROUND)?, times)
+    /// When the device has no room for the pictures as they are, or is lost.
+    pub fn of_cloud(&self, gpu: &Gpu, cloud: &Cloud, times: u32, config: &Config) -> Result<(Loss, u32), Error> {
+        let gaussians = Static::upload(gpu, cloud)?;
+        let mut fits = times.max(1);
+        loop {
+            let mut painter = Painter::new(gpu, config, Capacity::guess(gaussians.count))?;
+            let loss = self.of_drawing(|camera| Ok(painter.render(&gaussians, camera)?.rgb), fits);
+            match loss {
+                Err(Error::Gpu(gpu::Error::TooLarge { .. } | gpu::Error::OutOfMemory { .. })) if fits > 1 => fits -= 1,
+                loss => return Ok((loss?, fits)),
+            }
+        }
     }
 
     /// The Gaussians of a drawer as they are now.
@@ -110,13 +120,17 @@ impl Yardstick {
     /// # Errors
     /// As [`Yardstick::of_cloud`].
     pub fn of_drawer(&self, drawer: &mut Drawer) -> Result<Loss, Error> {
-        self.of_drawing(drawer, 1)
+        self.of_drawing(|camera| Ok(drawer.draw(camera)?), 1)
     }
 
-    fn of_drawing(&self, drawer: &mut Drawer, times: u32) -> Result<Loss, Error> {
+    fn of_drawing(
+        &self,
+        mut draw: impl FnMut(&Camera) -> Result<Vec<[f32; 3]>, Error>,
+        times: u32,
+    ) -> Result<Loss, Error> {
         let draw = |pose: &Pose| {
             let large = pose.camera.scaled(pose.camera.size.map(|n| n * times));
-            Ok(to_rgb8(pose.camera.size, &low_pass::reduced(&drawer.draw(&large)?, large.size, times)))
+            Ok(to_rgb8(pose.camera.size, &low_pass::reduced(&draw(&large)?, large.size, times)))
         };
         let pictures: Vec<RgbImage> = self.poses.iter().map(draw).collect::<Result<_, Error>>()?;
         let mut pictures_again = pictures.iter();
@@ -174,4 +188,42 @@ pub fn table(lines: &[(String, Loss)]) -> String {
     }
     text.push('\n');
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::export::tests::cloud;
+    use crate::gpu::testing;
+
+    /// Square pictures of a training that ends at their full size, four times as large: what a training needs for a picture is more
+    /// than one binding of lavapipe holds. Where the picture alone is too large it is drawn less large.
+    #[test]
+    fn large_pictures_are_measured_as_large_as_the_device_can() {
+        let gpu = testing::gpu();
+        let mut cloud = cloud(100, 0);
+        cloud.log_scale.fill([-1.0; 3]);
+        for (side, least) in [(512, 4), (1100, 1)] {
+            let camera = Camera {
+                rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+                translation: [0.0, 0.0, 10.0],
+                focal: [side as f32; 2],
+                principal: [side as f32 / 2.0; 2],
+                distortion: [0.0; 4],
+                size: [side; 2],
+            };
+            let config = Config::default();
+            let mut painter = Painter::new(&gpu, &config, Capacity::guess(100)).expect("room");
+            let gaussians = Static::upload(&gpu, &cloud).expect("room");
+            let anchors = painter.render(&gaussians, &camera).expect("a picture").to_rgb8();
+            let pose = Pose { name: "pose".into(), camera, anchors, photograph: None, mask: None };
+            let yardstick = Yardstick { poses: vec![pose], what: String::new() };
+            let (loss, times) = yardstick.of_cloud(&gpu, &cloud, 4, &config).expect("a measurement");
+            let [most, limit] = [u64::from(times + 1) * u64::from(side), gpu.info().max_binding_bytes];
+            assert!(times >= least && (times == 4 || 12 * most * most > limit), "{side}: {times} times");
+            // Gaussians of many pixels look the same when a larger picture is reduced.
+            let psnr = loss.anchors.expect("a picture to compare with").metrics.full.psnr;
+            assert!(psnr > 45.0, "{side}: {psnr} dB");
+        }
+    }
 }
