@@ -366,7 +366,8 @@ fn mistakes_are_one_sentence() {
         "{unexported}"
     );
     assert_eq!(fails(folder, "view nowhere"), "error: nowhere: there is no such folder");
-    succeeds(folder, "export run --views 2 --steps 1 --formats ply");
+    let told = succeeds(folder, "export run --views 2 --steps 1 --formats ply --provenance");
+    assert!(told.contains("Gaussians are guessed, ") && told.contains("\n25 degrees off the cameras' path "), "{told}");
     let camera = fails(folder, "view run --camera nobody");
     assert!(camera.contains("they are called like train_000"), "{camera}");
     let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
@@ -391,6 +392,9 @@ fn mistakes_are_one_sentence() {
     let mut ply = vec![];
     flate2::read::GzDecoder::new(&packed[..]).read_to_end(&mut ply).expect("gzip");
     assert!(ply == fs::read(folder.join("run/export/scene.ply")).expect("a file"), "the scene is the exported one");
+    let guessed = BASE64_STANDARD.decode(between("id=\"asset-guessed.bin\">")).expect("base64");
+    let bytes = flate2::read::GzDecoder::new(&guessed[..]).bytes().count();
+    assert_eq!(Some(bytes as u64), json(&path)["gaussians"].as_u64(), "a byte for each Gaussian");
     let config: Value = serde_json::from_str(between("id=\"config\">")).expect("JSON");
     let initial = &config["settings"]["cameras"][0]["initial"]["position"];
     let position: [f64; 3] = serde_json::from_value(initial.clone()).expect("a point");

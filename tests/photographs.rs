@@ -323,6 +323,11 @@ fn the_reference_has_no_shadow() {
         }
     }
     assert!(beside > 100, "{beside}");
+    // What the reference's map has red is noted in its view, and so are the guesses of all other views.
+    let guessed = scene_pictures(&request.out.join("prepare/guessed"));
+    let red = provenance.pixels().map(|from| if from.0[0] > 128 { 255 } else { 0 });
+    assert!(guessed[name].pixels().map(|pixel| pixel.0[0]).eq(red));
+    assert!(scene_pictures(&request.out.join("hole")).keys().all(|name| guessed.contains_key(name)));
 }
 
 /// Pictures of a folder by name.

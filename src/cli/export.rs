@@ -12,6 +12,7 @@ use super::folders::Origin;
 use super::next;
 use super::shared::{self, DeviceArgs};
 use crate::config::Source;
+use crate::export::provenance::{self, OffPath};
 use crate::export::{self, Cloud, Export, Observer, Options, low_pass, measure, up};
 use crate::folder::{self, Lock};
 use crate::formats::{gltf, ply, sog, splat, spz};
@@ -19,12 +20,14 @@ use crate::gpu::Gpu;
 use crate::model::stored::Stored;
 use crate::prepare::record;
 use crate::render::widen;
-use crate::scene::{Camera, Scene, path};
+use crate::scene::{self, Camera, Scene, path};
 
 /// The export's folder within a run folder.
 pub(super) const EXPORT: &str = "export";
 /// The figures' file within an export's folder.
 pub(super) const FIGURES: &str = "export.json";
+/// The file of which Gaussians are known and which guessed, within an export's folder.
+pub(super) const PROVENANCE: &str = "provenance.npy";
 /// Stem of the exported files.
 pub(super) const STEM: &str = "scene";
 
@@ -57,6 +60,12 @@ pub(super) struct Args {
     /// Write scene.sog as well
     #[arg(long)]
     sog: bool,
+    /// Write provenance.npy as well: which Gaussians photographs show, and which are guessed
+    ///
+    /// A row for each Gaussian of scene.ply, in its order: float32, its shares in the pixels of the training views that are
+    /// known and in those that prepare has guessed. `view` tints by it.
+    #[arg(long)]
+    provenance: bool,
     /// Version of scene.spz: 3, or 2 for older readers, with coarser rotations
     #[arg(long, value_name = "2|3", default_value = "3", value_parser = spz_version)]
     spz_version: spz::Version,
@@ -206,6 +215,9 @@ pub(super) struct Cameras {
     pub focus: [f64; 3],
     /// The training cameras.
     pub cameras: Vec<Pose>,
+    /// Figures of [`PROVENANCE`], where that was written.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub provenance: Option<Provenance>,
 }
 
 impl Cameras {
@@ -214,7 +226,7 @@ impl Cameras {
         let cameras: Vec<Camera> = scene.train.iter().map(|view| view.camera).collect();
         let focus = path::focus(&cameras, &[]).unwrap_or_default();
         let cameras = scene.train.iter().map(|view| Pose::new(&view.name, &view.camera)).collect();
-        Self { background: BLACK, focus, cameras }
+        Self { background: BLACK, focus, cameras, provenance: None }
     }
 }
 
@@ -256,6 +268,16 @@ struct Figures {
     before: Vec<Listed>,
     #[serde(flatten)]
     cameras: Cameras,
+}
+
+/// What of the Gaussians is known.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(super) struct Provenance {
+    /// Gaussians that are guessed more than known.
+    guessed: usize,
+    /// Gaussians that fewer than two training views show.
+    unsupported: usize,
+    off_path: Vec<OffPath>,
 }
 
 const NOTE: &str = "loss: means over the views of measured_on, which took no part in baking and refinement; anchors: \
@@ -313,6 +335,7 @@ impl Args {
             out: Some(out.to_owned()),
             formats: Format::USUAL.to_vec(),
             sog: false,
+            provenance: true,
             spz_version: spz::Version::default(),
             up: Up::Auto,
             degree,
@@ -390,9 +413,10 @@ impl Listed {
 }
 
 /// The files that exports have left in a folder, as they are there. Refuses to write over others.
-fn keep_others(folder: &Path, formats: &[Format]) -> anyhow::Result<Vec<Listed>> {
+fn keep_others(folder: &Path, args: &Args) -> anyhow::Result<Vec<Listed>> {
     let own: Vec<Listed> = listed(folder).into_iter().flatten().filter(|own| own.is_there(folder)).collect();
-    let mut names = formats.iter().map(|format| format.file());
+    let beside = args.provenance.then(|| PROVENANCE.to_owned());
+    let mut names = args.formats().into_iter().map(Format::file).chain(beside);
     if let Some(name) = names.find(|name| folder.join(name).exists() && !own.iter().any(|own| own.name == *name)) {
         bail!(
             "{}: is not as an export left it, and would be written over: move it away, or choose another --out",
@@ -423,12 +447,15 @@ pub(super) fn export(
         );
     }
     let own = origin.scene().map(Path::new);
-    let scene = args.scene.as_deref().or(own).with_context(|| {
+    let scene_folder = args.scene.as_deref().or(own).with_context(|| {
         format!("{}: a model alone does not know its cameras; name the scene with --scene", args.model.display())
     })?;
-    let scene = shared::load_scene_of_model(scene, &mut settings)?;
-    let before = keep_others(folder, &args.formats())?;
-    folder::sweep(folder, |name| name == FIGURES || Format::value_variants().iter().any(|own| own.file() == name));
+    let scene = shared::load_scene_of_model(scene_folder, &mut settings)?;
+    let before = keep_others(folder, args)?;
+    let root = scene_folder.is_dir().then_some(scene_folder);
+    folder::sweep(folder, |name| {
+        [FIGURES, PROVENANCE].contains(&name) || Format::value_variants().iter().any(|own| own.file() == name)
+    });
     on_gpu(Box::new(|gpu| {
         let began = Instant::now();
         let options = Options {
@@ -453,8 +480,14 @@ pub(super) fn export(
             let hash = blake3::hash(&bytes).to_hex().to_string();
             written.push((File { name, bytes: bytes.len(), hash, loss }, bytes));
         }
-        let (files, contents): (Vec<File>, Vec<Vec<u8>>) = written.into_iter().unzip();
-        let figures = figures(args, gpu.info().name.clone(), &scene, &made, (files, before), began);
+        let (files, mut contents): (Vec<File>, Vec<Vec<u8>>) = written.into_iter().unzip();
+        let told = args.provenance.then(|| provenance_of(gpu, &made, (&scene, root), &settings.render, observer));
+        let mut figures = figures(args, gpu.info().name.clone(), &scene, &made, (files, before), began);
+        if let Some((told, file, bytes)) = told.transpose()? {
+            figures.cameras.provenance = Some(told);
+            figures.files.push(file);
+            contents.push(bytes);
+        }
         let text = serde_json::to_string_pretty(&figures)? + "\n";
         let named =
             figures.files.iter().zip(&contents).map(|(file, bytes)| (folder.join(&file.name), bytes.as_slice()));
@@ -466,6 +499,26 @@ pub(super) fn export(
         println!("wrote {}, {FIGURES} in {}", names.join(", "), folder.display());
         Ok(())
     }))
+}
+
+/// What of the Gaussians is known: the figures, and the file with its bytes. `root` is the scene's folder.
+fn provenance_of(
+    gpu: &Gpu,
+    made: &Export,
+    (scene, root): (&Scene, Option<&Path>),
+    render: &crate::render::Config,
+    observer: &mut dyn Observer,
+) -> anyhow::Result<(Provenance, File, Vec<u8>)> {
+    let turned = |camera: &Camera| up::turn_camera(camera, made.turn);
+    let told = provenance::Provenance::of(gpu, &made.cloud, (scene, root), turned, render, observer)?;
+    observer.end();
+    let cameras: Vec<Camera> = scene.train.iter().map(|view| turned(&view.camera)).collect();
+    let off_path = told.off_path(gpu, &made.cloud, &cameras, render)?;
+    let [guessed, unsupported] = told.counts();
+    let bytes = scene::npy::encode(told.shares.as_flattened(), [2, u32::try_from(told.shares.len())?]);
+    let hash = blake3::hash(&bytes).to_hex().to_string();
+    let file = File { name: PROVENANCE.to_owned(), bytes: bytes.len(), hash, loss: measure::Loss::default() };
+    Ok((Provenance { guessed, unsupported, off_path }, file, bytes))
 }
 
 fn figures(
@@ -504,7 +557,7 @@ fn figures(
         loss: loss.collect(),
         files,
         before,
-        cameras: Cameras { background: BLACK, focus, cameras: cameras.collect() },
+        cameras: Cameras { background: BLACK, focus, cameras: cameras.collect(), provenance: None },
     }
 }
 
@@ -532,6 +585,19 @@ fn report(made: &Export, figures: &Figures, formats: &[Format], drawn: u32) {
             "widened for pictures of {} pixels, {:.1} times the training's size; the files were drawn {drawn} times as large",
             figures.screen, made.larger,
         );
+    }
+    if let Some(told) = &figures.cameras.provenance {
+        println!(
+            "{} of {} Gaussians are guessed, {} are shown by fewer than two photographs",
+            told.guessed, figures.gaussians, told.unsupported
+        );
+        for OffPath { degrees, guessed, unsupported } in &told.off_path {
+            println!(
+                "{degrees:.0} degrees off the cameras' path {:.1} % of the picture are guessed, {:.2} % shown by fewer than two photographs",
+                100.0 * guessed,
+                100.0 * unsupported
+            );
+        }
     }
     let cut = spz::beyond_range(&made.cloud);
     if formats.contains(&Format::Spz) && cut > 0 {

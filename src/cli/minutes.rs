@@ -40,6 +40,8 @@ pub(super) struct Reserve {
     pub steps: f64,
     /// Seconds besides.
     pub seconds: f64,
+    /// Seconds that training has, however late it is: what was made before it is not in vain.
+    pub training: f64,
 }
 
 /// The time that a training has, and where it is in it. All times are seconds since the program began.
@@ -163,7 +165,7 @@ pub(super) fn fitted(
     let kept = reserve.steps * full * GROWTH + reserve.seconds;
     let after = DRAWN * drawn as f64 * full * GROWTH + WRITTEN + kept;
     let gone = began.elapsed().as_secs_f64();
-    let steps = ((60.0 * minutes - gone - after).max(0.0) / mean) as u32;
+    let (steps, over) = shared(60.0 * minutes - gone - after, reserve.training, mean);
     ensure!(
         steps >= FEWEST,
         "--minutes {minutes}: {:.1} min are the least here, of which {:.1} have gone before training: give more time, or \
@@ -172,13 +174,27 @@ pub(super) fn fitted(
         gone / 60.0,
     );
     let files = if kept > 0.0 { format!(", and {:.1} are kept for the files", kept / 60.0) } else { String::new() };
+    let fit = if over > 0.0 {
+        format!(
+            "fit into the {:.1} min that training has all the same, {:.1} beyond {minutes} min",
+            reserve.training / 60.0,
+            over / 60.0
+        )
+    } else {
+        format!("fit into what is left of {minutes} min")
+    };
     eprintln!(
-        "minutes: {:.1} min have gone{files}: {steps} steps of about {:.0} ms fit into what is left of {minutes} min; corrected \
-         while they run",
+        "minutes: {:.1} min have gone{files}: {steps} steps of about {:.0} ms {fit}; corrected while they run",
         gone / 60.0,
         1e3 * mean
     );
-    Ok((settings.rescheduled(steps), Clock::new(began, 60.0 * minutes - kept, full / first, drawn)))
+    Ok((settings.rescheduled(steps), Clock::new(began, 60.0 * minutes + over - kept, full / first, drawn)))
+}
+
+/// Steps that fit into the seconds that are `left`, or into those that training has all the same, and the seconds beyond.
+fn shared(left: f64, training: f64, step: f64) -> (u32, f64) {
+    let over = (training - left).max(0.0);
+    (((left + over).max(0.0) / step) as u32, over)
 }
 
 /// Seconds as minutes that are enough for them, in tenths.
@@ -227,6 +243,15 @@ mod tests {
         }
         let full = cost * 2.5 * 5f64.powf(0.8) * slow(now);
         (now + 0.4 * 30.0 * full + 1.0, settings)
+    }
+
+    /// What came before took longer than all the time: training has its share, and ends later by so much.
+    #[test]
+    fn what_is_late_is_not_in_vain() {
+        assert_eq!(shared(100.0, 24.0, 0.5), (200, 0.0));
+        assert_eq!(shared(4.0, 24.0, 0.5), (48, 20.0));
+        assert_eq!(shared(-20.0, 24.0, 0.5), (48, 44.0));
+        assert_eq!(shared(-20.0, 0.0, 0.5), (0, 20.0), "a training alone is refused");
     }
 
     /// Anchors grow, so that steps become slower, and of the growing the clock learns only later.

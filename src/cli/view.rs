@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use anyhow::{Context as _, anyhow, bail};
 
-use super::export::{Cameras, EXPORT, FIGURES, Pose, STEM};
+use super::export::{Cameras, EXPORT, FIGURES, PROVENANCE, Pose, STEM};
 use super::folders::Origin;
 use super::next;
 use super::shared;
@@ -18,7 +18,8 @@ use crate::view::{self, Page, Start};
 /// Show an exported scene in the browser
 ///
 /// Serves a page on the loopback address until it is stopped; nothing is fetched from elsewhere. The view starts at a
-/// training camera, by default the one that stands most upright, and a slider draws its photograph over the scene.
+/// training camera, by default the one that stands most upright, and a slider draws its photograph over the scene. What is guessed
+/// can be tinted where the export has its provenance, as those of remove have.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   gscream-vk view runs/garden
@@ -121,6 +122,13 @@ fn page(args: &Args) -> anyhow::Result<Page> {
         }
         jpeg.ok()
     });
+    let guessed = cameras.provenance.as_ref().and_then(|_| {
+        let guessed = guessed(&folder.join(PROVENANCE));
+        if let Err(error) = &guessed {
+            eprintln!("note: without a tint of what is guessed: {error:#}");
+        }
+        guessed.ok()
+    });
     let name = std::path::absolute(run).unwrap_or_else(|_| run.clone());
     Ok(Page {
         title: name.file_name().map_or_else(|| "scene".into(), |name| name.to_string_lossy().into_owned()),
@@ -128,7 +136,20 @@ fn page(args: &Args) -> anyhow::Result<Page> {
         start: start(pose, &cameras),
         background: cameras.background,
         photograph,
+        guessed,
     })
+}
+
+/// `[gaussian]` how much of it is guessed, 0 to 255.
+fn guessed(path: &Path) -> anyhow::Result<Vec<u8>> {
+    let map = scene::npy::read(path)?;
+    if map.size[0] != 2 {
+        bail!("{}: not as an export left it; `gscream-vk export --provenance` writes it", path.display());
+    }
+    let shares = map.values.as_chunks::<2>().0.iter();
+    Ok(shares
+        .map(|[known, guessed]| (255.0 * guessed / (known + guessed).max(f32::MIN_POSITIVE)).round() as u8)
+        .collect())
 }
 
 /// The camera that is rolled least out of the horizon.

@@ -1,6 +1,6 @@
 //! Static Gaussians drawn, compared and improved: the training step's own stages.
 
-use crate::gpu::{Buffer, Error, Gpu};
+use crate::gpu::{Error, Gpu};
 use crate::losses::{self, Losses, View, Weights};
 use crate::model::gaussians::Static;
 use crate::optimizer::adam::{self, Tensors};
@@ -21,7 +21,6 @@ struct Canvas {
     losses: Losses,
     rasterize: Backward,
     project: ProjectBackward,
-    ones: Buffer<[f32; 3]>,
 }
 
 impl Canvas {
@@ -39,7 +38,6 @@ impl Canvas {
             losses: Losses::new(gpu, &plan)?,
             rasterize: Backward::new(gpu, room.method, room.slots, room.pairs, Outputs::Color)?,
             project: ProjectBackward::new(gpu, room.slots)?,
-            ones: gpu.upload("ones", &vec![[1.0; 3]; room.pixels()])?,
         })
     }
 }
@@ -78,20 +76,30 @@ impl Drawer {
         gpu.read(&stages.own.picture.rgb)
     }
 
-    /// The sum of alpha x transmittance of every Gaussian over the pixels of a view: the colour's own gradient where the
-    /// picture's is 1.
+    /// The sum of alpha x transmittance of every Gaussian over the pixels of a view.
     ///
     /// # Errors
     /// As [`Drawer::draw`].
     pub fn contributions(&mut self, camera: &Camera) -> Result<Vec<f32>, Error> {
+        let [w, h] = camera.size.map(|n| n as usize);
+        Ok(self.shares(camera, &vec![[1.0; 3]; w * h])?.into_iter().map(|share| share[0]).collect())
+    }
+
+    /// The sum of alpha x transmittance of every Gaussian over the pixels of a view, each times the pixel's weights: the colour's
+    /// own gradient where these are the picture's.
+    ///
+    /// # Errors
+    /// As [`Drawer::draw`].
+    pub fn shares(&mut self, camera: &Camera, weights: &[[f32; 3]]) -> Result<Vec<[f32; 3]>, Error> {
         let (gpu, background) = (self.session.gpu().clone(), self.background);
+        let weights = gpu.upload("grad_rgb", weights)?;
         let drawn = self.session.run(&self.gaussians, camera, |rec, Stages { room, forward, own }, binned| {
             rasterize::forward(rec, room.method, forward.projected(), binned, background, &own.picture);
-            let gradient = PictureGradient { rgb: &own.ones, depth: None, transmittance: None };
+            let gradient = PictureGradient { rgb: &weights, depth: None, transmittance: None };
             own.rasterize.record(rec, room.method, forward.projected(), binned, &own.picture, gradient);
         })?;
         let (tiles, shares) = (gpu.read(drawn.forward.bin.tiles())?, gpu.read(&drawn.own.rasterize.grad_color)?);
-        Ok(tiles.iter().zip(shares).map(|(tiles, share)| if *tiles > 0 { share[0] } else { 0.0 }).collect())
+        Ok(tiles.iter().zip(shares).map(|(tiles, share)| if *tiles > 0 { share } else { [0.0; 3] }).collect())
     }
 
     /// One step of Adam (counted from 1) towards a picture \[pixel\] (see [`losses::pack`]); returns the loss before it.

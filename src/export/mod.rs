@@ -5,6 +5,7 @@ pub mod draw;
 pub mod low_pass;
 pub mod measure;
 pub mod poses;
+pub mod provenance;
 pub mod refine;
 pub mod up;
 
@@ -42,6 +43,9 @@ pub enum Error {
     /// A file that is not what its name says.
     #[error("{0}")]
     Format(String),
+    /// A scene that cannot be read any more.
+    #[error(transparent)]
+    Scene(#[from] crate::scene::Error),
     /// A model of which nothing is seen.
     #[error("none of the model's {gaussians} Gaussians is seen from any of {poses} poses: there is nothing to export")]
     Nothing {

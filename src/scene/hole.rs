@@ -11,6 +11,9 @@ use super::{Error, View, decode, resample};
 pub const HOLE: &str = "hole";
 /// Alpha of a pixel of the hole that shows what may not be there.
 pub const DOUBTFUL: u8 = 128;
+/// Folder of maps of what no photograph shows within a scene that `prepare` made: `NAME.png` of each view with a hole, as large as its
+/// filled picture, white where that is guessed, or painted by the user.
+pub const GUESSED: &str = "prepare/guessed";
 /// File in [`HOLE`] that names the reference pictures which the holes were filled with: of each in a line the BLAKE3 hash of
 /// its bytes and its path below the scene.
 pub const MADE_WITH: &str = "made_with";

@@ -55,7 +55,7 @@ use config::STEREO_PRIOR;
 pub use config::{Config, NONE};
 pub use error::Error;
 pub(crate) use exposure::even_out;
-pub use hole::{DOUBTFUL, HOLE, Hole, MADE_WITH};
+pub use hole::{DOUBTFUL, GUESSED, HOLE, Hole, MADE_WITH};
 pub(crate) use layout::{PICTURES, stem};
 pub use note::{Note, Notes};
 pub use picture::{decode, dimensions, is_turned, jpeg, object_mask};

@@ -2,7 +2,8 @@
 //! way is shown by [`live`].
 //!
 //! The viewer (`supersplat/`, MIT) is part of the program, so that nothing is fetched from anywhere. The page starts at a
-//! training camera, in a frame of the photograph's proportions; a slider draws the photograph over it, before and after.
+//! training camera, in a frame of the photograph's proportions; a slider draws the photograph over it, before and after, and what was
+//! guessed may be tinted.
 //! SuperSplat turns a PLY half round the z axis: up is -y in the file and +y in the page.
 
 pub mod live;
@@ -120,6 +121,8 @@ pub struct Page {
     pub background: [f64; 3],
     /// What the start's photograph shows from the viewer's camera ([`upright`]) as JPEG.
     pub photograph: Option<Vec<u8>>,
+    /// `[gaussian]` in the PLY's order, 0 where photographs show it to 255 where it is guessed: the page tints by it.
+    pub guessed: Option<Vec<u8>>,
 }
 
 impl Page {
@@ -138,6 +141,7 @@ impl Page {
             "title": self.title,
             "aspect": f64::from(width) / f64::from(height),
             "photograph": self.photograph.is_some(),
+            "guessed": self.guessed.is_some(),
             "settings": {
                 "version": 2,
                 "tonemapping": "none",
@@ -183,6 +187,7 @@ impl Page {
             plain("/scene.ply", "application/octet-stream", self.ply.clone()),
             plain("/LICENSE", "text/plain; charset=utf-8", LICENSE.as_bytes().to_vec()),
         ];
+        all.extend(self.guessed.clone().map(|bytes| plain("/guessed.bin", "application/octet-stream", bytes)));
         all.extend(self.photograph.clone().map(|jpeg| plain("/photograph.jpg", "image/jpeg", jpeg)));
         all
     }
@@ -206,8 +211,10 @@ impl Page {
         add("viewer.js", VIEWER);
         add("viewer.css", &packed(STYLE)?);
         add("scene.ply", &packed(&self.ply)?);
-        if let Some(jpeg) = &self.photograph {
-            add("photograph.jpg", &packed(jpeg)?);
+        for (name, bytes) in [("photograph.jpg", &self.photograph), ("guessed.bin", &self.guessed)] {
+            if let Some(bytes) = bytes {
+                add(name, &packed(bytes)?);
+            }
         }
         let policy = format!("<meta http-equiv=\"Content-Security-Policy\" content=\"{SINGLE_POLICY}\">");
         Ok(self.html(&policy, &assets, &format!("<script type=\"module\">\n{PROGRAM}</script>")))
@@ -225,6 +232,7 @@ mod tests {
             start: Start { center: [1.0, 2.0, 3.0], target: [4.0, -5.0, 6.0], fov: 55.0, size: [160, 120] },
             background: [0.0, 0.5, 1.0],
             photograph: Some(vec![1, 2, 3]),
+            guessed: Some(vec![0, 255]),
         }
     }
 
@@ -341,7 +349,7 @@ mod tests {
     #[test]
     fn one_page_holds_everything() {
         let html = page().single().expect("memory");
-        for name in ["viewer.js", "viewer.css", "scene.ply", "photograph.jpg"] {
+        for name in ["viewer.js", "viewer.css", "scene.ply", "photograph.jpg", "guessed.bin"] {
             let at = html.split_once(&format!("id=\"asset-{name}\">")).expect(name).1;
             let text = at.split_once("</script>").expect("its end").0;
             let gzip = BASE64_STANDARD.decode(text).expect("base64");

@@ -44,6 +44,8 @@ const SURE: f64 = 0.5;
 const REFINED: f64 = 0.6;
 const BAKED: f64 = 200.0;
 const WRITTEN: f64 = 3.0;
+/// Training has this part of the time, even if it is over: by so much `--minutes` may be missed, and without it all was in vain.
+const LATE: f64 = 0.1;
 
 /// The size of a removal.
 #[derive(Clone, Copy, Default)]
@@ -197,10 +199,14 @@ impl Time {
         })
     }
 
-    /// Steps and seconds that the files take.
+    /// Steps and seconds that the files take, and what training has before them even where the time is over.
     pub fn files(&self) -> Reserve {
         let baked = 1000.0 * self.work.files * REFINED + BAKED;
-        Reserve { steps: if self.work.form == Form::Anchors { baked } else { 0.0 }, seconds: WRITTEN }
+        Reserve {
+            steps: if self.work.form == Form::Anchors { baked } else { 0.0 },
+            seconds: WRITTEN,
+            training: self.minutes.map_or(0.0, |minutes| LATE * 60.0 * minutes),
+        }
     }
 }
 

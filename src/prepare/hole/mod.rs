@@ -50,7 +50,7 @@ use super::network::{self, Inpainting};
 use super::record::Batch;
 use super::{Error, Watch};
 use crate::multiview::Matched;
-use crate::scene::{self, Camera, DOUBTFUL, HOLE, MADE_WITH, PriorKind, Scene, resample};
+use crate::scene::{self, Camera, DOUBTFUL, GUESSED, HOLE, MADE_WITH, PriorKind, Scene, resample};
 use color::{Filled, Filling, Photograph};
 use surface::{Sight, Sights};
 
@@ -71,8 +71,8 @@ pub const METHOD: &str = "one surface with smooth ends, nothing where others loo
      what is nearly one plane is one, copies nearly keep their hue, ends are where the first view has them, \
      nothing from views with the object elsewhere, nothing stands where the first view looks through, surfaces by what they are covered with, \
      straight borders go on, those that end in a hole too, surfaces end at right angles, grain is kept, floors end at their walls, planes have \
-     their materials, which have grain, what is bare of the object refutes nothing, the reference has no shadow, and no \
-     small piece hangs in a hole";
+     their materials, which have grain, what is bare of the object refutes nothing, the reference has no shadow, no \
+     small piece hangs in a hole, and what is guessed is noted";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 
@@ -225,13 +225,19 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
             } else {
                 guess::fill(&sights, &photographs, i, &mut filling);
             }
+            let guessed = |hole: &u8, seen: &bool| if *hole != 0 && !seen { 255 } else { 0 };
+            let guessed =
+                photographs[i].hole.as_raw().iter().zip(&filling.seen).map(|(hole, seen)| guessed(hole, seen));
+            let [w, h] = cameras[i].size;
+            let guessed = GrayImage::from_raw(w, h, guessed.collect()).expect("a byte per pixel");
+            let name = &task.fine.train[i].name;
+            batch.gray(format!("{GUESSED}/{name}.png"), &guessed, "white: seen by no photograph, guessed");
             if i == of {
                 of_reference(task, of, &filling, &photographs[of], &sights, expected, &mut batch)?;
             }
             if !task.given.contains_key(&i) {
                 doubtful += filling.doubtful.iter().filter(|doubtful| **doubtful).count();
                 all += photographs[i].hole.as_raw().iter().filter(|hole| **hole != 0).count();
-                let name = &task.fine.train[i].name;
                 let picture = cut_out(&as_exposed(task, i, &filling.rgb), &filling.doubtful, &photographs[i].hole);
                 batch.rgba(
                     format!("{HOLE}/{name}.png"),
