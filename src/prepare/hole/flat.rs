@@ -113,8 +113,14 @@ impl Common {
         Self { normal, offset: 1.0 / length + normal.dot(origin) }
     }
 
+    /// Whether another plane is tilted against it by this sine at most, and off by this much at a point.
+    pub(super) fn is(&self, other: &Self, at: DVec3, sine: f64, off: f64) -> bool {
+        let away = |plane: &Self| plane.normal.dot(at) - plane.offset;
+        self.normal.cross(other.normal).length() <= sine && (away(self).abs() - away(other).abs()).abs() <= off
+    }
+
     /// A plane as a view sees it.
-    fn of(plane: &Plane, sight: &Sight) -> Self {
+    pub(super) fn of(plane: &Plane, sight: &Sight) -> Self {
         let rotation = sight.grid.camera.rotation.map(|row| DVec3::from(row.map(f64::from)));
         let plane = DVec3::from(*plane);
         let turned = rotation[0] * plane.x + rotation[1] * plane.y + rotation[2] * plane.z;
@@ -219,6 +225,7 @@ impl Sights {
             (sight.around, sight.cover) = (planes, cover);
             sites.into_iter().for_each(|(site, depth)| sight.depth[site] = depth);
         }
+        self.stand();
     }
 
     /// Planes around a view's hole, and the sites on them; nothing where the view's neighbours are too near to tell.

@@ -72,7 +72,7 @@ pub const METHOD: &str = "one surface with smooth ends, nothing where others loo
      nothing from views with the object elsewhere, nothing stands where the first view looks through, surfaces by what they are covered with, \
      straight borders go on, those that end in a hole too, surfaces end at right angles, grain is kept, floors end at their walls, planes have \
      their materials, which have grain, what is bare of the object refutes nothing, the reference has no shadow, no \
-     small piece hangs in a hole, and what is guessed is noted";
+     small piece hangs in a hole, what is guessed is noted, and nothing shows through what the object stands on";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 
@@ -303,7 +303,7 @@ type Shown = BTreeMap<usize, Vec<bool>>;
 fn shown_by_others(sights: &Sights, views: &[usize]) -> Shown {
     let of = |i: usize| {
         let carried = sights.carried(i).into_iter().zip(&sights.0[i].hole);
-        carried.filter(|(_, hole)| **hole).map(|((z, _), _)| z.is_finite()).collect()
+        carried.filter(|(_, hole)| **hole).map(|((_, photographed), _)| photographed).collect()
     };
     views.iter().map(|i| (*i, of(*i))).collect()
 }

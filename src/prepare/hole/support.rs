@@ -4,8 +4,10 @@
 //! the object's points come down to when they are dropped onto the plane, the plane is, and hides what is behind it.
 
 use glam::{DVec2, DVec3};
+use rayon::prelude::*;
 
-use super::surface::Sight;
+use super::flat::Common;
+use super::surface::{Sight, Sights};
 use crate::prepare::planes::{self, Plane};
 use crate::statistics::{median, quantile};
 
@@ -17,10 +19,17 @@ const FEWEST: usize = 30;
 const CLEAR: f64 = 0.15;
 /// Points within this part of the object's height of the plane are the plane's.
 const ON_IT: f64 = 0.08;
+/// Points lower than this part of the object's height are above where it stands: what it stands on is known to a few parts of it.
+const FOOT: f64 = 0.25;
 /// Least part of the points that is clear of the plane, most that lies behind it, and least that touches it.
 const RISES: f64 = 0.5;
 const BEHIND: f64 = 0.1;
 const TOUCHES: f64 = 0.02;
+/// Points of the object in all views that tell where it stands, at most.
+const POINTS: usize = 20_000;
+/// Sine of the angle up to which planes of two views are one, and least part of the views that have one.
+const TILTED: f64 = 0.1;
+const AGREE: f64 = 0.2;
 /// Points farther than this many times the median from the middle of all are strays of the matching.
 const STRAY: f64 = 3.0;
 
@@ -32,6 +41,8 @@ pub struct Support {
     tall: f64,
     /// Corners, along the axes, of the least convex polygon with all points of the object, counterclockwise.
     corners: Vec<DVec2>,
+    /// The same of those next to the plane: there the object stands.
+    foot: Vec<DVec2>,
 }
 
 impl Support {
@@ -54,12 +65,16 @@ impl Support {
         }
         let (across, down) = normal.any_orthonormal_pair();
         let axes = [across, down];
-        let clear = object.iter().zip(&heights).filter(|(_, h)| **h > CLEAR * tall);
-        let dropped: Vec<DVec2> = clear.map(|(point, _)| DVec2::new(point.dot(across), point.dot(down))).collect();
-        let middle = DVec2::new(median(dropped.iter().map(|p| p.x))?, median(dropped.iter().map(|p| p.y))?);
-        let reach = STRAY * median(dropped.iter().map(|p| p.distance(middle)))?;
-        let corners = hull(dropped.into_iter().filter(|p| p.distance(middle) <= reach).collect());
-        (corners.len() >= 3).then_some(Self { plane, axes, tall, corners })
+        let around = |is: &dyn Fn(f64) -> bool| -> Option<Vec<DVec2>> {
+            let these = object.iter().zip(&heights).filter(|(_, h)| is(**h / tall));
+            let dropped: Vec<DVec2> = these.map(|(point, _)| DVec2::new(point.dot(across), point.dot(down))).collect();
+            let middle = DVec2::new(median(dropped.iter().map(|p| p.x))?, median(dropped.iter().map(|p| p.y))?);
+            let reach = STRAY * median(dropped.iter().map(|p| p.distance(middle)))?;
+            Some(hull(dropped.into_iter().filter(|p| p.distance(middle) <= reach).collect()))
+        };
+        let corners = around(&|h| h > CLEAR)?;
+        let foot = around(&|h| h <= FOOT && h > -ON_IT).unwrap_or_default();
+        (corners.len() >= 3).then_some(Self { plane, axes, tall, corners, foot })
     }
 
     /// Whether a point in the camera's coordinates lies on it, by the object's height.
@@ -75,15 +90,24 @@ impl Support {
 
     /// Depth z at which a ray (x/z, y/z) meets the plane under the object; nothing beside it.
     pub fn under(&self, ray: [f64; 2]) -> Option<f64> {
+        self.within(&self.corners, ray)
+    }
+
+    /// Depth z at which a ray meets the plane where the object stands on it; nothing beside that.
+    fn below(&self, ray: [f64; 2]) -> Option<f64> {
+        self.within(&self.foot, ray)
+    }
+
+    fn within(&self, corners: &[DVec2], ray: [f64; 2]) -> Option<f64> {
         let z = 1.0 / planes::on(&self.plane, ray);
         let point = DVec3::new(ray[0], ray[1], 1.0) * z;
         let at = DVec2::new(point.dot(self.axes[0]), point.dot(self.axes[1]));
-        let n = self.corners.len();
+        let n = corners.len();
         let inside = (0..n).all(|i| {
-            let (from, to) = (self.corners[i], self.corners[(i + 1) % n]);
+            let (from, to) = (corners[i], corners[(i + 1) % n]);
             (to - from).perp_dot(at - from) >= 0.0
         });
-        (z > 0.0 && z.is_finite() && inside).then_some(z)
+        (z > 0.0 && z.is_finite() && inside && n >= 3).then_some(z)
     }
 }
 
@@ -110,13 +134,55 @@ fn hull(mut points: Vec<DVec2>) -> Vec<DVec2> {
     corners
 }
 
+impl Sights {
+    /// Finds where the object stands on the plane that most views have it stand on, by what all measure of it: a table that nobody sees below the object
+    /// does not let the floor be seen that others see past the table.
+    pub(super) fn stand(&mut self) {
+        let trusted = || self.0.iter().filter(|sight| sight.grid.trusted);
+        let object: Vec<DVec3> = trusted()
+            .flat_map(|sight| sight.of_object().map(|site| sight.point(site, sight.grid.depth[site])))
+            .collect();
+        let object: Vec<DVec3> = object.iter().copied().step_by(object.len().div_ceil(POINTS).max(1)).collect();
+        let on = |plane: Plane, sight: &Sight| {
+            let camera = sight.grid.camera;
+            Support::new(plane, &object.iter().map(|p| camera.to_camera(p.to_array()).into()).collect::<Vec<_>>())
+        };
+        // What one view alone takes for a plane may pass before the object.
+        let views: Vec<&Sight> = trusted().collect();
+        let of = |sight: &&Sight| -> Vec<(Common, f64)> {
+            let supports = sight.supports(&sight.around).into_iter().filter_map(|support| on(support.plane, sight));
+            supports.map(|support| (Common::of(&support.plane, sight), support.tall)).collect()
+        };
+        let found: Vec<(Common, f64)> = views.par_iter().map(of).collect::<Vec<_>>().concat();
+        let middle = object.iter().sum::<DVec3>() / object.len().max(1) as f64;
+        let agree =
+            |(a, tall): &(Common, f64)| found.iter().filter(|(b, _)| a.is(b, middle, TILTED, ON_IT * tall)).count();
+        let agree: Vec<usize> = found.iter().map(agree).collect();
+        let Some(best) = (0..found.len()).max_by_key(|i| (agree[*i], std::cmp::Reverse(*i))) else { return };
+        if agree[best] < 2 || (agree[best] as f64) < AGREE * views.len() as f64 {
+            return;
+        }
+        let stands = |sight: &Sight| -> Vec<f64> {
+            let support = found[best].0.seen_by(sight).and_then(|plane| on(plane, sight));
+            let at = |site: usize| support.as_ref().filter(|_| sight.hole[site])?.below(sight.ray(site));
+            (0..sight.hole.len()).map(|site| at(site).unwrap_or(f64::NAN)).collect()
+        };
+        let stands: Vec<Vec<f64>> = self.0.par_iter().map(stands).collect();
+        self.0.iter_mut().zip(stands).for_each(|(sight, stands)| sight.stands = stands);
+    }
+}
+
 impl Sight {
-    /// The planes, of these of the view, that the object stands on.
-    pub(super) fn supports(&self, planes: &[Plane]) -> Vec<Support> {
+    /// The sites at which others confirm the object's depth.
+    fn of_object(&self) -> impl Iterator<Item = usize> {
         // The margin around the object shows what is behind it.
         let deep = |site: usize| self.around(site).all(|near| self.hole[near]);
-        let sites = (0..self.hole.len()).filter(|site| self.grid.confirmed[*site] && deep(*site));
-        let object: Vec<DVec3> = sites
+        (0..self.hole.len()).filter(move |site| self.grid.confirmed[*site] && deep(*site))
+    }
+
+    /// The planes, of these of the view, that the object stands on.
+    pub(super) fn supports(&self, planes: &[Plane]) -> Vec<Support> {
+        let object: Vec<DVec3> = (self.of_object())
             .map(|site| {
                 let [x, y] = self.ray(site);
                 DVec3::new(x, y, 1.0) * self.grid.depth[site]
@@ -149,7 +215,11 @@ impl Sight {
 
 #[cfg(test)]
 mod tests {
+    use image::GrayImage;
+
     use super::*;
+    use crate::multiview::DepthGrid;
+    use crate::scene::Camera;
 
     /// A floor a unit and a half below the camera, with y downwards: y = 1.5.
     const FLOOR: Plane = [0.0, 1.0 / 1.5, 0.0];
@@ -181,6 +251,78 @@ mod tests {
         assert!(Support::new(FLOOR, &cube(0.5)).is_none());
         assert!(Support::new(FLOOR, &cube(-0.6)).is_none());
         assert!(Support::new(FLOOR, &cube(0.0)[..20]).is_none());
+    }
+
+    const SIZE: [u32; 2] = [120, 90];
+
+    /// One of eight cameras around a box of one unit on a table that is little larger, over a floor, y downwards: the camera, the mask,
+    /// the depth of what each pixel shows, and of what it would show without the box.
+    fn table(turn: usize) -> (Camera, GrayImage, DepthGrid, Vec<f64>) {
+        let (sin, cos) = (std::f64::consts::TAU * turn as f64 / 8.0).sin_cos();
+        let eye = DVec3::new(5.0 * sin, -3.0, -5.0 * cos);
+        let ahead = (DVec3::new(0.0, -0.2, 0.0) - eye).normalize();
+        let across = DVec3::Y.cross(ahead).normalize();
+        let rows = [across, ahead.cross(across), ahead];
+        let camera = Camera {
+            rotation: rows.map(|row| row.to_array().map(|v| v as f32)),
+            translation: rows.map(|row| -row.dot(eye)),
+            focal: [110.0; 2],
+            principal: [60.0, 45.0],
+            distortion: [0.0; 4],
+            size: SIZE,
+        };
+        let pixels = (SIZE[0] * SIZE[1]) as usize;
+        let met = |way: DVec3, [low, high]: [DVec3; 2]| {
+            let [low, high] = [(low - eye) / way, (high - eye) / way];
+            let (enter, leave) = (low.min(high).max_element(), low.max(high).min_element());
+            if enter < leave { enter } else { f64::INFINITY }
+        };
+        let shown = |pixel: usize| {
+            let way = DVec3::from(camera.lift(camera.pixel_center(pixel), 1.0).expect("a ray")) - eye;
+            let slab = [DVec3::new(-0.8, 0.0, -0.8), DVec3::new(0.8, 0.05, 0.8)];
+            let behind = met(way, slab).min(if way.y > 0.0 { (1.5 - eye.y) / way.y } else { 50.0 });
+            (met(way, [DVec3::new(-0.5, -0.8, -0.5), DVec3::new(0.5, 0.0, 0.5)]), behind)
+        };
+        let (boxed, behind): (Vec<f64>, Vec<f64>) = (0..pixels).map(shown).unzip();
+        let depth = boxed.iter().zip(&behind).map(|(a, b)| a.min(*b)).collect();
+        let mask = boxed.iter().map(|z| if z.is_finite() { 255 } else { 0 }).collect();
+        let mask = GrayImage::from_raw(SIZE[0], SIZE[1], mask).expect("a byte per pixel");
+        let (confirmed, colors) = (vec![true; pixels], vec![[90; 3]; pixels]);
+        let grid =
+            DepthGrid { camera, stride: 1, columns: SIZE[0], rows: SIZE[1], depth, confirmed, colors, trusted: true };
+        (camera, mask, grid, behind)
+    }
+
+    /// Nobody sees the table under the object, and past its edge everybody sees the floor, which lies behind the table in every view.
+    #[test]
+    fn the_floor_does_not_show_through_the_table() {
+        let views: Vec<_> = (0..8).map(table).collect();
+        let cameras: Vec<Camera> = views.iter().map(|view| view.0).collect();
+        let masks: Vec<GrayImage> = views.iter().map(|view| view.1.clone()).collect();
+        let mut sights = Sights::new(views.iter().map(|view| view.2.clone()).collect(), &cameras, &masks, &masks);
+        for (sight, camera) in sights.0.iter_mut().zip(&cameras) {
+            // The planes y = 0 and y = 1.5 of the world.
+            let down = camera.rotation.map(|row| f64::from(row[1]));
+            sight.around = [0.0, 1.5].map(|y| down.map(|v| v / (y - camera.center()[1]))).to_vec();
+        }
+        let through = |sights: &Sights| {
+            let carried = sights.carried(0).into_iter().zip(&views[0].3);
+            carried.filter(|((z, _), behind)| *z > 1.1 * **behind).count()
+        };
+        assert!(through(&sights) > 100, "{}", through(&sights));
+        sights.stand();
+        assert!(through(&sights) < 20, "{}", through(&sights));
+        for of in [0, 3] {
+            sights.solve(of, 1);
+            let (sight, behind) = (&sights.0[of], &views[of].3);
+            let holes: Vec<usize> = (0..sight.hole.len()).filter(|site| sight.hole[*site]).collect();
+            let under: Vec<usize> = holes.iter().copied().filter(|site| sight.stands[*site].is_finite()).collect();
+            let right = |sites: &[usize]| {
+                sites.iter().filter(|site| (sight.depth[**site] / behind[**site] - 1.0).abs() < 0.02).count()
+            };
+            assert!(under.len() > 100 && right(&under) == under.len(), "{} of {}", right(&under), under.len());
+            assert!(right(&holes) * 20 > holes.len() * 19, "{} of {}", right(&holes), holes.len());
+        }
     }
 
     #[test]

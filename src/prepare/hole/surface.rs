@@ -66,6 +66,8 @@ pub struct Sight {
     pub surface: Vec<u8>,
     /// Planes around the hole: inverse depth by x/z, y/z and 1.
     pub planes: Vec<planes::Plane>,
+    /// `[site of the hole]` depth z of the plane that the object stands on where it does, NaN elsewhere: nothing behind that shows.
+    pub(super) stands: Vec<f64>,
     /// Planes around the hole that were found before it is solved; none where the views are too near each
     /// other to tell.
     pub(super) around: Vec<planes::Plane>,
@@ -200,6 +202,7 @@ impl Sight {
             measured: vec![false; sites],
             surface: vec![0; sites],
             planes: vec![],
+            stands: vec![f64::NAN; sites],
             around: vec![],
             cover: Cover::default(),
             covered: vec![],
@@ -530,6 +533,9 @@ impl Sights {
                 if depth == refuted || depth <= (1.0 - SAME) * object {
                     continue;
                 }
+                if depth > (1.0 + APART) * own.stands[site] {
+                    return (own.stands[site], false);
+                }
                 if self.is_refuted(of, own.point(site, depth)) {
                     refuted = depth;
                     continue;
@@ -542,19 +548,6 @@ impl Sights {
             (f64::NAN, false)
         };
         (0..own.hole.len()).into_par_iter().map(one).collect()
-    }
-
-    /// `[site of the hole]` of a view whether another's surface behind the object falls there, or beside it.
-    pub fn told(&self, by: usize, of: usize) -> Vec<bool> {
-        let (own, other) = (&self.0[of], &self.0[by]);
-        let mut falls = vec![false; own.hole.len()];
-        for site in (0..other.hole.len()).filter(|site| other.hole[*site] && other.depth[*site].is_finite()) {
-            if let Some((there, _)) = own.see(other.point(site, other.depth[site])) {
-                falls[there] = true;
-            }
-        }
-        let holes = (0..own.hole.len()).filter(|site| own.hole[*site]);
-        holes.map(|site| own.around(site).any(|near| falls[near])).collect()
     }
 
     /// `[cell]` what each plane costs there by what photographs show on it, and at last where the site was carried to; nothing
@@ -584,7 +577,7 @@ impl Sights {
             let impossible = |plane: &planes::Plane| {
                 let z = 1.0 / planes::on(plane, own.ray(site));
                 let before = z < NEARER / f64::from(disparity[site]);
-                before || self.is_refuted(of, own.point(site, z))
+                before || z > (1.0 + APART) * own.stands[site] || self.is_refuted(of, own.point(site, z))
             };
             let cost = |label: usize| {
                 if planes.get(label).is_some_and(impossible) {
@@ -648,6 +641,9 @@ impl Sights {
         let against = |cell: usize, d: f64| {
             let site = sites[cell];
             if d.is_nan() || d <= 0.0 || own.hole[site] && 1.0 / d < (1.0 - APART) * own.object[site] {
+                return 1.0;
+            }
+            if 1.0 / d > (1.0 + APART) * own.stands[site] {
                 return 1.0;
             }
             let is = planes.iter().position(|plane| planes::on(plane, own.ray(site)) == d);

@@ -126,6 +126,19 @@ impl Sights {
         hidden.len() >= HULL_VIEWS && hidden.len() as f64 >= WITHIN_THING * asked as f64 && around()
     }
 
+    /// `[site of the hole]` of a view whether another's surface behind the object falls there, or beside it.
+    pub fn told(&self, by: usize, of: usize) -> Vec<bool> {
+        let (own, other) = (&self.0[of], &self.0[by]);
+        let mut falls = vec![false; own.hole.len()];
+        for site in (0..other.hole.len()).filter(|site| other.hole[*site] && other.depth[*site].is_finite()) {
+            if let Some((there, _)) = own.see(other.point(site, other.depth[site])) {
+                falls[there] = true;
+            }
+        }
+        let holes = (0..own.hole.len()).filter(|site| own.hole[*site]);
+        holes.map(|site| own.around(site).any(|near| falls[near])).collect()
+    }
+
     /// Whether the way from the object to a depth z at a site goes through a thing: then something nearer is seen there.
     pub(super) fn barred(&self, of: usize, site: usize, depth: f64) -> bool {
         let own = &self.0[of];
