@@ -270,7 +270,7 @@ struct Figures {
     cameras: Cameras,
 }
 
-/// What of the Gaussians is known.
+/// Figures of how much of the Gaussians photographs show.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct Provenance {
     /// Gaussians that are guessed more than known.
@@ -501,7 +501,7 @@ pub(super) fn export(
     }))
 }
 
-/// What of the Gaussians is known: the figures, and the file with its bytes. `root` is the scene's folder.
+/// Provenance of an export: the figures, and the file with its bytes. `root` is the scene's folder.
 fn provenance_of(
     gpu: &Gpu,
     made: &Export,

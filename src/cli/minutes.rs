@@ -245,7 +245,7 @@ mod tests {
         (now + 0.4 * 30.0 * full + 1.0, settings)
     }
 
-    /// What came before took longer than all the time: training has its share, and ends later by so much.
+    /// Training has its share where the parts before it took longer than all the time, and ends later by so much.
     #[test]
     fn what_is_late_is_not_in_vain() {
         assert_eq!(shared(100.0, 24.0, 0.5), (200, 0.0));

@@ -1,4 +1,4 @@
-//! What of a scene photographs show, and what was guessed where the object stood.
+//! Each Gaussian is known or guessed: photographs show it, or it was made up where the object stood.
 //!
 //! A Gaussian is moved, split and pruned as training goes on, so that where it came from says little of what it shows in the
 //! end. What counts is which pixels it was trained on: its share (alpha x transmittance) in every pixel of every training view
@@ -70,7 +70,7 @@ fn told(scene: &Scene, root: Option<&Path>, at: usize) -> Result<Vec<[f32; 3]>, 
 }
 
 impl Provenance {
-    /// Of Gaussians in the axes that `turned` brings a camera into.
+    /// Looks at Gaussians from the training views; `turned` brings a camera into their axes.
     ///
     /// # Errors
     /// When the device has no room, or is lost; a map of `prepare` that is no picture; an end that somebody wished.
