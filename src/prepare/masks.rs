@@ -4,13 +4,16 @@
 //! the object. Rendered into another view in place of the colours and divided by what covers the pixel, these shares are
 //! the object's part of each pixel.
 
+use std::collections::HashMap;
+
 use image::{GrayImage, Luma};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use rayon::prelude::*;
 
 use super::splats::{Share, Splats};
 use crate::gpu::Error;
 use crate::scene::{Camera, View, resample};
-use crate::statistics::median;
+use crate::statistics::{median, quantile};
 
 /// A Gaussian of whose footprint less than this part shows in a view has no vote there. A short fit's object lets a tenth and
 /// more of what stands behind it through, all of it inside the mask.
@@ -27,6 +30,12 @@ const COLOR: f32 = 0.08;
 const REACH: f32 = 6.0;
 /// Views that are asked for the Gaussians' colours.
 const COLORED: usize = 6;
+/// What no masked view has seen is the object where it hangs together with what they have seen of it: steps from one to the next are
+/// within neighbouring cells, whose sides are this part of the object's extent, or so many spacings where that is more.
+const STEP: f32 = 0.125;
+const STEP_SPACINGS: f32 = 4.0;
+/// A piece that hangs together is the object where it has this part of all that the masked views have seen of it.
+const ATTACHED: f32 = 0.05;
 /// A pixel less covered than this shows nothing that could be the object.
 const COVERED: f32 = 0.1;
 
@@ -87,7 +96,8 @@ impl Votes {
 
     /// Counts them. `positions` and `colors` are the anchors': a Gaussian that no masked view has seen votes as its anchor
     /// does, and an anchor that none has seen as those which are near it and look like it. What stands behind the object is
-    /// as near to it as its own other side, but seldom of its colour.
+    /// as near to it as its own other side, but seldom of its colour; what stands elsewhere may be of its colour, but does not hang
+    /// together with it.
     pub fn count(&self, positions: &[[f32; 3]], colors: &[[f32; 3]]) -> Shares {
         let offsets = self.all.len() / positions.len().max(1);
         let of_anchors: Vec<[f32; 2]> = (0..positions.len())
@@ -109,11 +119,17 @@ impl Votes {
             let votes = near.iter().map(|n| of_anchors[seen[n.item as usize]]);
             votes.map(|[inside, all]| inside / all).sum::<f32>() / count.get() as f32
         };
+        let is_seen = |a: usize| of_anchors[a][1] > SEEN;
+        let part = |a: usize| if is_seen(a) { of_anchors[a][0] / of_anchors[a][1] } else { around(a) };
+        let mut priors: Vec<f32> = (0..positions.len()).into_par_iter().map(part).collect();
+        let inside = |a: usize| if is_seen(a) { of_anchors[a][0] } else { 0.0 };
+        for a in apart(positions, &priors, spacing, inside).into_iter().filter(|a| !is_seen(*a)) {
+            priors[a] = 0.0;
+        }
         let mut shares =
             Shares { object: Vec::with_capacity(self.all.len()), seen: Vec::with_capacity(self.all.len()) };
-        for (a, [inside, all]) in of_anchors.iter().copied().enumerate() {
-            let seen = all > SEEN;
-            let prior = if seen { inside / all } else { around(a) };
+        for (a, prior) in priors.into_iter().enumerate() {
+            let seen = is_seen(a);
             for g in a * offsets..(a + 1) * offsets {
                 let share = (self.inside[g] + PRIOR * prior) / (self.all[g] + PRIOR);
                 shares.object.push(share.clamp(0.0, 1.0));
@@ -122,6 +138,38 @@ impl Votes {
         }
         shares
     }
+}
+
+/// Anchors of which more than [`OBJECT`] is the object, by `priors`, in pieces that do not hang together with what was seen of it:
+/// `inside` are an anchor's votes for the object, none where it was not seen.
+fn apart(positions: &[[f32; 3]], priors: &[f32], spacing: f32, inside: impl Fn(usize) -> f32) -> Vec<usize> {
+    let object: Vec<usize> = (0..positions.len()).filter(|a| priors[*a] > OBJECT).collect();
+    let seen = || object.iter().copied().filter(|a| inside(*a) > 0.0);
+    let all: f32 = seen().map(&inside).sum();
+    let middle: Option<Vec<f64>> = (0..3).map(|k| median(seen().map(|a| positions[a][k]))).collect();
+    let Some(middle) = middle else { return vec![] };
+    let off = |a: usize| (0..3).map(|k| (f64::from(positions[a][k]) - middle[k]).powi(2)).sum::<f64>().sqrt() as f32;
+    let extent = quantile(seen().map(off), 0.9).map_or(0.0, |radius| 2.0 * radius as f32);
+    let side = (STEP * extent).max(STEP_SPACINGS * spacing).max(f32::MIN_POSITIVE);
+    let cell = |a: usize| -> [i64; 3] { std::array::from_fn(|k| (positions[a][k] / side).floor() as i64) };
+    let mut cells: HashMap<[i64; 3], Vec<usize>> = HashMap::new();
+    object.iter().for_each(|a| cells.entry(cell(*a)).or_default().push(*a));
+    let mut alone = vec![];
+    for a in &object {
+        let mut piece = vec![];
+        let mut open: Vec<[i64; 3]> = vec![cell(*a)];
+        while let Some([x, y, z]) = open.pop() {
+            let Some(own) = cells.remove(&[x, y, z]) else { continue };
+            piece.extend(own);
+            let around =
+                (-1..=1).flat_map(|dz| (-1..=1).flat_map(move |dy| (-1..=1).map(move |dx| [x + dx, y + dy, z + dz])));
+            open.extend(around.filter(|cell| cells.contains_key(cell)));
+        }
+        if piece.iter().map(|a| inside(*a)).sum::<f32>() < ATTACHED * all {
+            alone.extend(piece);
+        }
+    }
+    alone
 }
 
 /// Median distance of some anchors to the next.
@@ -319,5 +367,22 @@ mod tests {
         }
         let shares = votes.count(&positions, &colors);
         assert_eq!((shares.object[20], shares.object[21]), (1.0, 0.0));
+    }
+
+    /// A row of red things of which one end was seen inside a mask, a floor seen beside it, and red things far away, which are nearer in
+    /// likeness to the object than to anything else: no view has seen them, and they are none of it. The row's other end is.
+    #[test]
+    fn what_looks_like_the_object_elsewhere_is_none_of_it() {
+        let (red, grey) = ([0.8, 0.2, 0.1], [0.5; 3]);
+        let row = (0..20).map(|i| ([i as f32 * 0.05, 0.0, 0.0], red, i < 10));
+        let floor = (0..20).map(|i| ([i as f32 * 0.05, 0.1, 0.0], grey, true));
+        let bench = (0..20).map(|i| ([i as f32 * 0.05, 0.0, 4.0], red, false));
+        let all: Vec<_> = row.chain(floor).chain(bench).collect();
+        let positions: Vec<[f32; 3]> = all.iter().map(|of| of.0).collect();
+        let colors: Vec<[f32; 3]> = all.iter().map(|of| of.1).collect();
+        let votes = |kind: bool| all.iter().map(|of| if of.2 && (kind || of.1 == red) { 10.0 } else { 0.0 }).collect();
+        let shares = Votes { inside: votes(false), all: votes(true) }.count(&positions, &colors);
+        assert!(shares.object[..20].iter().all(|share| *share > 0.9), "{:?}", shares.object);
+        assert!(shares.object[20..].iter().all(|share| *share < 0.1), "{:?}", shares.object);
     }
 }

@@ -244,6 +244,11 @@ impl View {
         Ok(view)
     }
 
+    /// Whether it has a few marks at most, and the mask of these.
+    fn is_few(&self) -> bool {
+        (1..=FEW).contains(&self.marks.len()) && self.version == self.drawn
+    }
+
     /// Whether it has a mask of something.
     fn has_object(&self) -> bool {
         self.mask.is_some() && self.share > 0.0
@@ -366,11 +371,11 @@ impl Session {
         self.cut(object, number, Some(marks))
     }
 
-    /// Makes the masks of views with a few marks again, now that more is known than when they were made.
+    /// Makes the masks of views with a few marks again, now that more is known than when they were made. One that is being made
+    /// sees to that itself ([`Self::cut`]).
     pub fn again(&self) {
-        let few = |view: &View| (1..=FEW).contains(&view.marks.len()) && view.version == view.drawn;
         let those = |own: &Own| -> Vec<(usize, usize)> {
-            (0..own.views.len()).filter(|i| few(&own.views[*i])).map(|i| (own.entry.number, i)).collect()
+            (0..own.views.len()).filter(|i| own.views[*i].is_few()).map(|i| (own.entry.number, i)).collect()
         };
         let all: Vec<(usize, usize)> = self.lock().objects.iter().flat_map(those).collect();
         for (object, number) in all {
@@ -380,19 +385,25 @@ impl Session {
         }
     }
 
-    /// Makes the mask of a view of these marks, or of those that it has. Marks and mask change together, or not at all.
+    /// Makes the mask of a view of these marks, or of those that it has. Marks and mask change together, or not at all. Where its depth
+    /// became known meanwhile, the mask is made once more.
     fn cut(&self, object: usize, number: usize, marks: Option<Vec<Mark>>) -> Result<u64, Refused> {
         let version = {
             let mut state = self.lock();
             state.may_change()?;
+            let revision = state.revision;
             let view = &mut state.own(object)?.views[number];
+            // Somebody has marked it since it was listed.
+            if marks.is_none() && !view.is_few() {
+                return Ok(revision);
+            }
             view.version += 1;
             let version = view.version;
             state.said = None;
             version
         };
         // The object is not removed meanwhile, nor deleted: that waits for its turn, too.
-        let _turn = self.cutting.lock().unwrap_or_else(PoisonError::into_inner);
+        let turn = self.cutting.lock().unwrap_or_else(PoisonError::into_inner);
         let (view, revision, folder) = {
             let mut state = self.lock();
             let revision = state.revision;
@@ -423,10 +434,13 @@ impl Session {
                 }
                 (own.marks, own.mask) = (marks, mask);
                 own.drawn = version;
+                let late = depth.is_none() && own.is_few() && read(&self.depths).contains_key(&number);
                 state.revision += 1;
                 state.error = None;
                 self.changed.notify_all();
-                Ok(state.revision)
+                let revision = state.revision;
+                drop((state, turn));
+                if late { self.cut(object, number, None) } else { Ok(revision) }
             }
             Err(refused) => {
                 if drawn {

@@ -6,6 +6,7 @@ use serde_json::{Value, json};
 
 use super::repaint::Repainting;
 use super::*;
+use crate::scene::Camera;
 use crate::scene::doctor::iou;
 use crate::view::server::{self, Secret};
 
@@ -231,6 +232,42 @@ fn a_cut_after_reopening_begins_with_the_mask_on_disk() {
     // One that is known to be made of other marks is not.
     session.mark(1, 0, vec![brush]).unwrap();
     assert_eq!(scene::mask(&place.objects().join("a.png"), 1).unwrap().get_pixel(10, 10).0, [0]);
+}
+
+/// The depth of a view arrives while the mask of a click is made without it: the mask is made once more.
+#[test]
+fn depth_that_comes_during_a_click_counts() {
+    let place = Place::new();
+    let session = place.open();
+    // Whoever wants the photograph waits, and has looked for the depth before.
+    let held = session.pictures.lock().unwrap();
+    std::thread::scope(|scope| {
+        let click = scope.spawn(|| session.mark(1, 0, vec![Mark::Object { at: [0.44, 0.5], scale: 0 }]));
+        while session.cutting.try_lock().is_ok() {
+            std::thread::yield_now();
+        }
+        std::thread::sleep(Duration::from_millis(50));
+        let camera = Camera {
+            rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            translation: [0.0; 3],
+            focal: [150.0; 2],
+            principal: [80.0, 60.0],
+            distortion: [0.0; 4],
+            size: SIZE,
+        };
+        let near = |i: u32| if is_object(i % SIZE[0], i / SIZE[0]) { 1.5 } else { 2.0 };
+        session
+            .knows(0, [camera; 2].map(|camera| DepthMap { camera, depth: (0..SIZE[0] * SIZE[1]).map(near).collect() }));
+        session.again();
+        drop(held);
+        click.join().unwrap().unwrap();
+    });
+    let view = session.lock().objects[0].views[0].clone();
+    let (_, with_depth, mask) = view.made.last().unwrap();
+    assert_eq!((*with_depth, view.version, view.drawn), (Some(true), 3, 3));
+    assert!(Arc::ptr_eq(mask, view.mask.as_ref().unwrap()));
+    session.again();
+    assert_eq!(session.lock().objects[0].views[0].drawn, 4);
 }
 
 /// Pixels are counted when a mask is made: a hundred views of large masks cost a poll nothing.
