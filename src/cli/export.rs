@@ -13,14 +13,14 @@ use super::next;
 use super::shared::{self, DeviceArgs};
 use crate::config::Source;
 use crate::export::provenance::{self, OffPath};
-use crate::export::{self, Cloud, Export, Observer, Options, low_pass, measure, up};
+use crate::export::{self, Cloud, Export, Observer, Options, low_pass, measure};
 use crate::folder::{self, Lock};
 use crate::formats::{gltf, ply, sog, splat, spz};
 use crate::gpu::Gpu;
 use crate::model::stored::Stored;
 use crate::prepare::record;
 use crate::render::widen;
-use crate::scene::{self, Camera, Scene, path};
+use crate::scene::{self, Camera, Scene, path, up};
 
 /// The export's folder within a run folder.
 pub(super) const EXPORT: &str = "export";

@@ -183,7 +183,7 @@ fn photograph(origin: &Origin, pose: &Pose) -> anyhow::Result<Vec<u8>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::export::up;
+    use crate::scene::up;
 
     /// Of cameras that are rolled to either side, as `export` writes them.
     #[test]

@@ -24,10 +24,9 @@ pub use draw::{Drawn, Placed, darkened, draw};
 pub use object::{Hit, Kind, Light, Object};
 pub use stand::{Stand, find};
 
-use crate::export::up;
 use crate::gpu::{self, Gpu};
 use crate::multiview::{self, DepthGrid};
-use crate::scene::{self, Camera, Scene, colmap, stem};
+use crate::scene::{self, Camera, Scene, colmap, stem, up};
 use crate::statistics::{median, quantile};
 
 /// Longer side of the pictures that depth is measured in, pixels.

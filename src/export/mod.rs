@@ -7,7 +7,6 @@ pub mod measure;
 pub mod poses;
 pub mod provenance;
 pub mod refine;
-pub mod up;
 
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
@@ -23,7 +22,7 @@ pub use crate::model::gaussians::{Cloud, logit, sigmoid};
 use crate::model::stored::Stored;
 use crate::render::config::BACKGROUND;
 use crate::render::view::Renderer;
-use crate::scene::{Camera, Scene};
+use crate::scene::{Camera, Scene, up};
 use crate::signal::Signal;
 
 /// Why an export, or one of its files, cannot be written or read.

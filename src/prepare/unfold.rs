@@ -14,9 +14,8 @@ use rayon::prelude::*;
 
 use super::poses::{Shot, model_files_of};
 use super::shadow::plane::{self, Support};
-use crate::export::up;
 use crate::scene::colmap::{Image, Intrinsics, Model};
-use crate::scene::{Scene, resample};
+use crate::scene::{Scene, resample, up};
 use crate::statistics::median;
 
 /// Longer side of the photographs that drawings are made of, pixels.

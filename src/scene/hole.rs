@@ -1,10 +1,11 @@
 //! Pictures of the place without the object, for the views that are not the reference: what `prepare` has filled.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use image::{GrayImage, RgbImage};
+use rayon::prelude::*;
 
-use super::{Error, View, decode, resample};
+use super::{Config, Error, Notes, Reference, View, decode, layout, resample};
 
 /// Folder of the filled holes within a scene, `hole/NAME.png`: in proportion as large as the photographs; alpha is 255 in the
 /// hole, [`DOUBTFUL`] where what is there is not to be trained on, and around it colours go on for a few pixels.
@@ -32,7 +33,7 @@ pub struct Hole {
 }
 
 /// Whether the holes were filled with the reference picture that is there: an exchanged one shows something else in them.
-pub(super) fn are_current(scene: &Path) -> bool {
+fn are_current(scene: &Path) -> bool {
     let Ok(text) = std::fs::read_to_string(scene.join(HOLE).join(MADE_WITH)) else { return true };
     text.lines().all(|line| {
         let Some((hash, file)) = line.split_once(' ') else { return false };
@@ -44,7 +45,7 @@ pub(super) fn are_current(scene: &Path) -> bool {
 ///
 /// # Errors
 /// A file that is no picture, or is in other proportions than the photograph.
-pub(super) fn read(path: &Path, at: usize, view: &View) -> Result<Hole, Error> {
+fn read(path: &Path, at: usize, view: &View) -> Result<Hole, Error> {
     let picture = decode(path)?.into_rgba8();
     let size @ [w, h] = view.camera.size;
     let (from, expected) = (f64::from(picture.width()), f64::from(picture.width()) * f64::from(h) / f64::from(w));
@@ -81,6 +82,46 @@ pub(super) fn read(path: &Path, at: usize, view: &View) -> Result<Hole, Error> {
     let [covered, filled] =
         [covered, filled].map(|bytes| GrayImage::from_raw(size[0], size[1], bytes).expect("a byte per pixel"));
     Ok(Hole { view: at, image, covered, filled })
+}
+
+/// Reads the filled holes, where they go with the reference that is there. The masks become those of what was filled, the
+/// references' too: a hole is a little larger than the object. Returns those of the views that are no references.
+pub(super) fn read_all(
+    dir: &Path,
+    config: &Config,
+    (train, files): (&mut [View], &[layout::Entry]),
+    references: &[Reference],
+    notes: &mut Notes,
+) -> Result<Vec<Hole>, Error> {
+    let filled = train
+        .iter()
+        .zip(files)
+        .enumerate()
+        .filter_map(|(at, (view, entry))| Some((at, view, entry.hole.as_ref().filter(|_| view.mask.is_some())?)));
+    let filled: Vec<(usize, &View, &PathBuf)> = filled.collect();
+    if filled.is_empty() {
+        return Ok(vec![]);
+    }
+    if !(config.has_reference() && config.fill_holes) {
+        notes.push(format!("{HOLE}/ is ignored, as configured: the other views' holes are not trained on"));
+        return Ok(vec![]);
+    }
+    if !config.truth_reference.is_empty() || !config.reference_file.is_empty() || !are_current(dir) {
+        notes.push(format!(
+            "{HOLE}/ is not used: it was filled with another reference picture; prepare --only reference fills it anew"
+        ));
+        return Ok(vec![]);
+    }
+    let one = |(at, view, path): &(usize, &View, &PathBuf)| read(path, *at, view);
+    let holes: Vec<Result<Hole, Error>> = filled.par_iter().map(one).collect();
+    let mut holes = holes.into_iter().collect::<Result<Vec<_>, Error>>()?;
+    for hole in &holes {
+        let mask = train[hole.view].mask.as_mut().expect("views without a mask were left out");
+        mask.iter_mut().zip(hole.covered.as_raw()).for_each(|(mask, covered)| *mask = (*mask).max(*covered));
+    }
+    holes.retain(|hole| !references.iter().any(|r| r.view == hole.view));
+    notes.push(format!("the holes of {} more views are filled ({HOLE}/)", holes.len()));
+    Ok(holes)
 }
 
 #[cfg(test)]

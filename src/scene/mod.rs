@@ -41,6 +41,7 @@ pub mod room360;
 pub mod sheet;
 mod strays;
 pub mod synthetic;
+pub mod up;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -324,7 +325,7 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     }
     let mut references = read_references;
     references.sort_by_key(|r| r.view);
-    let holes = read_holes(dir, config, (&mut train, &train_files), &references, &mut notes)?;
+    let holes = hole::read_all(dir, config, (&mut train, &train_files), &references, &mut notes)?;
     summarise(&train, &test, &references, points.len(), config, &mut notes);
     let radius = radius(&train);
     if radius.is_none() {
@@ -705,46 +706,6 @@ impl Reader<'_> {
         let view = View { name: entry.name.clone(), camera, image, mask, weight: None, prior, depth };
         Ok(Loaded { view, calibrated: intrinsics.size, picture, stretched_mask })
     }
-}
-
-/// Reads the filled holes, where they go with the reference that is there. The masks become those of what was filled, the
-/// references' too: a hole is a little larger than the object. Returns those of the views that are no references.
-fn read_holes(
-    dir: &Path,
-    config: &Config,
-    (train, files): (&mut [View], &[layout::Entry]),
-    references: &[Reference],
-    notes: &mut Notes,
-) -> Result<Vec<Hole>, Error> {
-    let filled = train
-        .iter()
-        .zip(files)
-        .enumerate()
-        .filter_map(|(at, (view, entry))| Some((at, view, entry.hole.as_ref().filter(|_| view.mask.is_some())?)));
-    let filled: Vec<(usize, &View, &PathBuf)> = filled.collect();
-    if filled.is_empty() {
-        return Ok(vec![]);
-    }
-    if !(config.has_reference() && config.fill_holes) {
-        notes.push(format!("{HOLE}/ is ignored, as configured: the other views' holes are not trained on"));
-        return Ok(vec![]);
-    }
-    if !config.truth_reference.is_empty() || !config.reference_file.is_empty() || !hole::are_current(dir) {
-        notes.push(format!(
-            "{HOLE}/ is not used: it was filled with another reference picture; prepare --only reference fills it anew"
-        ));
-        return Ok(vec![]);
-    }
-    let read = |(at, view, path): &(usize, &View, &PathBuf)| hole::read(path, *at, view);
-    let holes: Vec<Result<Hole, Error>> = filled.par_iter().map(read).collect();
-    let mut holes = holes.into_iter().collect::<Result<Vec<_>, Error>>()?;
-    for hole in &holes {
-        let mask = train[hole.view].mask.as_mut().expect("views without a mask were left out");
-        mask.iter_mut().zip(hole.covered.as_raw()).for_each(|(mask, covered)| *mask = (*mask).max(*covered));
-    }
-    holes.retain(|hole| !references.iter().any(|r| r.view == hole.view));
-    notes.push(format!("the holes of {} more views are filled ({HOLE}/)", holes.len()));
-    Ok(holes)
 }
 
 /// A size with each side divided by `by`, rounded to the nearest pixel and never 0.

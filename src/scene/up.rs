@@ -7,7 +7,7 @@
 
 use glam::{DMat3, DVec3};
 
-use crate::scene::Camera;
+use super::Camera;
 
 /// Weight of the mean against the x axes' spread: the squared sine of two degrees.
 const RIDGE: f64 = 0.001;
