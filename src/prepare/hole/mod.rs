@@ -72,7 +72,8 @@ pub const METHOD: &str = "one surface with smooth ends, nothing where others loo
      nothing from views with the object elsewhere, nothing stands where the first view looks through, surfaces by what they are covered with, \
      straight borders go on, those that end in a hole too, surfaces end at right angles, grain is kept, floors end at their walls, planes have \
      their materials, which have grain, what is bare of the object refutes nothing, the reference has no shadow, no \
-     small piece hangs in a hole, what is guessed is noted, and nothing shows through what the object stands on";
+     small piece hangs in a hole, what is guessed is noted, nothing shows through what the object stands on, and what is \
+     doubtful is not guessed";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 
@@ -212,18 +213,21 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
                 // What a person or a network has painted is not for us to doubt.
                 filling.doubtful.iter_mut().zip(&filling.seen).for_each(|(doubtful, seen)| *doubtful &= seen);
             }
+            // Doubtful pixels are left to training; a picture that is looked at is filled everywhere.
+            let idle: Vec<bool> = filling.doubtful.iter().map(|doubtful| *doubtful && i != of).collect();
             // What was made for this view the others get from it; what photographs show they look up themselves.
             let made: Vec<bool> = if task.given.contains_key(&i) {
                 photographs[i].hole.as_raw().iter().map(|v| *v != 0).collect()
             } else {
-                guess::thick(&filling.guessed, cameras[i].size)
+                let guessed = filling.guessed.iter().zip(&idle).map(|(guessed, idle)| *guessed && !idle);
+                guess::thick(&guessed.collect::<Vec<_>>(), cameras[i].size)
             };
             if task.given.contains_key(&i) {
                 painted(task, i, &photographs[i].hole, &mut filling)?;
             } else if let Some(network) = task.inpainting {
                 network.fill(&mut filling.rgb, &filling.guessed, cameras[i].size.map(|n| n as usize))?;
             } else {
-                guess::fill(&sights, &photographs, i, &mut filling);
+                guess::fill(&sights, &photographs, i, &mut filling, |pixel| !idle[pixel]);
             }
             let guessed = |hole: &u8, seen: &bool| if *hole != 0 && !seen { 255 } else { 0 };
             let guessed =
