@@ -5,15 +5,16 @@ use anyhow::{Context as _, bail};
 
 use super::{next, pictures};
 use crate::prepare::hole::PROVENANCE;
-use crate::prepare::record;
+use crate::prepare::{record, unfold};
 use crate::scene::doctor::{self, Finding, Report, Severity};
-use crate::scene::{Scene, sheet};
+use crate::scene::{Camera, Scene, map, sheet};
 use crate::work;
 
 /// Look over a scene before training: masks, names, sizes, poses, depth, reference, exposure
 ///
 /// Problems and notes go to stdout, the worst first. A contact sheet of all views with their masks, as PNG and as a page,
-/// goes into the folder that --sheet names; of a scene that prepare made it shows what no view sees of the hole.
+/// goes into the folder that --sheet names; of a scene that prepare made it shows what no view sees of the hole. The page has a map
+/// of the cameras from above: parts of the model that share hardly a point have colours of their own, what was left out is hollow.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   gscream-vk doctor scene
@@ -38,7 +39,17 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
-    let (report, scene) = examined(&args.scene, args.masks.as_deref())?;
+    let (mut report, scene) = examined(&args.scene, args.masks.as_deref())?;
+    let (spots, parts) = scene.as_ref().map(|scene| unfold::standing(&args.scene, scene)).unwrap_or_default();
+    let is_masked = scene.as_ref().is_some_and(|scene| scene.train.iter().any(|view| view.mask.is_some()));
+    if let Some([largest, second, ..]) = parts.as_deref().filter(|_| is_masked) {
+        let what = format!(
+            "the model is in parts, of {largest} and {second} photographs, that share nothing but the object; where the object looks alike \
+             from several sides, one may stand on the wrong side of it: look where they stand in the map of --sheet; prepare turns them \
+             back where what the object stands on proves it"
+        );
+        report.add(Severity::Note, "poses", None, what);
+    }
     if args.json {
         println!("{}", serde_json::to_string_pretty(&report)?);
     } else {
@@ -51,7 +62,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         let rgb: Vec<[f32; 3]> = sheet.picture.pixels().map(|p| p.0.map(|v| f32::from(v) / 255.0)).collect();
         pictures::write_png(&folder.join(sheet::PICTURE), [sheet.picture.width(), sheet.picture.height()], &rgb)?;
         let page = folder.join(sheet::PAGE);
-        atomic::write(&page, sheet::page(&args.scene.display().to_string(), &sheet, &report))
+        let cameras: Vec<Camera> = scene.train.iter().map(|view| view.camera).collect();
+        let map = map::draw(&cameras, &spots, &scene.points);
+        atomic::write(&page, sheet::page(&args.scene.display().to_string(), &sheet, &map, &report))
             .with_context(|| format!("{}: cannot be written", page.display()))?;
         eprintln!("wrote {} and {} in {}", sheet::PICTURE, sheet::PAGE, folder.display());
     }

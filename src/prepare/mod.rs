@@ -20,7 +20,7 @@ mod program;
 pub mod record;
 pub mod shadow;
 pub mod splats;
-mod unfold;
+pub mod unfold;
 pub mod video;
 
 use std::collections::BTreeMap;

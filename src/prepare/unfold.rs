@@ -6,7 +6,8 @@
 //! surface that the object stands on is drawn as it is seen from above, once by each part, and a part whose drawing is the other's when
 //! it is turned about the object, and at no other turn, is turned.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use image::GrayImage;
@@ -15,7 +16,8 @@ use rayon::prelude::*;
 use super::poses::{Shot, model_files_of};
 use super::shadow::plane::{self, Support};
 use crate::scene::colmap::{Image, Intrinsics, Model};
-use crate::scene::{Scene, resample, up};
+use crate::scene::map::{Spot, Standing};
+use crate::scene::{Scene, View, resample, up};
 use crate::statistics::median;
 
 /// Longer side of the photographs that drawings are made of, pixels.
@@ -168,6 +170,36 @@ pub fn parts(model: &Model, scene: &Scene) -> Option<Parts> {
     }
     let counts = (0..all.len()).map(|number| of.iter().filter(|own| **own == Some(number)).count()).collect();
     Some(Parts { of, counts, told })
+}
+
+/// Where the photographs of a scene's folder stand: those of its train and test views, by the parts of the model, and those that were left
+/// out. And how many each part has, where the model is in parts that were not turned about the object yet.
+pub fn standing(folder: &Path, scene: &Scene) -> (Vec<Spot>, Option<Vec<usize>>) {
+    let model = crate::scene::colmap::read(folder).ok();
+    let parts = model.as_ref().filter(|model| !model.tracks.is_empty()).and_then(|model| parts(model, scene));
+    let named = |parts: &Parts| -> BTreeMap<String, usize> {
+        let images = model.iter().flat_map(|model| &model.images).zip(&parts.of);
+        images.filter_map(|(image, part)| Some((crate::scene::stem(&image.name).to_owned(), (*part)?))).collect()
+    };
+    let part: BTreeMap<String, usize> = parts.as_ref().map_or_else(BTreeMap::new, named);
+    let spot = |view: &View| Spot {
+        name: view.name.clone(),
+        center: view.camera.center(),
+        ahead: view.camera.rotation[2].map(f64::from),
+        standing: Standing::Part(part.get(&view.name).copied().unwrap_or(0)),
+    };
+    let mut spots: Vec<Spot> = scene.train.iter().chain(&scene.test).map(spot).collect();
+    let there: BTreeSet<String> = spots.iter().map(|spot| spot.name.clone()).collect();
+    let left =
+        model.iter().flat_map(|model| &model.images).filter(|image| !there.contains(crate::scene::stem(&image.name)));
+    spots.extend(left.map(|image| Spot {
+        name: crate::scene::stem(&image.name).to_owned(),
+        center: image.center().map(|v| v / scene.unit),
+        ahead: image.rotation[2],
+        standing: Standing::Out,
+    }));
+    let is_turned = super::record::ended(folder).values().any(|step| step.figures.contains_key(super::TURNED));
+    (spots, parts.map(|parts| parts.counts).filter(|_| !is_turned))
 }
 
 /// A surface seen from above; NaN where nobody sees it.

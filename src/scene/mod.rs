@@ -30,6 +30,7 @@ mod error;
 mod exposure;
 mod hole;
 mod layout;
+pub mod map;
 mod note;
 pub(crate) mod npy;
 pub mod path;

@@ -79,8 +79,8 @@ pub fn draw(scene: &Scene, provenance: Option<&RgbImage>) -> Sheet {
     Sheet { picture, cell, names: cells.into_iter().map(|(name, _)| name).collect() }
 }
 
-/// The page around the sheet, with what was found.
-pub fn page(title: &str, sheet: &Sheet, report: &Report) -> String {
+/// The page around the sheet, with what was found and a map of the cameras ([`super::map`]).
+pub fn page(title: &str, sheet: &Sheet, map: &Markup, report: &Report) -> String {
     let [w, h] = sheet.cell;
     let columns = sheet.picture.width() / w.max(1);
     let thumbnail = |i: usize, name: &str| -> Markup {
@@ -126,6 +126,9 @@ pub fn page(title: &str, sheet: &Sheet, report: &Report) -> String {
                         }
                     }
                 }
+                h2 { "The cameras from above" }
+                (map)
+                h2 { "Photographs" }
                 @for (i, name) in sheet.names.iter().enumerate() { (thumbnail(i, name)) }
             }
         }
