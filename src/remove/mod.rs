@@ -372,7 +372,7 @@ impl Session {
     }
 
     /// Makes the masks of views with a few marks again, now that more is known than when they were made. One that is being made
-    /// sees to that itself ([`Self::cut`]).
+    /// sees to that itself.
     pub fn again(&self) {
         let those = |own: &Own| -> Vec<(usize, usize)> {
             (0..own.views.len()).filter(|i| own.views[*i].is_few()).map(|i| (own.entry.number, i)).collect()

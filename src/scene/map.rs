@@ -73,7 +73,7 @@ pub fn draw(cameras: &[Camera], spots: &[Spot], points: &[Point]) -> Markup {
     };
     let edge = MARK * SIDE;
     let mark = |spot: &Spot| {
-        let [x, y] = place(flat(spot.center)).map(|v| v.clamp(edge, SIDE - edge));
+        let [x, y] = place(flat(spot.center)).map(|v| v.clamp(1.5 * edge, SIDE - 1.5 * edge));
         let [right, ahead] = flat(spot.ahead);
         let length = right.hypot(ahead).max(1e-9);
         let [dx, dy] = [right / length * edge, -ahead / length * edge];
