@@ -39,7 +39,7 @@ mod texture;
 mod window;
 mod witness;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use image::{GrayImage, Rgb, RgbImage, Rgba, RgbaImage};
@@ -65,6 +65,10 @@ const BLEEDING: f64 = 0.03;
 const LEAST_HOLE: f64 = 0.4;
 /// Views whose pictures are filled at once: each is held as float32.
 const AT_ONCE: usize = 16;
+/// Views whose holes are filled, at most, besides those that the user has painted; and how many of them are those that show most of what no
+/// other does. The rest is spread over the capture: neighbours show the same surface.
+const FILLED: usize = 96;
+const FIRST: usize = 24;
 /// Name of the way in which holes are filled: a scene that was filled in another way is filled anew.
 pub const METHOD: &str = "one surface with smooth ends, nothing where others look through it, no colour from a rim that looks like nothing near it, \
      lights joined, doubts left to training, nothing stands on what only crosses the floor, lines go on through holes and to walls behind, \
@@ -72,8 +76,8 @@ pub const METHOD: &str = "one surface with smooth ends, nothing where others loo
      nothing from views with the object elsewhere, nothing stands where the first view looks through, surfaces by what they are covered with, \
      straight borders go on, those that end in a hole too, surfaces end at right angles, grain is kept, floors end at their walls, planes have \
      their materials, which have grain, what is bare of the object refutes nothing, the reference has no shadow, no \
-     small piece hangs in a hole, what is guessed is noted, nothing shows through what the object stands on, and what is \
-     doubtful is not guessed";
+     small piece hangs in a hole, what is guessed is noted, nothing shows through what the object stands on, what is doubtful \
+     is not guessed, and of many views some are filled";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";
 
@@ -198,7 +202,9 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
     watch.turn(n + 1)?;
     // What the user has painted is known to all others.
     rest.sort_by_key(|(_, i)| !task.given.contains_key(i));
-    let order: Vec<usize> = std::iter::once(of).chain(rest.into_iter().map(|(_, i)| i)).collect();
+    let rest: Vec<usize> = rest.into_iter().map(|(_, i)| i).collect();
+    let (some, left) = chosen(&rest, task.given.len().max(FIRST), task.given.len().max(FILLED));
+    let order: Vec<usize> = std::iter::once(of).chain(some).collect();
     for i in order.iter().filter(|i| **i != of) {
         sights.solve(*i, task.seed + *i as u64);
     }
@@ -259,6 +265,22 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
             watch.turn(n + 1 + done)?;
         }
     }
+    for i in left {
+        let own = photographs[i].picture.pixels().map(|p| p.0.map(|v| f32::from(v) / 255.0)).collect::<Vec<_>>();
+        let hole = &photographs[i].hole;
+        let picture = cut_out(&own, &vec![true; own.len()], hole);
+        let name = &task.fine.train[i].name;
+        batch.rgba(format!("{HOLE}/{name}.png"), &picture, "left to training: others show the same");
+        done += 1;
+        watch.turn(n + 1 + done)?;
+    }
+    if done as usize > order.len() {
+        batch.notes.push(format!(
+            "the holes of {} of {} views are filled, spread over the capture; the others show the same surface, and are left to training",
+            order.len(),
+            with_holes.len()
+        ));
+    }
     let percent = (100.0 * doubtful as f64 / all.max(1) as f64).round();
     if percent > 0.0 {
         batch.notes.push(format!(
@@ -273,6 +295,21 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
     let from = "the reference pictures that the holes were filled with";
     batch.bytes(format!("{HOLE}/{MADE_WITH}"), made_with.concat().into_bytes(), from);
     Ok(batch)
+}
+
+/// Of these views, in their order, those that are filled and those that are not: the `first` of them, and others between, evenly spread by
+/// their numbers, which follow their names; `most` at most.
+fn chosen(views: &[usize], first: usize, most: usize) -> (Vec<usize>, Vec<usize>) {
+    if views.len() <= most {
+        return (views.to_vec(), vec![]);
+    }
+    let (first, rest) = views.split_at(first.min(most));
+    let mut sorted = rest.to_vec();
+    sorted.sort_unstable();
+    let count = most - first.len();
+    let spread: BTreeSet<usize> = (0..count).map(|k| sorted[(2 * k + 1) * sorted.len() / (2 * count)]).collect();
+    let (some, left): (Vec<usize>, Vec<usize>) = rest.iter().partition(|i| spread.contains(i));
+    (first.iter().copied().chain(some).collect(), left)
 }
 
 /// Takes the hole from the user's own reference picture.
@@ -441,4 +478,29 @@ fn known_depth(sight: &Sight, camera: &Camera, unit: f64, known: impl Fn(usize) 
         (sight.hole[site] || known(site)).then(|| (sight.depth_at(place) * unit) as f32)
     };
     (0..w * camera.size[1] as usize).into_par_iter().map(|i| one(i).unwrap_or(f32::NAN)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_are_filled_and_the_rest_evenly() {
+        let views: Vec<usize> = (0..100).rev().collect();
+        let (filled, left) = chosen(&views, 10, 40);
+        assert_eq!((filled.len(), left.len()), (40, 60));
+        assert_eq!(filled[..10], views[..10]);
+        // In their order, and between two of them are two or three that are left.
+        assert!(filled.is_sorted_by(|a, b| a > b));
+        let gaps: Vec<usize> = filled[10..].windows(2).map(|pair| pair[0] - pair[1]).collect();
+        assert!(gaps.iter().all(|gap| (2..=4).contains(gap)), "{gaps:?}");
+        assert!(filled[39] <= 3 && filled[10] >= 86, "{filled:?}");
+        let mut all = [filled, left].concat();
+        all.sort_unstable_by(|a, b| b.cmp(a));
+        assert_eq!(all, views);
+        // Few are filled all, and all that come first where these are the most.
+        assert_eq!(chosen(&views, 10, 100), (views.clone(), vec![]));
+        assert_eq!(chosen(&views, 40, 40), (views[..40].to_vec(), views[40..].to_vec()));
+        assert_eq!(chosen(&[], 1, 1), (vec![], vec![]));
+    }
 }

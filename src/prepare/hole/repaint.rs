@@ -442,9 +442,9 @@ pub fn filled(scene: &Path, view: &str, photograph: &Path) -> Result<RgbImage, E
     around(scene, view, photograph, &scene::decode(&scene.join(hole_path(view)))?.into_rgba8())
 }
 
-/// Whether a view of a prepared scene has a hole that is filled.
+/// Whether a view of a prepared scene has a hole that is filled, and not left to training.
 pub fn has_hole(scene: &Path, view: &str) -> bool {
-    scene.join(hole_path(view)).is_file()
+    [hole_path(view), behind_path(view)].iter().all(|path| scene.join(path).is_file())
 }
 
 /// The hash of everything that repaints are made of, besides them.
@@ -491,7 +491,9 @@ impl Task<'_> {
     /// A view whose hole is filled and as it was made.
     fn open(&self, at: usize) -> Result<Option<Opened>, Error> {
         let scene::View { name, camera, .. } = &self.scene.train[at];
-        let Some(path) = self.base(&hole_path(name))? else { return Ok(None) };
+        let Some(path) = self.base(&hole_path(name))?.filter(|_| has_hole(self.folder.root(), name)) else {
+            return Ok(None);
+        };
         let base = scene::decode(&path)?.into_rgba8();
         let behind = Behind::new(&npy::read(&self.folder.root().join(behind_path(name)))?, self.scene.unit);
         let doubtful: Vec<bool> = base.pixels().map(|p| p.0[3] == DOUBTFUL).collect();
@@ -515,6 +517,9 @@ impl Task<'_> {
         let Opened { mut view, base } = self.open(at)?.ok_or_else(|| {
             let [hole, reference] = [hole_path(name), reference_path(name)];
             Error::Request(match (root.join(&hole).is_file(), root.join(&reference).is_file()) {
+                (true, _) if !has_hole(root, name) => {
+                    format!("{name}: its hole is left to training, since others show the same; paint in one of those, next to it")
+                }
                 (true, _) => {
                     format!("{name}: {hole} was changed by hand and stays; move it away to repaint it")
                 }
