@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 
-use super::{Config, Error, Notes, Reference, View, decode, layout, resample};
+use super::{Config, Error, Notes, Reference, View, decode, resample};
 
 /// Folder of the filled holes within a scene, `hole/NAME.png`: in proportion as large as the photographs; alpha is 255 in the
 /// hole, [`DOUBTFUL`] where what is there is not to be trained on, and around it colours go on for a few pixels.
@@ -84,12 +84,12 @@ fn read(path: &Path, at: usize, view: &View) -> Result<Hole, Error> {
     Ok(Hole { view: at, image, covered, filled })
 }
 
-/// Reads the filled holes, where they go with the reference that is there. The masks become those of what was filled, the
+/// Reads the filled holes, `files` by view, where they go with the reference that is there. The masks become those of what was filled, the
 /// references' too: a hole is a little larger than the object. Returns those of the views that are no references.
 pub(super) fn read_all(
     dir: &Path,
     config: &Config,
-    (train, files): (&mut [View], &[layout::Entry]),
+    (train, files): (&mut [View], &[Option<PathBuf>]),
     references: &[Reference],
     notes: &mut Notes,
 ) -> Result<Vec<Hole>, Error> {
@@ -97,7 +97,7 @@ pub(super) fn read_all(
         .iter()
         .zip(files)
         .enumerate()
-        .filter_map(|(at, (view, entry))| Some((at, view, entry.hole.as_ref().filter(|_| view.mask.is_some())?)));
+        .filter_map(|(at, (view, file))| Some((at, view, file.as_ref().filter(|_| view.mask.is_some())?)));
     let filled: Vec<(usize, &View, &PathBuf)> = filled.collect();
     if filled.is_empty() {
         return Ok(vec![]);

@@ -326,7 +326,8 @@ pub fn load(dir: &Path, config: &Config) -> Result<Scene, Error> {
     }
     let mut references = read_references;
     references.sort_by_key(|r| r.view);
-    let holes = hole::read_all(dir, config, (&mut train, &train_files), &references, &mut notes)?;
+    let filled: Vec<Option<PathBuf>> = train_files.iter().map(|entry| entry.hole.clone()).collect();
+    let holes = hole::read_all(dir, config, (&mut train, &filled), &references, &mut notes)?;
     summarise(&train, &test, &references, points.len(), config, &mut notes);
     let radius = radius(&train);
     if radius.is_none() {
