@@ -30,8 +30,8 @@ const COLOR: f32 = 0.08;
 const REACH: f32 = 6.0;
 /// Views that are asked for the Gaussians' colours.
 const COLORED: usize = 6;
-/// What no masked view has seen is the object where it hangs together with what they have seen of it: steps from one to the next are
-/// within neighbouring cells, whose sides are this part of the object's extent, or so many spacings where that is more.
+/// Anchors hang together where they lie in neighbouring cells, whose sides are this part of the object's extent, or so many spacings where
+/// that is more. One that no masked view has seen is the object if it hangs together with what they have seen of it.
 const STEP: f32 = 0.125;
 const STEP_SPACINGS: f32 = 4.0;
 /// A piece that hangs together is the object where it has this part of all that the masked views have seen of it.
@@ -151,7 +151,8 @@ fn apart(positions: &[[f32; 3]], priors: &[f32], spacing: f32, inside: impl Fn(u
     let off = |a: usize| (0..3).map(|k| (f64::from(positions[a][k]) - middle[k]).powi(2)).sum::<f64>().sqrt() as f32;
     let extent = quantile(seen().map(off), 0.9).map_or(0.0, |radius| 2.0 * radius as f32);
     let side = (STEP * extent).max(STEP_SPACINGS * spacing).max(f32::MIN_POSITIVE);
-    let cell = |a: usize| -> [i64; 3] { std::array::from_fn(|k| (positions[a][k] / side).floor() as i64) };
+    let cell =
+        |a: usize| -> [i64; 3] { std::array::from_fn(|k| (positions[a][k] / side).floor().clamp(-1e9, 1e9) as i64) };
     let mut cells: HashMap<[i64; 3], Vec<usize>> = HashMap::new();
     object.iter().for_each(|a| cells.entry(cell(*a)).or_default().push(*a));
     let mut alone = vec![];

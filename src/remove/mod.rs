@@ -440,7 +440,8 @@ impl Session {
                 self.changed.notify_all();
                 let revision = state.revision;
                 drop((state, turn));
-                if late { self.cut(object, number, None) } else { Ok(revision) }
+                // The marks count, whatever comes of the second time.
+                if late { self.cut(object, number, None).or(Ok(revision)) } else { Ok(revision) }
             }
             Err(refused) => {
                 if drawn {

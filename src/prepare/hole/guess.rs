@@ -97,23 +97,16 @@ impl Chart {
     }
 }
 
-/// Fills what nothing tells of a view's hole: what is `wanted` of it by textures, the rest smoothly.
-pub fn fill(
-    sights: &Sights,
-    photographs: &[Photograph<'_>],
-    of: usize,
-    filling: &mut Filling,
-    wanted: impl Fn(usize) -> bool,
-) {
+/// Fills what nothing tells of a view's hole: the pixels of it that are `wanted` by textures, the rest smoothly.
+pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling: &mut Filling, wanted: &[bool]) {
     let (own, sight) = (&photographs[of], &sights.0[of]);
     let [w, h] = own.camera.size.map(|n| n as usize);
     if !filling.guessed.contains(&true) {
         return;
     }
-    let wanted: Vec<bool> = (0..w * h).map(|i| filling.guessed[i] && wanted(i)).collect();
     let guessed: Vec<usize> = (0..w * h).filter(|i| wanted[*i]).collect();
     // What is thin between known pixels needs no texture, and would draw the chart out to wherever it is.
-    let thick = thick(&wanted, own.camera.size);
+    let thick = thick(wanted, own.camera.size);
     let ray = |i: usize| own.camera.unproject([(i % w) as f64 + 0.5, (i / w) as f64 + 0.5]);
     let site = f64::from(sight.grid.stride) * f64::from(own.camera.size[0]) / f64::from(sight.grid.camera.size[0]);
     borders(filling, [w, h], &thick, ASIDE * site);

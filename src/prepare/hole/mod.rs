@@ -220,20 +220,20 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
                 filling.doubtful.iter_mut().zip(&filling.seen).for_each(|(doubtful, seen)| *doubtful &= seen);
             }
             // Doubtful pixels are left to training; a picture that is looked at is filled everywhere.
-            let idle: Vec<bool> = filling.doubtful.iter().map(|doubtful| *doubtful && i != of).collect();
+            let guessed = filling.guessed.iter().zip(&filling.doubtful);
+            let wanted: Vec<bool> = guessed.map(|(guessed, doubtful)| *guessed && (i == of || !doubtful)).collect();
             // What was made for this view the others get from it; what photographs show they look up themselves.
             let made: Vec<bool> = if task.given.contains_key(&i) {
                 photographs[i].hole.as_raw().iter().map(|v| *v != 0).collect()
             } else {
-                let guessed = filling.guessed.iter().zip(&idle).map(|(guessed, idle)| *guessed && !idle);
-                guess::thick(&guessed.collect::<Vec<_>>(), cameras[i].size)
+                guess::thick(&wanted, cameras[i].size)
             };
             if task.given.contains_key(&i) {
                 painted(task, i, &photographs[i].hole, &mut filling)?;
             } else if let Some(network) = task.inpainting {
                 network.fill(&mut filling.rgb, &filling.guessed, cameras[i].size.map(|n| n as usize))?;
             } else {
-                guess::fill(&sights, &photographs, i, &mut filling, |pixel| !idle[pixel]);
+                guess::fill(&sights, &photographs, i, &mut filling, &wanted);
             }
             let guessed = |hole: &u8, seen: &bool| if *hole != 0 && !seen { 255 } else { 0 };
             let guessed =
@@ -265,6 +265,13 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
             watch.turn(n + 1 + done)?;
         }
     }
+    if !left.is_empty() {
+        batch.notes.push(format!(
+            "the holes of {} of {} views are filled, spread over the capture; the others show the same surface, and are left to training",
+            order.len(),
+            with_holes.len()
+        ));
+    }
     for i in left {
         let own = photographs[i].picture.pixels().map(|p| p.0.map(|v| f32::from(v) / 255.0)).collect::<Vec<_>>();
         let hole = &photographs[i].hole;
@@ -273,13 +280,6 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
         batch.rgba(format!("{HOLE}/{name}.png"), &picture, "left to training: others show the same");
         done += 1;
         watch.turn(n + 1 + done)?;
-    }
-    if done as usize > order.len() {
-        batch.notes.push(format!(
-            "the holes of {} of {} views are filled, spread over the capture; the others show the same surface, and are left to training",
-            order.len(),
-            with_holes.len()
-        ));
     }
     let percent = (100.0 * doubtful as f64 / all.max(1) as f64).round();
     if percent > 0.0 {
@@ -297,8 +297,8 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
     Ok(batch)
 }
 
-/// Of these views, in their order, those that are filled and those that are not: the `first` of them, and others between, evenly spread by
-/// their numbers, which follow their names; `most` at most.
+/// Views that are filled, `most` of these at most, and those that are not, in their order. Filled are the `first` of them, and others evenly
+/// spread by their numbers, which follow their names.
 fn chosen(views: &[usize], first: usize, most: usize) -> (Vec<usize>, Vec<usize>) {
     if views.len() <= most {
         return (views.to_vec(), vec![]);

@@ -41,7 +41,7 @@ pub struct Support {
     tall: f64,
     /// Corners, along the axes, of the least convex polygon with all points of the object, counterclockwise.
     corners: Vec<DVec2>,
-    /// The same of those next to the plane: there the object stands.
+    /// Corners of the same polygon of those points that are next to the plane: there the object stands.
     foot: Vec<DVec2>,
 }
 
