@@ -5,7 +5,7 @@
 //! - `residue`: what is left of a shadow that was taken out goes with the object.
 //! - [`complete`]: masks that end before the object does grow, and views that have it elsewhere are not asked.
 //! - `covered`: where depth does not tell surfaces apart, what they look like does (`material`).
-//! - `corner`: a surface whose edge goes into the hole ends at a right angle.
+//! - `corner`: a surface whose edge goes into the hole ends at a right angle, and its front goes on up to there.
 //! - `surface`: the depth of what is behind the object, in all views, by what they know of a point (`witness`).
 //! - `color`: what photographs show of it, and what views that were filled before show of it (`relief`).
 //! - `guess`: what nobody shows is filled with pieces of the same surface, seen straight on (`texture`), lines and straight
@@ -36,6 +36,7 @@ mod similar;
 mod support;
 mod surface;
 mod texture;
+mod votes;
 mod window;
 mod witness;
 
@@ -74,8 +75,8 @@ pub const METHOD: &str = "one surface with smooth ends, nothing where others loo
      lights joined, doubts left to training, nothing stands on what only crosses the floor, lines go on through holes and to walls behind, \
      what is nearly one plane is one, copies nearly keep their hue, ends are where the first view has them, \
      nothing from views with the object elsewhere, nothing stands where the first view looks through, surfaces by what they are covered with, \
-     straight borders go on, those that end in a hole too, surfaces end at right angles, grain is kept, floors end at their walls, planes have \
-     their materials, which have grain, what is bare of the object refutes nothing, the reference has no shadow, no \
+     straight borders go on, those that end in a hole too, surfaces end at right angles, their fronts and the faces below \
+     them go on up to there, grain is kept, floors end at their walls, planes have their materials, which have grain, what is bare of the object refutes nothing, the reference has no shadow, no \
      small piece hangs in a hole, what is guessed is noted, nothing shows through what the object stands on, what is doubtful \
      is not guessed, and of many views some are filled";
 /// Where each pixel of the reference is from, below the scene's folder.
@@ -189,7 +190,10 @@ pub fn make(task: &Task<'_>, watch: &mut dyn Watch) -> Result<Batch, Error> {
         sights.0[of].borders = guess::ends(&sights.0[of], &photographs[of]);
         let mut solved = sights.clone();
         solved.solve(of, task.seed);
-        (sights.0[of].borders, sights.0[of].cuts) = solved.0[of].cut_off();
+        let ends = solved.0[of].cut_off(&photographs[of]);
+        let sight = &mut sights.0[of];
+        (sight.borders, sight.cuts) = (ends.borders, ends.cuts);
+        sight.covered.extend(ends.faces);
     }
     sights.solve(of, task.seed);
     // After the reference those that show most of what is still unknown.

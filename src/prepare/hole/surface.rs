@@ -12,6 +12,8 @@ use rayon::prelude::*;
 use super::corner::Cut;
 use super::covered::{Cover, Covered};
 use super::flat;
+use super::support::Support;
+use super::votes::{Claim, ENOUGH, Votes};
 use super::window::Window;
 use crate::multiview::DepthGrid;
 use crate::prepare::planes;
@@ -21,10 +23,6 @@ use crate::scene::Camera;
 pub(super) const SAME: f64 = 0.03;
 /// Relative difference from which on the nearer of two surfaces hides the farther one.
 pub(super) const APART: f64 = 0.06;
-/// Sum of the weights of the views that must claim a depth behind the object.
-const ENOUGH: f64 = 2.0;
-/// Weights of claims: of a view that is solved, which is enough; of a depth that another view confirms; of one that none does.
-const WEIGHTS: [f64; 3] = [ENOUGH, 1.0, 0.5];
 /// Share of the views with a point in the picture whose masks must cover it for it to be the object's.
 const HULL: f64 = 0.8;
 /// Fewest views with a point in the picture that can tell whether it is the object's.
@@ -94,53 +92,6 @@ pub struct Sight {
 /// A camera's rotation.
 fn rotation(camera: &Camera) -> DMat3 {
     DMat3::from_cols_array_2d(&camera.rotation.map(|row| row.map(f64::from))).transpose()
-}
-
-/// Depth z that another view claims at a site.
-#[derive(Clone, Copy)]
-struct Claim {
-    depth: f64,
-    view: usize,
-    /// Which of [`WEIGHTS`] is its.
-    class: usize,
-    /// Whether the view's photograph shows it.
-    photographed: bool,
-    /// Number of the view's plane that it lies on, if on one.
-    surface: u8,
-}
-
-/// Votes of the views that have claims in a cluster: the weightiest of each view counts.
-struct Votes {
-    /// `[view][class]` how many of its claims there are.
-    counts: Vec<[u32; 3]>,
-    /// The sum.
-    weight: f64,
-}
-
-impl Votes {
-    fn of(views: usize) -> Self {
-        Self { counts: vec![[0; 3]; views], weight: 0.0 }
-    }
-
-    /// The weight of a view's weightiest claim.
-    fn own(&self, view: usize) -> f64 {
-        self.counts[view].iter().position(|count| *count > 0).map_or(0.0, |class| WEIGHTS[class])
-    }
-
-    fn count(&mut self, claim: &Claim, change: impl Fn(&mut u32)) {
-        let before = self.own(claim.view);
-        change(&mut self.counts[claim.view][claim.class]);
-        // Halves and wholes: the sum is exact.
-        self.weight += self.own(claim.view) - before;
-    }
-
-    fn come(&mut self, claim: &Claim) {
-        self.count(claim, |count| *count += 1);
-    }
-
-    fn go(&mut self, claim: &Claim) {
-        self.count(claim, |count| *count -= 1);
-    }
 }
 
 /// A surface as it goes on around one of its sites.
@@ -632,8 +583,11 @@ impl Sights {
             (true, true) => planes::around(&known, &rays, &open, seed),
         };
         let supports = own.supports(&planes);
+        let barred = |plane: usize, site: usize| own.cuts.iter().any(|cut| cut.bars(plane, own.middle(site)));
+        // What has ended hides nothing.
         let under = |site: &usize| {
-            let depths = supports.iter().filter_map(|support| support.under(own.ray(*site)));
+            let ended = |support: &Support| (0..planes.len()).any(|k| support.is(&planes[k]) && barred(k, *site));
+            let depths = supports.iter().filter(|support| !ended(support)).filter_map(|at| at.under(own.ray(*site)));
             depths.reduce(f64::min).filter(|_| own.hole[*site])
         };
         let under: Vec<Option<f64>> = sites.iter().map(under).collect();
@@ -647,7 +601,7 @@ impl Sights {
                 return 1.0;
             }
             let is = planes.iter().position(|plane| planes::on(plane, own.ray(site)) == d);
-            if is.is_some_and(|plane| own.cuts.iter().any(|cut| cut.bars(plane, own.middle(site)))) {
+            if is.is_some_and(|plane| barred(plane, site)) {
                 return 1.0;
             }
             let hidden = under[cell].is_some_and(|z| 1.0 / d > (1.0 + SAME) * z)
@@ -655,11 +609,19 @@ impl Sights {
             self.against(of, own.point(site, 1.0 / d)).max(if hidden { BELOW } else { 0.0 })
         };
         let told = !own.around.is_empty();
-        let costs = match (told, own.covered.is_empty()) {
+        let mut costs = match (told, own.covered.is_empty()) {
             (true, _) => self.evidence(of, &sites, size, disparity, &planes),
             (false, false) => own.material_costs(&sites, &known, &against),
             (false, true) => vec![],
         };
+        // Within its ends a surface is there, but where others look through it.
+        for (cell, costs) in costs.iter_mut().enumerate().filter(|(cell, _)| own.hole[sites[*cell]]) {
+            let its = own.cuts.iter().find_map(|cut| cut.has(own.middle(sites[cell])));
+            let stands = |plane: &usize| against(cell, planes::on(&planes[*plane], own.ray(sites[cell]))) < 1.0;
+            if let Some(own) = its.filter(stands) {
+                *costs = Some((0..=planes.len()).map(|k| if k == own { 0.0 } else { planes::IMPOSSIBLE }).collect());
+            }
+        }
         let borders: Vec<[DVec2; 2]> = own.borders.iter().map(|ends| ends.map(|end| end - corner)).collect();
         let hole = planes::Hole {
             told,
@@ -764,21 +726,6 @@ pub(super) mod tests {
             GrayImage::from_fn(SIZE[0], SIZE[1], |x, y| Luma([if inside(x, y) { 255 } else { 0 }]))
         };
         (cameras.iter().map(grid).collect(), cameras.clone(), cameras.iter().map(mask).collect())
-    }
-
-    /// The weightiest claim of a view counts alone, as claims come and go.
-    #[test]
-    fn a_view_has_one_vote() {
-        let claim = |view, class| Claim { depth: 1.0, view, class, photographed: true, surface: 0 };
-        let mut votes = Votes::of(2);
-        for (claim, weight) in [(claim(0, 2), 0.5), (claim(0, 1), 1.0), (claim(1, 2), 1.5), (claim(0, 1), 1.5)] {
-            votes.come(&claim);
-            assert_eq!(votes.weight, weight);
-        }
-        for (claim, weight) in [(claim(0, 1), 1.5), (claim(0, 1), 1.0), (claim(1, 2), 0.5), (claim(0, 2), 0.0)] {
-            votes.go(&claim);
-            assert_eq!(votes.weight, weight);
-        }
     }
 
     /// What the views on the left and on the right show behind the square is the wall, and the middle view's hole gets it; what
