@@ -115,6 +115,8 @@ const AROUND: f64 = 0.35;
 const TOGETHER: usize = 3;
 /// A click nearer to the outline than this part of the root of the mask's area is about the outline.
 const AFAR: f64 = 0.1;
+/// Such a click changes at most this part of the mask where all marks are taken together.
+const BESIDE_PART: f64 = 0.25;
 /// A click changes what lies within so many times its distance from the outline.
 const REACH: f64 = 6.0;
 /// The weight of being nearer to it than to what says otherwise, in nats.
@@ -204,8 +206,16 @@ pub fn next(picture: &RgbImage, marks: &[Mark], before: &GrayImage, cues: &Cues<
 fn further(picture: &RgbImage, marks: &[Mark], before: &GrayImage, cues: &Cues<'_>) -> GrayImage {
     let Some((at, adds)) = marks.last().and_then(Mark::click) else { return before.clone() };
     let cues = &Cues { depth: cues.depth.filter(|_| cues.knows(picture, before)), ..*cues };
-    let afar = cues.depth.is_none() || is_afar(before, at, adds);
-    let anew = (cues.carried.is_none() && marks.len() <= TOGETHER && afar).then(|| found(picture, marks, cues));
+    let afar = is_afar(before, at, adds);
+    let anew = cues.carried.is_none() && marks.len() <= TOGETHER && (afar || cues.depth.is_none());
+    let anew = anew.then(|| found(picture, marks, cues));
+    let changes = |new: &GrayImage| {
+        let both = before.as_raw().iter().zip(changed(before, new, at, adds).into_raw());
+        both.filter(|(was, is)| **was != *is).count() as f64
+    };
+    let area = before.as_raw().iter().filter(|v| **v != 0).count() as f64;
+    // What is of the background's colour at the outline floods that.
+    let anew = anew.filter(|new| afar || changes(new) <= BESIDE_PART * area);
     // An empty one has run out of pixels: the click says nothing of the rest.
     let agrees = |mask: &GrayImage| holds(mask, at) == adds && bounds_of(mask).is_some();
     anew.filter(agrees)

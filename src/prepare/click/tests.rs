@@ -398,6 +398,34 @@ fn a_further_click_keeps_what_others_hold() {
     }
 }
 
+/// The third click, on a small spot of the background's colour at the object's outline, changes what is near and no more.
+#[test]
+fn a_third_click_at_the_outline_leaves_the_rest() {
+    let mut rng = rand_pcg::Pcg64::new(3, 3);
+    let spot = |x: u32, y: u32| (84..90).contains(&x) && (40..46).contains(&y);
+    let square = |x: u32, y: u32| (50..90).contains(&x) && (40..80).contains(&y);
+    let picture = RgbImage::from_fn(160, 120, |x, y| {
+        let color = match (square(x, y) && !spot(x, y), spot(x, y) || (90..150).contains(&x) && (20..80).contains(&y)) {
+            (true, _) => [130, 130, 135],
+            (_, true) => [90, 140, 60],
+            _ => [60, 80, 150],
+        };
+        image::Rgb(color.map(|v| v + rng.random_range(0..12)))
+    });
+    let mark = |x: f64, y: f64| [x / 160.0, y / 120.0];
+    let marks = [object(mark(70.0, 60.0)), Mark::Background { at: mark(20.0, 20.0) }, object(mark(87.0, 43.0))];
+    let before = GrayImage::from_fn(160, 120, |x, y| Luma([if square(x, y) && !spot(x, y) { 255 } else { 0 }]));
+    let far = |x: u32, y: u32| f64::hypot(f64::from(x) - 87.0, f64::from(y) - 43.0) > 40.0;
+    let changed = |after: &GrayImage| {
+        after.enumerate_pixels().filter(|(x, y, is)| *is != before.get_pixel(*x, *y) && far(*x, *y)).count()
+    };
+    let after = next(&picture, &marks, &before, &Cues::default());
+    assert!(is_on(&after, mark(87.0, 43.0)) && changed(&after) == 0, "{}", changed(&after));
+    // All three from the beginning flood the background of that colour.
+    let anew = super::found(&picture, &marks, &Cues::default());
+    assert!(changed(&anew) > 500, "{}", changed(&anew));
+}
+
 /// Steps go from a colour to the whole and back, never past the ends.
 #[test]
 fn steps_go_to_larger_and_smaller_segments() {
