@@ -6,8 +6,8 @@
 
 use glam::{DVec2, DVec3};
 
-use super::color::Photograph;
 use super::covered::Covered;
+use super::photograph::Photograph;
 use super::surface::Sight;
 use crate::prepare::planes;
 use crate::statistics::quantile;

@@ -8,9 +8,10 @@ use std::collections::BTreeSet;
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
-use super::color::{Filling, Photograph, between};
+use super::color::Filling;
 use super::holed::Texture;
 use super::material::{Look, MATERIAL, of_another};
+use super::photograph::{Photograph, between};
 use super::surface::{APART, SAME, Sight, Sights};
 use super::texture;
 use crate::prepare::planes::{self, Plane, membrane};

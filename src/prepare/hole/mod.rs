@@ -28,6 +28,7 @@ mod holed;
 mod island;
 mod lines;
 mod material;
+mod photograph;
 mod regions;
 mod relief;
 pub mod repaint;
@@ -52,7 +53,8 @@ use super::record::Batch;
 use super::{Error, Watch};
 use crate::multiview::Matched;
 use crate::scene::{self, Camera, DOUBTFUL, GUESSED, HOLE, MADE_WITH, PriorKind, Scene, resample};
-use color::{Filled, Filling, Photograph};
+use color::{Filled, Filling};
+use photograph::Photograph;
 use surface::{Sight, Sights};
 
 /// The longer side of the photographs that the hole is filled from, pixels; larger ones are reduced, and the filling is

@@ -13,9 +13,10 @@ use glam::{DMat3, DVec3};
 use image::{GrayImage, Rgb, RgbImage, Rgba, RgbaImage};
 use rayon::prelude::*;
 
-use super::color::{self, Filling, between};
+use super::color::{self, Filling};
 use super::guess::{self, AROUND, Chart};
 use super::holed::Texture;
+use super::photograph::{self, between};
 use super::surface::SAME;
 use super::{behind_path, reference_path, texture};
 use crate::prepare::object::{no_such_view, read_mask};
@@ -344,7 +345,7 @@ impl View {
             };
             let pixel = seen(&self.behind).or_else(|| self.doubtful[i].then(|| seen(&self.mended))?)?;
             let at = |x: usize, y: usize| paint.picture.get_pixel(x as u32, y as u32).0.map(|v| f32::from(v) / 255.0);
-            let color = color::sample(at, paint.camera.size, pixel)?;
+            let color = photograph::sample(at, paint.camera.size, pixel)?;
             let brushed = paint.brushed[pixel[1] as usize * w as usize + pixel[0] as usize];
             Some((brushed, std::array::from_fn(|c| color[c] * gain[c])))
         };

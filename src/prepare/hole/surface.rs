@@ -12,7 +12,6 @@ use rayon::prelude::*;
 use super::corner::Cut;
 use super::covered::{Cover, Covered};
 use super::flat;
-use super::support::Support;
 use super::votes::{Claim, ENOUGH, Votes};
 use super::window::Window;
 use crate::multiview::DepthGrid;
@@ -586,8 +585,9 @@ impl Sights {
         let barred = |plane: usize, site: usize| own.cuts.iter().any(|cut| cut.bars(plane, own.middle(site)));
         // What has ended hides nothing.
         let under = |site: &usize| {
-            let ended = |support: &Support| (0..planes.len()).any(|k| support.is(&planes[k]) && barred(k, *site));
-            let depths = supports.iter().filter(|support| !ended(support)).filter_map(|at| at.under(own.ray(*site)));
+            let ended = |k: usize| barred(k, *site);
+            let there = supports.iter().filter(|at| !(0..planes.len()).any(|k| at.is(&planes[k]) && ended(k)));
+            let depths = there.filter_map(|support| support.under(own.ray(*site)));
             depths.reduce(f64::min).filter(|_| own.hole[*site])
         };
         let under: Vec<Option<f64>> = sites.iter().map(under).collect();
