@@ -61,6 +61,11 @@ impl DepthGrid {
         std::array::from_fn(|a| (at[a] - f64::from(self.camera.principal[a])) / f64::from(self.camera.focal[a]))
     }
 
+    /// Pixels from site to site of the view's picture where that is so wide.
+    pub fn pixels(&self, width: u32) -> f64 {
+        f64::from(self.stride) * f64::from(width) / f64::from(self.camera.size[0])
+    }
+
     /// The site there, if there is one.
     pub fn site(&self, column: i64, row: i64) -> Option<usize> {
         let inside = (0..i64::from(self.columns)).contains(&column) && (0..i64::from(self.rows)).contains(&row);

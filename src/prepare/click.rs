@@ -206,9 +206,9 @@ pub fn next(picture: &RgbImage, marks: &[Mark], before: &GrayImage, cues: &Cues<
 fn further(picture: &RgbImage, marks: &[Mark], before: &GrayImage, cues: &Cues<'_>) -> GrayImage {
     let Some((at, adds)) = marks.last().and_then(Mark::click) else { return before.clone() };
     let cues = &Cues { depth: cues.depth.filter(|_| cues.knows(picture, before)), ..*cues };
-    let afar = is_afar(before, at, adds);
-    let anew = cues.carried.is_none() && marks.len() <= TOGETHER && (afar || cues.depth.is_none());
-    let anew = anew.then(|| found(picture, marks, cues));
+    let together = cues.carried.is_none() && marks.len() <= TOGETHER;
+    let afar = together && is_afar(before, at, adds);
+    let anew = (together && (afar || cues.depth.is_none())).then(|| found(picture, marks, cues));
     let changes = |new: &GrayImage| {
         let both = before.as_raw().iter().zip(changed(before, new, at, adds).into_raw());
         both.filter(|(was, is)| **was != *is).count() as f64

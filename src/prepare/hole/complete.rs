@@ -144,7 +144,7 @@ pub fn complete(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage]
             }
         }
         // A site's pixels, and a half more on each side.
-        let site = f64::from(grid.stride) * f64::from(camera.size[0]) / f64::from(grid.camera.size[0]);
+        let site = grid.pixels(camera.size[0]);
         let more = crate::scene::resample::dilate(&more, site.ceil() as u32);
         mask.iter_mut().zip(more.as_raw()).for_each(|(m, more)| *m = (*m).max(*more));
         grown.push(view);

@@ -43,7 +43,7 @@ const STRAIGHT: usize = 2;
 pub struct Cut {
     /// Number of the surface.
     surface: usize,
-    /// Its corners, sites: where it goes into the hole, and ends, along its one side, and where it ends, and goes in, along its other.
+    /// Corners of the part, sites: where it goes into the hole, and ends, along its one side, and where it ends, and goes in, along its other.
     corners: [DVec2; 4],
     /// Which of its sides, each from a corner to the next, it is known not to go over.
     ends: [bool; 4],
@@ -62,7 +62,7 @@ impl Cut {
         surface == self.surface && (0..4).any(|side| self.ends[side] && !self.is_within(side, place))
     }
 
-    /// Its surface, at a place within all its sides, of which three are known.
+    /// The surface that is there for certain, at a place within all sides of a part whose front is known.
     pub fn has(&self, place: DVec2) -> Option<usize> {
         (self.ends[2] && (0..4).all(|side| self.is_within(side, place))).then_some(self.surface)
     }
@@ -189,17 +189,14 @@ impl Sight {
         (ends && before_camera).then_some(slab)
     }
 
-    /// Pixels of a picture from site to site.
-    fn pixels(&self, own: &Photograph<'_>) -> f64 {
-        f64::from(self.grid.stride) * f64::from(own.camera.size[0]) / f64::from(self.grid.camera.size[0])
-    }
-
     /// How far points of a plane (p . x = 1) are from one of them along a way in it, one for each pixel of a picture between two places
     /// along it, sites from that point's.
     fn steps(&self, own: &Photograph<'_>, plane: DVec3, base: DVec3, way: DVec3, [from, to]: [f64; 2]) -> Vec<f64> {
         let middle = self.place_of(base);
         let ahead = self.place_of(base + way * 1e-3 * base.length());
-        let (Some(way_seen), pixels) = ((ahead - middle).try_normalize(), self.pixels(own)) else { return vec![] };
+        let (Some(way_seen), pixels) = ((ahead - middle).try_normalize(), self.grid.pixels(own.camera.size[0])) else {
+            return vec![];
+        };
         let step = |k: usize| {
             let [x, y] = self.grid.ray_at((middle + way_seen * (from + k as f64 / pixels)).to_array());
             let ray = DVec3::new(x, y, 1.0);

@@ -109,8 +109,7 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
     // What is thin between known pixels needs no texture, and would draw the chart out to wherever it is.
     let thick = thick(wanted, own.camera.size);
     let ray = |i: usize| own.camera.unproject([(i % w) as f64 + 0.5, (i / w) as f64 + 0.5]);
-    let site = f64::from(sight.grid.stride) * f64::from(own.camera.size[0]) / f64::from(sight.grid.camera.size[0]);
-    borders(filling, [w, h], &thick, ASIDE * site);
+    borders(filling, [w, h], &thick, ASIDE * sight.grid.pixels(own.camera.size[0]));
     let behind = std::mem::take(&mut filling.behind);
     let surface = |i: usize| behind[i].or_else(|| ray(i).map(|ray| sight.surface_at(sight.grid.place(ray))));
     let surfaces: Vec<(usize, u8)> = guessed.par_iter().filter_map(|i| Some((*i, surface(*i)?))).collect();

@@ -7,9 +7,9 @@ use crate::scene::Camera;
 
 /// A photograph that colours are taken from.
 pub struct Photograph<'a> {
-    /// Its camera, at the picture's size.
+    /// The camera, at the picture's size.
     pub camera: Camera,
-    /// What it shows.
+    /// The colours that it shows.
     pub picture: &'a RgbImage,
     /// The object with a margin, as large as the picture.
     pub hole: GrayImage,

@@ -1,4 +1,4 @@
-//! What views claim to be behind the object at a site, and the votes that these have.
+//! Claims of views to know what is behind the object at a site, and the votes that these have.
 
 /// Sum of the weights of the views that must claim a depth behind the object.
 pub const ENOUGH: f64 = 2.0;
