@@ -8,6 +8,8 @@
 //! `ROOM/STEM.comp`. All of them are one module with one twin. A binding that not every variant has is an `Option`: those
 //! that are given say which variant runs. Where that leaves several, `Kernel` is an enum that says the rest: `Gpu` or `Cpu`
 //! for the form, and the macro that tells a variant from the first one with the same bindings (`Plain`).
+//!
+//! A line `// narrow subgroups` gives a kernel the least subgroups that its device has: `gpu::kernel::Interface::narrow`.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fmt::Write as _;
@@ -201,6 +203,7 @@ struct Interface {
     push: Vec<Member>,
     constants: Vec<Constant>,
     subgroups: bool,
+    narrow: bool,
 }
 
 impl Interface {
@@ -329,8 +332,9 @@ fn reflect(words: &[u32], source: &str) -> Result<Interface> {
     }
     ensure!(group[0] > 0, "no local_size");
     let subgroups = module.capabilities.iter().any(|c| format!("{:?}", c.operands).contains("GroupNonUniform"));
+    let narrow = source.lines().any(|line| line == "// narrow subgroups");
     constants.sort_by_key(|c| c.id);
-    Ok(Interface { group, bindings: found, push, constants, subgroups })
+    Ok(Interface { group, bindings: found, push, constants, subgroups, narrow })
 }
 
 fn glsl(ty: &Type) -> String {
@@ -581,7 +585,7 @@ impl Kernel {
 impl Variant {
     /// The `Interface` as Rust source.
     fn print(&self, all: &[Binding], constants: &[Constant], bound: u32, choice: usize) -> String {
-        let Interface { group, bindings, subgroups, constants: own, .. } = &self.interface;
+        let Interface { group, bindings, subgroups, narrow, constants: own, .. } = &self.interface;
         let binding = |b: &Binding| {
             let at = all.iter().position(|of_all| of_all.name == b.name).unwrap_or(0);
             let (number, name, access, scalar) = (b.number, &b.name, b.access, b.element.scalar.to_uppercase());
@@ -594,7 +598,7 @@ impl Variant {
             format!("({}, {at}),", c.id)
         };
         format!(
-            "Interface {{ name: {:?}, choice: {choice}, bound: {bound:#b}, group: {group:?}, subgroups: {subgroups}, \
+            "Interface {{ name: {:?}, choice: {choice}, bound: {bound:#b}, group: {group:?}, subgroups: {subgroups}, narrow: {narrow}, \
              bindings: &[{}], constants: &[{}], push_bytes: {}, spirv: include_bytes!({:?}) }},",
             self.name,
             bindings.iter().map(binding).collect::<String>(),

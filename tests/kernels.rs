@@ -48,10 +48,13 @@ fn registers_and_spills_are_those_of_the_table() {
     if !installed() {
         return;
     }
-    for (family, subgroup) in [("gfx1100", "64"), ("gfx1100", "32"), ("navi21", "64"), ("vega10", "64")] {
+    // `own`: as a training runs there, subgroups of 64 but where a kernel asks for the least.
+    for (family, subgroup) in [("gfx1100", "own"), ("gfx1100", "32"), ("navi21", "own"), ("vega10", "own")] {
         let attention = "model.attention.enabled=true";
-        let arguments =
-            ["kernels", "synthetic", "--preset", "demo", "--set", attention, "--subgroup", subgroup, "--json"];
+        let mut arguments = vec!["kernels", "synthetic", "--preset", "demo", "--set", attention, "--json"];
+        if subgroup != "own" {
+            arguments.extend(["--subgroup", subgroup]);
+        }
         let output = on_null_device(family, &arguments).output().expect("it runs");
         assert!(output.status.success(), "{family}: {}", String::from_utf8_lossy(&output.stderr));
         let found: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");

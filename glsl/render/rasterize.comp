@@ -5,6 +5,7 @@
 #include "tiles.glsl"
 // variant color: COLOR_ONLY
 // variant depth: NO_TRANSMITTANCE
+// narrow subgroups
 //
 // Front-to-back blending of a tile's Gaussians (3D Gaussian Splatting, equation 3): colour, depth and transmittance.
 // 16 x 16 tiles, a thread a pixel; Gaussians pass through shared memory, and each row of pixels goes through those that reach it:

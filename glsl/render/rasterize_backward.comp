@@ -9,6 +9,7 @@
 #include "tiles.glsl"
 // variant color: COLOR_ONLY
 // variant depth: NO_TRANSMITTANCE
+// narrow subgroups
 //
 // Gradients of the blending, per (Gaussian, tile) pair.
 //

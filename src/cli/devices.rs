@@ -44,8 +44,10 @@ fn list(devices: &[DeviceInfo]) -> String {
         } else {
             format!("cannot be used: lacks {}", d.lacks.join(", "))
         };
+        let narrow = d.narrow_subgroup_size;
+        let narrow = if narrow == d.subgroup_size { String::new() } else { format!(" and {narrow}") };
         text += &format!(
-            "{}  {}\n   {}, Vulkan {}, driver {}\n   memory {}, one binding {}, subgroups of {}, shared memory {}\n   {usable}\n",
+            "{}  {}\n   {}, Vulkan {}, driver {}\n   memory {}, one binding {}, subgroups of {}{narrow}, shared memory {}\n   {usable}\n",
             d.index,
             d.name,
             d.kind,
@@ -72,7 +74,8 @@ mod tests {
             kind: "discrete",
             driver: "vendor 1.2".into(),
             api: "1.2.170".into(),
-            subgroup_size: 32,
+            subgroup_size: 64,
+            narrow_subgroup_size: 32,
             push_descriptors: true,
             max_binding_bytes: 128 << 20,
             heap_bytes: 8 << 30,
@@ -92,11 +95,11 @@ mod tests {
             "\
 0  Old Card
    discrete, Vulkan 1.2.170, driver vendor 1.2
-   memory 8.00 GiB, one binding 128.00 MiB, subgroups of 32, shared memory 48.00 KiB
+   memory 8.00 GiB, one binding 128.00 MiB, subgroups of 64 and 32, shared memory 48.00 KiB
    usable; no timestamps: --profile measures nothing
 1  Old Card
    discrete, Vulkan 1.2.170, driver vendor 1.2
-   memory 8.00 GiB, one binding 128.00 MiB, subgroups of 32, shared memory 48.00 KiB
+   memory 8.00 GiB, one binding 128.00 MiB, subgroups of 64 and 32, shared memory 48.00 KiB
    cannot be used: lacks Vulkan 1.3, synchronization2
 "
         );

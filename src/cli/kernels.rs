@@ -29,9 +29,6 @@ pub(super) struct Args {
     scene: std::path::PathBuf,
     #[command(flatten)]
     settings: SettingsArgs,
-    /// Compile for subgroups of so many threads [default: the driver's choice]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
-    subgroup: Option<u32>,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -52,7 +49,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let given = SceneArgs { scene: args.scene.clone(), settings: args.settings.clone() };
     let Loaded { scene, settings, .. } = preset::load(&given, &args.device)?;
     // From the cache a kernel would have no compile time, and some drivers no figures.
-    let options = Options { statistics: true, subgroup_size: args.subgroup, cache: None, ..args.device.options() };
+    let options = Options { statistics: true, cache: None, ..args.device.options() };
     with_gpu(&options, |gpu| {
         // No stereo: it would run on the device, and its points change no kernel. What does not fit into the device's
         // memory is rehearsed all the same.

@@ -88,6 +88,7 @@ mod tests {
             driver: String::new(),
             api: "1.3.0".into(),
             subgroup_size: 8,
+            narrow_subgroup_size: 8,
             push_descriptors: true,
             max_binding_bytes: 1 << 30,
             heap_bytes: 1 << 33,

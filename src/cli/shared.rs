@@ -34,6 +34,9 @@ pub struct DeviceArgs {
     /// Kernels for a GPU or for a CPU driver, for comparisons [default: the device's own kind]
     #[arg(long, value_name = "FORM", hide_possible_values = true)]
     pub form: Option<Form>,
+    /// Threads of a subgroup, of all kernels [default: the driver's choice, in some the least that the device has]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    subgroup: Option<u32>,
     /// How passes bind buffers: push, or sets, which every device has [default: auto, push where the device can]
     #[arg(long, value_name = "HOW", default_value = "auto", hide_default_value = true, hide_possible_values = true)]
     pub descriptors: Descriptors,
@@ -50,6 +53,7 @@ impl DeviceArgs {
             descriptors: self.descriptors,
             cache: self.cache(),
             form: self.form,
+            subgroup_size: self.subgroup,
             ..Options::default()
         }
     }

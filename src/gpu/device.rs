@@ -15,7 +15,7 @@ use super::descriptors::Descriptors;
 use super::error::{Error, Named};
 use super::form::Form;
 use super::instance::{Instance, has};
-use super::kernel::Interface;
+use super::kernel::{self, Interface};
 use super::ledger::{Ledger, Rehearsal};
 use super::physical::{self, DeviceInfo, Found};
 use super::spares::{self, Spares};
@@ -130,6 +130,7 @@ pub(super) struct Inner {
     physical: vk::PhysicalDevice,
     memory_budget: bool,
     require_subgroups: bool,
+    keeps_nan: bool,
     // Fields are dropped in this order: the device before its instance.
     pub device: Device,
     instance: Instance,
@@ -170,6 +171,7 @@ impl Gpu {
         let missing = |feature| Error::Missing { device: found.info.name.clone(), feature };
         if let Some(size) = options.subgroup_size {
             info.subgroup_size = found.subgroups.wanted(size).map_err(missing)?;
+            info.narrow_subgroup_size = info.subgroup_size;
         }
         if let Some(limit) = options.max_binding_bytes {
             info.max_binding_bytes = info.max_binding_bytes.min(limit);
@@ -221,6 +223,7 @@ impl Gpu {
             debug: instance.debug_utils.then(|| ash::ext::debug_utils::Device::new(&instance.raw, &device)),
             queue: Mutex::new(queue),
             require_subgroups: found.subgroups.chosen,
+            keeps_nan: found.keeps_nan,
             memory_budget: has(&found.extensions, ash::ext::memory_budget::NAME),
             physical: found.raw,
             info,
@@ -581,6 +584,11 @@ impl Inner {
         Ok(())
     }
 
+    /// Threads of this kernel's subgroups.
+    pub fn subgroup_size(&self, kernel: &Interface) -> u32 {
+        if kernel.narrow { self.info.narrow_subgroup_size } else { self.info.subgroup_size }
+    }
+
     fn make(&self, pipeline: &Pipeline) -> Result<Made, vk::Result> {
         let Pipeline { kernel, constants, layout, .. } = pipeline;
         let entries: Vec<_> = kernel
@@ -590,9 +598,13 @@ impl Inner {
             .map(|(i, &(id, _))| vk::SpecializationMapEntry { constant_id: id, offset: 4 * i as u32, size: 4 })
             .collect();
         let specialization = vk::SpecializationInfo::default().map_entries(&entries).data(constants);
-        let words = ash::util::read_spv(&mut std::io::Cursor::new(kernel.spirv)).expect("build.rs wrote whole words");
+        let mut words =
+            ash::util::read_spv(&mut std::io::Cursor::new(kernel.spirv)).expect("build.rs wrote whole words");
         // From SPIR-V 1.6 on a subgroup's size may vary from the driver's own without being allowed to.
         assert!(words[1] < 0x1_0600, "{}: a kernel knows its subgroups' size", kernel.name);
+        if self.keeps_nan {
+            kernel::keep_nan(&mut words);
+        }
         // SAFETY: the SPIR-V comes from shaderc and the layout, the push constants' size and the constants' ids from its
         // reflection, so that they agree; `constants` has 4 bytes for each id. The module goes after the pipeline is made, and
         // what was made before a failure the caller destroys.
@@ -600,7 +612,7 @@ impl Inner {
             let module_info = vk::ShaderModuleCreateInfo::default().code(&words);
             let module = self.device.create_shader_module(&module_info, None)?;
             let mut size = vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default()
-                .required_subgroup_size(self.info.subgroup_size);
+                .required_subgroup_size(self.subgroup_size(kernel));
             let mut stage = vk::PipelineShaderStageCreateInfo::default()
                 .stage(vk::ShaderStageFlags::COMPUTE)
                 .module(module)
@@ -608,9 +620,9 @@ impl Inner {
                 .specialization_info(&specialization);
             if kernel.subgroups {
                 stage = stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS);
-                if self.require_subgroups {
-                    stage = stage.push_next(&mut size);
-                }
+            }
+            if self.require_subgroups && (kernel.subgroups || kernel.narrow) {
+                stage = stage.push_next(&mut size);
             }
             let mut create = vk::ComputePipelineCreateInfo::default().layout(*layout).stage(stage);
             if self.executables.is_some() {

@@ -67,6 +67,9 @@ pub struct Interface {
     pub group: [u32; 3],
     /// True when it uses subgroup operations: the subgroup size is then pinned and subgroups are full.
     pub subgroups: bool,
+    /// Its subgroups are the least that the device has ([`DeviceInfo::narrow_subgroup_size`](super::DeviceInfo)): what they
+    /// pass over together, or the registers that they hold, is worth more than fewer of them.
+    pub narrow: bool,
     /// Its storage buffers, by binding number.
     pub bindings: &'static [Binding],
     /// Its specialisation constants: id, and place in the kernel's `Constants`.
@@ -96,6 +99,48 @@ impl Interface {
     pub(super) fn collect<T>(&self, mut all: Vec<Option<T>>) -> Vec<T> {
         self.bindings.iter().map(|b| bound(all[b.at].take(), b.name)).collect()
     }
+}
+
+/// Declares that a module's arithmetic keeps zeros' signs, infinities and what is not a number: without it a compiler may
+/// assume that there are none, and drop every comparison that looks for them. (SPV_KHR_float_controls; for devices with
+/// `shaderSignedZeroInfNanPreserveFloat32`.)
+pub(super) fn keep_nan(module: &mut Vec<u32>) {
+    const HEADER: usize = 5;
+    const EXTENSION: u32 = 10;
+    const ENTRY_POINT: u32 = 15;
+    const EXECUTION_MODE: u32 = 16;
+    const CAPABILITY: u32 = 17;
+    const SIGNED_ZERO_INF_NAN_PRESERVE: [u32; 2] = [4466, 4461]; // the capability and the mode
+    let mut kept = module[..HEADER].to_vec();
+    let mut extension = Some(&b"SPV_KHR_float_controls\0\0"[..]);
+    let mut rest = &module[HEADER..];
+    let mut entry = None;
+    while let [first, ..] = *rest {
+        let (instruction, behind) = rest.split_at((first >> 16) as usize);
+        let op = first & 0xffff;
+        // Capabilities come first, then extensions; modes follow the entry points.
+        if op != CAPABILITY
+            && let Some(name) = extension.take()
+        {
+            kept.extend([
+                2 << 16 | CAPABILITY,
+                SIGNED_ZERO_INF_NAN_PRESERVE[0],
+                (1 + name.len() as u32 / 4) << 16 | EXTENSION,
+            ]);
+            kept.extend(name.as_chunks().0.iter().map(|&four| u32::from_le_bytes(four)));
+        }
+        if op != ENTRY_POINT
+            && let Some(id) = entry.take()
+        {
+            kept.extend([4 << 16 | EXECUTION_MODE, id, SIGNED_ZERO_INF_NAN_PRESERVE[1], 32]);
+        }
+        if op == ENTRY_POINT {
+            entry = Some(instruction[2]);
+        }
+        kept.extend(instruction);
+        rest = behind;
+    }
+    *module = kept;
 }
 
 /// A kernel's twin without its types.
@@ -218,5 +263,34 @@ pub trait Reference: Kernel {
     /// remainder. Elsewhere zeros are compared with the twin's.
     fn cancels(_binding: &'static str) -> bool {
         false
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Kernel as _, keep_nan};
+    use crate::gpu::kernels;
+
+    /// Nothing else of a module changes.
+    #[test]
+    fn a_module_declares_that_it_keeps_what_is_not_a_number() {
+        let spirv = kernels::primitives::finite::Kernel::VARIANTS[0].spirv;
+        let mut words: Vec<u32> = bytemuck::pod_collect_to_vec(spirv);
+        keep_nan(&mut words);
+        let before = rspirv::dr::load_bytes(spirv).expect("build.rs wrote it");
+        let mut after = rspirv::dr::load_words(words).expect("whole instructions in their order");
+        let entry = &before.entry_points[0].operands[1];
+        let mode = after.execution_modes.iter().position(|mode| {
+            format!("{:?}", mode.operands[1]).contains("SignedZeroInfNanPreserve") && mode.operands[0] == *entry
+        });
+        let mode = after.execution_modes.remove(mode.expect("the mode"));
+        assert_eq!(mode.operands[2], rspirv::dr::Operand::LiteralBit32(32));
+        assert_eq!(
+            (after.capabilities.len(), after.extensions.len()),
+            (before.capabilities.len() + 1, before.extensions.len() + 1)
+        );
+        after.capabilities.clone_from(&before.capabilities);
+        after.extensions.clone_from(&before.extensions);
+        assert_eq!(format!("{after:?}"), format!("{before:?}"));
     }
 }

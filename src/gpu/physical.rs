@@ -31,6 +31,8 @@ pub struct DeviceInfo {
     pub api: String,
     /// Threads of a subgroup, as kernels run.
     pub subgroup_size: u32,
+    /// Threads of a subgroup of kernels that ask for the least: 32 on RDNA, 8 or 16 on Xe, elsewhere mostly the same.
+    pub narrow_subgroup_size: u32,
     /// The buffers of a pass can be pushed. Otherwise they are bound as descriptor sets.
     pub push_descriptors: bool,
     /// Bytes one storage binding holds: the range of a binding, the size of a buffer or of an allocation, the least.
@@ -52,6 +54,8 @@ pub(super) struct Found {
     pub raw: vk::PhysicalDevice,
     pub info: DeviceInfo,
     pub subgroups: Subgroups,
+    /// Kernels can declare that they tell what is not a number from a number.
+    pub keeps_nan: bool,
     /// The family whose queue is taken; a device that lacks nothing has one.
     pub family: Option<u32>,
     pub identity: Identity,
@@ -84,12 +88,23 @@ impl Subgroups {
     /// allow a varying size, their modules are older than SPIR-V 1.6, and their subgroups are asked to be full. MoltenVK on
     /// Apple's GPUs is such a driver, with 32 of 4 to 32.
     fn usual(self) -> Option<u32> {
-        let fits = |size: &u32| (LEAST_SUBGROUP..=MOST_SUBGROUP_THREADS).contains(size) && size.is_power_of_two();
-        if !self.chosen {
-            return Some(self.own).filter(fits);
-        }
-        let sizes = (0..32).map(|bit| 1 << bit).filter(|size| (self.least..=self.most).contains(size));
-        Some(self.own).into_iter().chain(sizes).filter(fits).min_by_key(|size| size.abs_diff(self.own))
+        self.sizes().min_by_key(|size| (size.abs_diff(self.own), *size != self.own))
+    }
+
+    /// The sizes that kernels can have.
+    fn sizes(self) -> impl Iterator<Item = u32> {
+        let (least, most) = if self.chosen { (self.least, self.most) } else { (self.own, self.own) };
+        let sizes = (0..32).map(|bit| 1 << bit).filter(move |size| (least..=most).contains(size));
+        let own = Some(self.own).filter(|size| size.is_power_of_two());
+        let fits = |size: &u32| (LEAST_SUBGROUP..=MOST_SUBGROUP_THREADS).contains(size);
+        own.into_iter().chain(sizes).filter(fits)
+    }
+
+    /// The least size that kernels can have, which is as wide as the device's units are, if a workgroup may have `room` of
+    /// them or fewer.
+    fn narrow(self, room: u32) -> Option<u32> {
+        let usual = self.usual();
+        self.sizes().filter(|size| Some(*size) == usual || MOST_FULL_THREADS.div_ceil(*size) <= room).min()
     }
 
     /// This size, in the place of the usual one.
@@ -233,6 +248,7 @@ impl Facts {
             raw,
             info,
             subgroups: self.subgroups(),
+            keeps_nan: self.v12.shader_signed_zero_inf_nan_preserve_float32 != 0,
             family: self.family(),
             identity: Identity {
                 vendor: self.core.vendor_id,
@@ -284,8 +300,13 @@ impl Facts {
         }
     }
 
+    /// Most subgroups of a workgroup: a limit for sizes that are asked for.
+    fn most_subgroups(&self) -> u32 {
+        if self.subgroups().chosen { self.v13.max_compute_workgroup_subgroups } else { u32::MAX }
+    }
+
     fn lacks(&self) -> Vec<String> {
-        let Self { core, v11, v13, f12, f13, .. } = self;
+        let Self { core, v11, f12, f13, .. } = self;
         let limits = &core.limits;
         let mut lacks = vec![];
         let mut need = |ok: bool, what: &str| {
@@ -316,8 +337,7 @@ impl Facts {
         let size = subgroups.usual();
         let wanted = format!("subgroups of one known size of {LEAST_SUBGROUP} to {MOST_SUBGROUP_THREADS} threads");
         need(size.is_some(), &wanted);
-        // A limit for sizes that are asked for.
-        let most = if subgroups.chosen { v13.max_compute_workgroup_subgroups } else { u32::MAX };
+        let most = self.most_subgroups();
         let full = size.map_or(0, |size| MOST_FULL_THREADS.div_ceil(size));
         need(most >= full, &format!("workgroups of {full} subgroups"));
         let buffers = limits.max_per_stage_descriptor_storage_buffers.min(limits.max_descriptor_set_storage_buffers);
@@ -361,6 +381,7 @@ impl Facts {
                 vk::api_version_patch(version)
             ),
             subgroup_size: self.subgroups().usual().unwrap_or(v11.subgroup_size),
+            narrow_subgroup_size: self.subgroups().narrow(self.most_subgroups()).unwrap_or(v11.subgroup_size),
             push_descriptors: self.pushed >= MOST_BUFFERS,
             max_binding_bytes: limits.into_iter().filter(|&bytes| bytes > 0).min().unwrap_or(0),
             heap_bytes: self.heap_bytes(),

@@ -273,7 +273,7 @@ impl<'g> Recorder<'g> {
             _ => self.workgroups(kernel, threads),
         };
         if !workgroups.contains(&0) {
-            let (size, before) = (self.gpu.info().subgroup_size, self.download(slots)?);
+            let (size, before) = (self.gpu.inner().subgroup_size(kernel), self.download(slots)?);
             let case = Case::new(kernel, (constants, push), workgroups, size, before, twin);
             lock(&self.gpu.inner().cases).push(case);
         }

@@ -33,8 +33,8 @@ struct Row {
     heaps: Vec<(u64, bool)>,
     /// Properties and heap.
     types: Vec<(vk::MemoryPropertyFlags, u32)>,
-    /// Threads of a subgroup, queue family; or the end of the first thing it lacks.
-    becomes: Result<(u32, u32), &'static str>,
+    /// Threads of a subgroup and of a narrow one, queue family; or the end of the first thing it lacks.
+    becomes: Result<(u32, u32, u32), &'static str>,
 }
 
 impl Row {
@@ -95,7 +95,7 @@ fn nvidia(name: &'static str, gib: u64) -> Row {
             (HOST | CACHED, 1),
             (LOCAL | HOST, 2),
         ],
-        becomes: Ok((32, 2)),
+        becomes: Ok((32, 32, 2)),
     }
 }
 
@@ -110,7 +110,7 @@ fn radv(name: &'static str, gib: u64, wave32: bool) -> Row {
         families: vec![DRAW | COMPUTE | COPY, COMPUTE | COPY, COPY],
         heaps: vec![(32 * GIB, false), (gib * GIB, true)],
         types: vec![(LOCAL, 1), (HOST, 0), (LOCAL | HOST, 1), (HOST | CACHED, 0)],
-        becomes: Ok((64, 1)),
+        becomes: Ok((64, if wave32 { 32 } else { 64 }, 1)),
     }
 }
 
@@ -132,7 +132,7 @@ fn anv(name: &'static str, least: u32, own_gib: Option<u64>) -> Row {
         heaps: own_gib
             .map_or(vec![(12 * GIB, true)], |gib| vec![(gib * GIB, true), (16 * GIB, false), (GIB / 4, true)]),
         types: if own_gib.is_some() { split } else { shared },
-        becomes: Ok((32, u32::from(own_gib.is_some()))),
+        becomes: Ok((32, least, u32::from(own_gib.is_some()))),
     }
 }
 
@@ -147,7 +147,7 @@ fn small(name: &'static str, subgroup: (u32, u32, u32, bool), subgroups: u32, li
         families: vec![DRAW | COMPUTE | COPY],
         heaps: vec![(6 * GIB, true)],
         types: vec![(LOCAL, 0), (LOCAL | HOST, 0), (LOCAL | HOST | CACHED, 0)],
-        becomes: Ok((subgroup.0, 0)),
+        becomes: Ok((subgroup.0, if subgroup.3 { subgroup.1 } else { subgroup.0 }, 0)),
     }
 }
 
@@ -183,7 +183,7 @@ fn rows() -> Vec<Row> {
         small("Apple M2 (Honeykrisp)", (32, 32, 32, true), 32, (1 << 20, 32 << 10, 1024)),
         // `tu_device.cc`: threadsize_base 64 and its double, at most 16 waves; the double is its own.
         Row {
-            becomes: Ok((64, 0)),
+            becomes: Ok((64, 64, 0)),
             ..small("Adreno 740 (Turnip)", (128, 64, 128, true), 16, (1 << 20, 32 << 10, 1024))
         },
         // Unsure: threads of a workgroup, of which older Malis have 512 or 384.
@@ -217,9 +217,10 @@ fn known_devices_become_what_they_are_worth() {
         let found = row.facts().found(vk::PhysicalDevice::null(), Ok(vec![]));
         let info = &found.info;
         match row.becomes {
-            Ok((subgroup, family)) => {
+            Ok((subgroup, narrow, family)) => {
                 assert_eq!(info.lacks, [""; 0], "{name}");
-                assert_eq!((info.subgroup_size, found.family), (subgroup, Some(family)), "{name}");
+                let sizes = (info.subgroup_size, info.narrow_subgroup_size);
+                assert_eq!((sizes, found.family), ((subgroup, narrow), Some(family)), "{name}");
                 assert_eq!(found.subgroups.wanted(subgroup), Ok(subgroup), "{name}: its own size can be named");
             }
             Err(lack) => {

@@ -427,6 +427,7 @@ mod tests {
             driver: "driver 1.2".into(),
             api: "1.3.200".into(),
             subgroup_size: 32,
+            narrow_subgroup_size: 32,
             push_descriptors: true,
             max_binding_bytes: 1 << 30,
             heap_bytes: 1 << 33,

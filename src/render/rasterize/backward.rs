@@ -170,7 +170,7 @@ pub struct Backward {
 
 /// Subgroups of a wide tile's workgroup: its shared memory has room for the sums of each.
 pub(super) fn subgroups(gpu: &Gpu) -> u32 {
-    (Tiling::Wide.threads_backward() / gpu.info().subgroup_size).max(1)
+    (Tiling::Wide.threads_backward() / gpu.info().narrow_subgroup_size).max(1)
 }
 
 impl Backward {
