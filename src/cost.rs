@@ -7,8 +7,11 @@ use crate::gpu::Access;
 /// The step's numbers; means over its views where there are several.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Counts {
-    /// Anchors.
+    /// Anchors, or plain Gaussians.
     pub anchors: f64,
+    /// Coefficients of a plain Gaussian's harmonics for each colour; 0 of anchors.
+    #[serde(default)]
+    pub harmonics: f64,
     /// Gaussians per anchor.
     pub offsets: f64,
     /// Anchors in view.
@@ -45,9 +48,10 @@ pub struct Counts {
 }
 
 impl Counts {
-    fn fields(&mut self) -> [&mut f64; 16] {
+    fn fields(&mut self) -> [&mut f64; 17] {
         let Self {
             anchors,
+            harmonics,
             offsets,
             visible,
             gaussians,
@@ -66,6 +70,7 @@ impl Counts {
         } = self;
         [
             anchors,
+            harmonics,
             offsets,
             visible,
             gaussians,

@@ -20,18 +20,17 @@ fn bench(folder: &Path, arguments: &str) -> Output {
         .env("XDG_CACHE_HOME", folder.join("cache"))
         .env("MESA_SHADER_CACHE_DIR", env!("CARGO_TARGET_TMPDIR"))
         .env_remove("RUST_LOG");
-    let arguments = arguments.split_whitespace();
-    command.arg("bench").args(arguments).args(FEW.split_whitespace()).output().expect("the program starts")
+    command.arg("bench").args(arguments.split_whitespace()).output().expect("the program starts")
 }
 
 fn succeeds(folder: &Path, arguments: &str) -> String {
-    let output = bench(folder, arguments);
+    let output = bench(folder, &format!("{arguments} {FEW}"));
     assert!(output.status.success(), "{arguments}: {}", String::from_utf8_lossy(&output.stderr));
     String::from_utf8(output.stdout).expect("UTF-8")
 }
 
 fn fails(folder: &Path, arguments: &str) -> String {
-    let output = bench(folder, arguments);
+    let output = bench(folder, &format!("{arguments} {FEW}"));
     assert!(!output.status.success() && output.stdout.is_empty(), "{arguments} went well");
     let stderr = String::from_utf8(output.stderr).expect("UTF-8");
     stderr.lines().find(|line| line.starts_with("error: ")).expect("an error in one line").to_owned()
@@ -44,6 +43,31 @@ fn json(path: &Path) -> Value {
 
 fn number(value: &Value) -> f64 {
     value.as_f64().unwrap_or_else(|| panic!("{value} is no number"))
+}
+
+/// Plain Gaussians, the first steps of which see smaller pictures than the measured one.
+#[test]
+fn a_step_of_plain_gaussians_is_measured() {
+    let scene = common::folder();
+    let folder = scene.path();
+    let few = "--preset gaussians --set train.coarse.until=3 --iterations 20";
+    let output =
+        bench(folder, &format!("scene {few} --warm-up 5 --views 2 --repetitions 1 --predict published --out it"));
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let record = json(&folder.join("it/bench.json"));
+    let passes = record["step"]["passes"].as_array().expect("passes");
+    for pass in passes {
+        assert!(pass["work"].is_object(), "{} has no formula in src/lab/bench/cost.rs", pass["pass"]);
+    }
+    let has = |name: &str| passes.iter().any(|pass| pass["pass"] == name);
+    for name in ["render/activate", "render/activate_backward", "optimizer/adam", "primitives/sort_scatter"] {
+        assert!(has(name), "{name} is missing");
+    }
+    let count = |name: &str| number(&record["step"]["counts"][name]);
+    assert_eq!((count("pixels"), count("offsets"), count("harmonics")), (48.0 * 36.0, 1.0, 4.0));
+    assert!(count("gaussians") <= count("anchors") && count("drawn") <= count("gaussians") && count("drawn") > 0.0);
+    let predicted = record["predictions"].as_array().expect("predictions");
+    assert!(predicted.len() >= 3);
 }
 
 #[test]

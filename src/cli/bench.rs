@@ -8,7 +8,7 @@ use super::folders::last_part;
 use super::hole::{self, HoleArgs};
 use super::next;
 use super::next::command_line;
-use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, only_anchors, with_gpu};
+use super::shared::{DeviceArgs, MeasureArgs, SceneArgs, with_gpu};
 use crate::config::SettingsArgs;
 use crate::gpu::Options;
 use crate::lab::bench::ceilings::Prober;
@@ -85,7 +85,6 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let Some(scene) = args.scene.clone() else { bail!("SCENE: name the scene to measure a step of") };
     let args_of_scene = SceneArgs { scene, settings: args.settings.clone() };
     let settings = args_of_scene.resolve()?;
-    only_anchors(&settings, "bench")?;
     let loaded = Loaded::read(&args_of_scene.scene, settings.clone())?;
     let facts = SceneFacts::new(last_part(&args_of_scene.name()), &loaded.scene);
     let json = serde_json::to_value(&settings).context("the settings as JSON")?;

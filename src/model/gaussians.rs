@@ -133,6 +133,11 @@ fn scale_higher(harmonics: &mut [[f32; 3]], each: usize, by: f64) {
 pub(crate) const NAMES: [Names; 5] =
     [names!("position"), names!("log_scale"), names!("quaternion"), names!("logit"), names!("harmonics")];
 
+/// Floats per Gaussian of each, for so many coefficients per colour.
+pub(crate) const fn widths(coefficients: u32) -> [u32; 5] {
+    [3, 3, 4, 1, 3 * coefficients]
+}
+
 /// The learnt arrays of static Gaussians, with Adam's moments.
 #[derive(Debug)]
 pub struct Static {
@@ -177,8 +182,9 @@ impl Static {
         let count = cloud.len() as u32;
         let each = coefficients(cloud.degree);
         let capacity = capacity.min(Self::most(gpu, cloud.degree)).max(count).max(1);
-        let parameter = |group, names, width, data: &[f32]| {
-            Ok::<_, Error>(Parameter::upload(gpu, names, width, capacity, data)?.in_group(group))
+        let parameter = |group, which: usize, data: &[f32]| {
+            let width = widths(each as u32)[which];
+            Ok::<_, Error>(Parameter::upload(gpu, NAMES[which], width, capacity, data)?.in_group(group))
         };
         let mut harmonics = cloud.harmonics.clone();
         scale_higher(&mut harmonics, each, 1.0 / f64::from(higher));
@@ -186,11 +192,11 @@ impl Static {
             count,
             capacity,
             degree: cloud.degree,
-            position: parameter(Group::Position, NAMES[0], 3, cloud.position.as_flattened())?,
-            log_scale: parameter(Group::LogScale, NAMES[1], 3, cloud.log_scale.as_flattened())?,
-            quaternion: parameter(Group::Quaternion, NAMES[2], 4, cloud.rotation.as_flattened())?,
-            logit: parameter(Group::Opacity, NAMES[3], 1, &cloud.logit)?,
-            harmonics: parameter(Group::Harmonics, NAMES[4], 3 * each as u32, harmonics.as_flattened())?,
+            position: parameter(Group::Position, 0, cloud.position.as_flattened())?,
+            log_scale: parameter(Group::LogScale, 1, cloud.log_scale.as_flattened())?,
+            quaternion: parameter(Group::Quaternion, 2, cloud.rotation.as_flattened())?,
+            logit: parameter(Group::Opacity, 3, &cloud.logit)?,
+            harmonics: parameter(Group::Harmonics, 4, harmonics.as_flattened())?,
             higher,
             antialiased: cloud.antialiased,
         })

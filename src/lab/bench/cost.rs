@@ -17,6 +17,7 @@ use crate::gpu::form::without_form;
 use crate::math::attention::WEIGHTS as ATTENTION_WEIGHTS;
 use crate::math::decoder::Layout;
 use crate::model::arrays::ARRAYS;
+use crate::model::gaussians::{NAMES, widths};
 use crate::model::parameter::{PROJECTIONS, WEIGHTS};
 
 impl Dispatch<'_> {
@@ -39,6 +40,8 @@ impl Dispatch<'_> {
 fn learnt(c: &Counts, name: &str) -> f64 {
     if let Some(array) = ARRAYS.iter().find(|array| array.names.contain(name)) {
         f64::from((array.width)(c.offsets as u32)) * c.anchors
+    } else if let Some(at) = NAMES.iter().position(|names| names.contain(name)) {
+        f64::from(widths(c.harmonics as u32)[at]) * c.anchors
     } else if WEIGHTS.contain(name) {
         c.weights()
     } else if PROJECTIONS.contain(name) {
@@ -224,6 +227,24 @@ pub const TABLE: &[Formula] = &[
             let g = c.gaussians;
             work(c.second_bytes() + 256.0 * c.visible + 112.0 * g, (10.0 * 32.0 + 38.0) * g, 12.0 * g)
         },
+    },
+    Formula {
+        pass: "render/activate",
+        variants: &[],
+        derivation: "per Gaussian position 12, log-scales 12, rotation 16, logit 4, harmonics 12 a coefficient, and position, scale, \
+                     rotation, opacity, colour 56 B; 37 operations (position 6, direction 11, rotation 13, opacity 2, colour 5), 9 for each \
+                     coefficient (harmonic 3, products 6), 4 exponentials",
+        work: |c, _| {
+            work((100.0 + 12.0 * c.harmonics) * c.anchors, (37.0 + 9.0 * c.harmonics) * c.anchors, 4.0 * c.anchors)
+        },
+    },
+    Formula {
+        pass: "render/activate_backward",
+        variants: &[],
+        derivation: "per Gaussian drawn its place in the list 4, position 12, scale 12, rotation 16, opacity 4, colour 12, their gradients \
+                     56, those of what is learnt 44 and 12 a coefficient; 55 operations (scale 3, rotation 28, opacity 3, colour 10, \
+                     direction 11), 6 for each coefficient",
+        work: |c, _| work((160.0 + 12.0 * c.harmonics) * c.drawn, (55.0 + 6.0 * c.harmonics) * c.drawn, 0.0),
     },
     Formula {
         pass: "render/widen",

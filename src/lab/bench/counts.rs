@@ -30,8 +30,10 @@ pub const WANTED: [&str; 12] = [
 /// What does not come from the device.
 #[derive(Clone, Copy, Debug)]
 pub struct Known {
-    /// Anchors.
+    /// Anchors, or plain Gaussians.
     pub anchors: u32,
+    /// Coefficients of a plain Gaussian's harmonics for each colour; 0 of anchors.
+    pub harmonics: u32,
     /// Gaussians per anchor.
     pub offsets: u32,
     /// Width and height of the picture.
@@ -44,7 +46,8 @@ pub struct Known {
 pub fn count(words: &BTreeMap<&'static str, Vec<u32>>, schedule: &Schedule, method: Method, known: Known) -> Counts {
     let of = |name: &str| words.get(name).map_or(&[][..], Vec::as_slice);
     let first = |name: &str| of(name).first().copied().unwrap_or(0);
-    let visible = first("visible_count");
+    // Plain Gaussians are not culled before they are projected.
+    let visible = if known.harmonics > 0 { known.anchors } else { first("visible_count") };
     let slots = ((visible * known.offsets) as usize).min(of("depth").len());
     let gaussians = of("depth")[..slots].iter().filter(|bits| f32::from_bits(**bits) > 0.0).count();
     let tiling = method.tiling;
@@ -63,6 +66,7 @@ pub fn count(words: &BTreeMap<&'static str, Vec<u32>>, schedule: &Schedule, meth
     let walked = lists.walk(tiling, known.size, method);
     Counts {
         anchors: known.anchors.into(),
+        harmonics: known.harmonics.into(),
         offsets: known.offsets.into(),
         visible: visible.into(),
         gaussians: gaussians as f64,

@@ -159,7 +159,8 @@ impl<'a> Trained<'a> {
     ) -> Result<step::StepFigures, Error> {
         ensure_timestamps(gpu)?;
         let plan = Plan::new(self.scene, settings);
-        let photographs = Rc::new(photographs::upload(gpu, &self.subset, &plan, 1)?);
+        let reduction = settings.train.coarse.reduction(self.number);
+        let photographs = Rc::new(photographs::upload(gpu, &self.subset, &plan, reduction)?);
         let variant = Variant { name: String::new(), changes: vec![], settings: settings.clone() };
         let mut bench = Bench::new(gpu, self.scene, &variant, plan, photographs, &self.warm, self.number)?;
         say(&format!("bench: step {}, {repetitions} rounds", self.number));

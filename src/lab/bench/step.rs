@@ -12,6 +12,7 @@ use crate::gpu::{Entry, Gpu, Schedule, Timing};
 use crate::lab::report::Error;
 use crate::lab::report::kernels::{Bench, Clocked};
 use crate::lab::statistics::Spread;
+use crate::model::gaussians::NAMES;
 use crate::render::Method;
 
 /// What holds a pass back at least.
@@ -174,9 +175,12 @@ impl Round {
 fn trace(gpu: &Gpu, bench: &mut Bench, settings: &Settings, view: usize) -> Result<(Counts, Schedule), Error> {
     let schedule = bench.clock(gpu, view)?.schedule;
     let words = bench.trace(gpu, view, &counts::WANTED)?;
+    let learnt = &bench.step.learnt;
+    let harmonics = learnt.rows().into_iter().find(|row| row.names.value == NAMES[4].value);
     let known = Known {
-        anchors: bench.step.anchors().count,
-        offsets: bench.step.anchors().offsets,
+        anchors: learnt.count(),
+        harmonics: harmonics.map_or(0, |row| row.width / 3),
+        offsets: learnt.offsets(),
         size: bench.size(view),
         gradient_scales: settings.losses.depth.gradient.scales,
     };

@@ -9,10 +9,8 @@ use super::step::{Bound, HostFigures, PassFigures, StepFigures, floor};
 use super::{Device, Record};
 use crate::lab::statistics::Spread;
 
-/// Kernels that are no part of a step of anchors: growing and pruning, what comes before training or after it, those of plain
-/// Gaussians, which `bench` refuses, and what measures.
-const NO_STEP: [&str; 6] =
-    ["densify/grow", "densify/prune", "densify/split", "multiview/", "render/activate", "lab/bench/"];
+/// Kernels that are no part of a step: growing and pruning, what comes before training or after it, and what measures.
+const NO_STEP: [&str; 5] = ["densify/grow", "densify/prune", "densify/split", "multiview/", "lab/bench/"];
 
 /// Every kernel with its variants, from the sources.
 fn kernels() -> BTreeSet<String> {

@@ -41,12 +41,15 @@ pub fn step(figures: &StepFigures) -> String {
     line(
         &mut text,
         format_args!(
-            "step {} on {} view(s), means: {:.0} anchors, {:.0} in view, {:.0} Gaussians, {:.0} drawn, {:.0} pairs ({:.0} before \
-             their tile ends), {:.0} pixels, {} samples of which {:.0} % blended, {:.0} tokens a side",
+            "step {} on {} view(s), means: {}{:.0} Gaussians, {:.0} drawn, {:.0} pairs ({:.0} before their tile ends), {:.0} \
+             pixels, {} samples of which {:.0} % blended, {:.0} tokens a side",
             figures.step,
             figures.views.len(),
-            c.anchors,
-            c.visible,
+            if c.harmonics > 0.0 {
+                format!("{:.0}, of which ", c.anchors)
+            } else {
+                format!("{:.0} anchors, {:.0} in view, ", c.anchors, c.visible)
+            },
             c.gaussians,
             c.drawn,
             c.pairs,

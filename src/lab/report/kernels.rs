@@ -330,15 +330,17 @@ impl Warm {
             run.change_anchors(step)?;
         }
         let step = run.step();
-        let (anchors, mut weights) = step.model()?;
-        if !weights.has_attention() {
+        let mut model = step.stored()?;
+        if let Stored::Anchors(_, weights) = &mut model
+            && !weights.has_attention()
+        {
             // A choice may have it where the settings leave it out.
             let fresh =
                 init::weights(settings.train.seed, settings.model.offsets as usize, true, settings.model.opacity);
             fresh.tensors.into_iter().for_each(|(name, tensor)| _ = weights.tensors.entry(name).or_insert(tensor));
         }
         // The grid's side matters to growing alone, which is not measured.
-        let from = Beginning { model: Stored::Anchors(anchors, weights), voxel: 1.0, rows: 0 };
+        let from = Beginning { model, voxel: 1.0, rows: 0 };
         let mut tensors = vec![];
         let mut values = BTreeMap::new();
         for parameter in step.learnt.rows().into_iter().chain(step.learnt.weights()) {
@@ -366,12 +368,16 @@ impl Bench {
         gpu: &Gpu,
         scene: &Scene,
         variant: &Variant,
-        plan: Plan,
+        mut plan: Plan,
         photographs: Rc<Vec<Photograph>>,
         warm: &Warm,
         number: u32,
     ) -> Result<Self, Error> {
         let settings = &variant.settings;
+        // Those of the photographs, whatever the run's first steps have.
+        plan.sizes = photographs.iter().map(|photograph| photograph.camera.size).collect();
+        plan.sizes.sort_unstable();
+        plan.sizes.dedup();
         let mut step = Step::new(gpu, plan, settings, &warm.from)?;
         step.resize(warm.capacity)?;
         step.prepare(number)?;
