@@ -50,16 +50,17 @@ pub struct Peak {
     pub dispatch: f64,
     /// Microseconds of a barrier.
     pub barrier: f64,
-    /// Share of these rates that a kernel reaches, above 0 and up to 1.
-    pub reached: f64,
+    /// Share of these rates that kernels reach, at least and at most, above 0 and up to 1.
+    pub reached: [f64; 2],
 }
 
 impl Peak {
-    fn rates(&self) -> Rates {
+    /// Where kernels reach this share of the peaks.
+    fn rates(&self, reached: f64) -> Rates {
         Rates {
-            bandwidth: self.reached * self.bandwidth,
-            operations: self.reached * self.multiply_adds,
-            exponentials: self.reached * self.exponentials,
+            bandwidth: reached * self.bandwidth,
+            operations: reached * self.multiply_adds,
+            exponentials: reached * self.exponentials,
             dispatch: 1e-3 * self.dispatch,
         }
     }
@@ -74,8 +75,9 @@ impl Peak {
         if let Some((key, value)) = times.into_iter().find(|(_, v)| !(v.is_finite() && **v >= 0.0)) {
             return Err(format!("{name}: {key} = {value} must be 0 or more"));
         }
-        if !(*reached > 0.0 && *reached <= 1.0) {
-            return Err(format!("{name}: reached = {reached} must be above 0 and at most 1"));
+        let [least, most] = *reached;
+        if !(least > 0.0 && least <= most && most <= 1.0) {
+            return Err(format!("{name}: reached = [{least}, {most}] must be above 0, at most 1 and in order"));
         }
         Ok(())
     }
@@ -111,36 +113,37 @@ pub fn read(path: &Path) -> Result<Vec<Peak>, Error> {
 pub struct Prediction {
     /// What it is predicted from.
     pub peak: Peak,
-    /// Each pass with a formula, in the record's order: milliseconds per step, and what they go by.
+    /// Each pass with a formula, in the record's order: milliseconds per step at least, and what they go by.
     pub passes: Vec<(String, f64, Bound)>,
     /// Passes without a formula, of which nothing is known.
     pub unknown: Vec<String>,
     /// Milliseconds of the barriers of a step.
     pub barriers: f64,
-    /// Milliseconds of a step.
-    pub step: f64,
+    /// Milliseconds of a step, at least and at most.
+    pub step: [f64; 2],
     /// Steps of the training that is meant.
     pub steps: u32,
-    /// Minutes of so many steps like this one.
-    pub minutes: f64,
+    /// Minutes of so many steps like this one, at least and at most.
+    pub minutes: [f64; 2],
 }
 
 /// Predicts a training of `steps` steps that are all like the one measured.
 pub fn predict(figures: &StepFigures, steps: u32, peak: &Peak) -> Prediction {
-    let rates = peak.rates();
-    let (mut passes, mut unknown) = (vec![], vec![]);
+    let [least, most] = peak.reached.map(|reached| peak.rates(reached));
+    let barriers = 1e-3 * peak.barrier * figures.barriers;
+    let (mut passes, mut unknown, mut step) = (vec![], vec![], [barriers; 2]);
     for pass in &figures.passes {
         match &pass.work {
             Some(work) => {
-                let (milliseconds, bound) = floor(work, pass.dispatches, &rates);
+                let (milliseconds, bound) = floor(work, pass.dispatches, &most);
+                step[0] += milliseconds;
+                step[1] += floor(work, pass.dispatches, &least).0;
                 passes.push((pass.pass.clone(), milliseconds, bound));
             }
             None => unknown.push(pass.pass.clone()),
         }
     }
-    let barriers = 1e-3 * peak.barrier * figures.barriers;
-    let step = passes.iter().map(|(_, ms, _)| ms).sum::<f64>() + barriers;
-    let minutes = step * f64::from(steps) / 60e3;
+    let minutes = step.map(|step| step * f64::from(steps) / 60e3);
     Prediction { peak: peak.clone(), passes, unknown, barriers, step, steps, minutes }
 }
 
@@ -148,31 +151,33 @@ pub fn predict(figures: &StepFigures, steps: u32, peak: &Peak) -> Prediction {
 pub fn text(predictions: &[Prediction]) -> String {
     const SHOWN: f64 = 0.02;
     let Some(first) = predictions.first() else { return String::new() };
-    let mut text =
-        String::from("predicted from published peaks, not measured; milliseconds per step and what they go by\n");
-    let mut row = |name: &str, cells: Vec<(f64, &str)>| {
+    let mut text = String::from(
+        "predicted from published peaks, not measured; milliseconds per step at least and what they go by\n",
+    );
+    let mut row = |name: &str, cells: Vec<(String, &str)>| {
         write!(text, "{name:<42}").expect("a string takes everything");
         for (value, by) in cells {
-            write!(text, " {:>12} {by:<10}", digits(value)).expect("a string takes everything");
+            write!(text, " {value:>12} {by:<10}").expect("a string takes everything");
         }
         text.truncate(text.trim_end().len());
         text.push('\n');
     };
     let shown: Vec<usize> =
-        (0..first.passes.len()).filter(|&i| predictions.iter().any(|p| p.passes[i].1 >= SHOWN * p.step)).collect();
+        (0..first.passes.len()).filter(|&i| predictions.iter().any(|p| p.passes[i].1 >= SHOWN * p.step[0])).collect();
     for &i in &shown {
-        row(&first.passes[i].0, predictions.iter().map(|p| (p.passes[i].1, p.passes[i].2.name())).collect());
+        row(&first.passes[i].0, predictions.iter().map(|p| (digits(p.passes[i].1), p.passes[i].2.name())).collect());
     }
     let rest = |p: &Prediction| {
         p.passes.iter().enumerate().filter(|(i, _)| !shown.contains(i)).map(|(_, pass)| pass.1).sum::<f64>()
     };
+    let range = |[least, most]: [f64; 2]| format!("{}..{}", digits(least), digits(most));
     let others = first.passes.len() - shown.len();
     if others > 0 {
-        row(&format!("{others} others"), predictions.iter().map(|p| (rest(p), "")).collect());
+        row(&format!("{others} others"), predictions.iter().map(|p| (digits(rest(p)), "")).collect());
     }
-    row("barriers", predictions.iter().map(|p| (p.barriers, "")).collect());
-    row("step", predictions.iter().map(|p| (p.step, "")).collect());
-    row(&format!("{} steps, minutes", first.steps), predictions.iter().map(|p| (p.minutes, "")).collect());
+    row("barriers", predictions.iter().map(|p| (digits(p.barriers), "")).collect());
+    row("step", predictions.iter().map(|p| (range(p.step), "")).collect());
+    row(&format!("{} steps, minutes", first.steps), predictions.iter().map(|p| (range(p.minutes), "")).collect());
     let mut heading = format!("{:<42}", "pass");
     for prediction in predictions {
         write!(heading, " {:>12} {:<10}", prediction.peak.name, "").expect("a string takes everything");
@@ -198,7 +203,7 @@ mod tests {
             exponentials: 1.0,
             dispatch: 100.0,
             barrier: 250.0,
-            reached: 0.5,
+            reached: [0.25, 0.5],
         }
     }
 
@@ -206,13 +211,14 @@ mod tests {
     fn a_step_is_the_sum_of_its_passes_and_barriers() {
         let record = super::super::tests::record();
         let prediction = predict(&record.step, 3000, &peak());
-        // 8 MB at 4 GB/s, 1 M operations at 0.5 G/s: 2 ms each, and 0.1 ms of a dispatch; two barriers of 0.25 ms.
+        // 8 MB at 4 GB/s, 1 M operations at 0.5 G/s: 2 ms each, or twice that, and 0.1 ms of a dispatch; two barriers of 0.25 ms.
         let close = |got: f64, want: f64| assert!((got - want).abs() < 1e-12 * want, "{got}, not {want}");
         assert_eq!(prediction.passes.len(), 2);
         prediction.passes.iter().for_each(|(_, ms, _)| close(*ms, 2.1));
         close(prediction.barriers, 0.5);
-        close(prediction.step, 4.7);
-        close(prediction.minutes, 4.7 * 3000.0 / 60e3);
+        close(prediction.step[0], 4.7);
+        close(prediction.step[1], 8.7);
+        close(prediction.minutes[1], 8.7 * 3000.0 / 60e3);
         assert_eq!(prediction.unknown, ["render/unheard_of"]);
         insta::assert_snapshot!(text(&[prediction.clone(), prediction]));
     }
@@ -220,7 +226,7 @@ mod tests {
     #[test]
     fn lists_of_peaks_are_read_or_refused() {
         let published = read(Path::new(PUBLISHED)).expect("our own");
-        assert_eq!(published.len(), 3);
+        assert_eq!(published.len(), 5);
         let folder = tempfile::tempdir().expect("a temporary folder");
         let path = folder.path().join("peaks.toml");
         let says = |text: &str| {
@@ -235,7 +241,9 @@ mod tests {
         refused(says(""), "missing field `gpu`");
         refused(with("bandwidth = 8.0", "bandwidth = 0"), "a device: bandwidth = 0 must be above 0");
         refused(with("barrier = 250.0", "barrier = nan"), "a device: barrier = NaN must be 0 or more");
-        refused(with("reached = 0.5", "reached = 1.5"), "a device: reached = 1.5 must be above 0 and at most 1");
+        let reached = |from: &str| with("reached = [0.25, 0.5]", from);
+        refused(reached("reached = [0.25, 1.5]"), "a device: reached = [0.25, 1.5] must be above 0, at most 1");
+        refused(reached("reached = [0.75, 0.5]"), "a device: reached = [0.75, 0.5] must be");
         refused(with("dispatch", "despatch"), "unknown field `despatch`");
         let missing = read(&folder.path().join("none.toml")).expect_err("no file").to_string();
         assert!(missing.contains("none.toml: cannot be read: ") && missing.contains("`published`"), "{missing}");
