@@ -313,17 +313,31 @@ fn found(picture: &RgbImage, marks: &[Mark], cues: &Cues<'_>) -> GrayImage {
         _ => mark.bounds(),
     };
     let joined = |a: [f64; 4], b: [f64; 4]| [a[0].min(b[0]), a[1].min(b[1]), a[2].max(b[2]), a[3].max(b[3])];
-    let first = match marks.iter().filter_map(of).reduce(joined) {
-        Some(bounds) => Window::around(std::array::from_fn(|k| bounds[k] * f64::from(full[k % 2])), 0.5, full),
-        None => Window::whole(picture),
-    };
+    let bounds = marks.iter().filter_map(of).reduce(joined);
+    let bounds = bounds.map(|bounds| std::array::from_fn(|k| bounds[k] * f64::from(full[k % 2])));
+    let first = bounds.map_or_else(|| Window::whole(picture), |bounds| Window::around(bounds, 0.5, full));
+    let boxed = marks.iter().all(|mark| mark.bounds().is_none() || matches!(mark, Mark::Box { .. }));
+    let fitted = cues.depth.filter(|_| outlined && boxed && cues.measured.is_some()).map(DepthMap::far);
+    let fitted = fitted.as_ref().map(|depth| Cues { depth: Some(depth), ..*cues });
     let cues = &Cues { depth: cues.measured.filter(|_| outlined).or(cues.depth), ..*cues };
     let alone = Cues { depth: None, ..*cues };
-    let by_places = cues.depth.is_some().then(|| cut(picture, first, marks, cues, None));
-    let (found, cues) = match by_places {
-        Some(found) if found.as_ref().is_none_or(|mask| cues.knows(picture, mask)) => (found, cues),
-        _ => (cut(picture, first, marks, &alone, None), &alone),
+    let by_places = |cues| {
+        let found = cut(picture, first, marks, cues, None);
+        found.as_ref().is_none_or(|mask| cues.knows(picture, mask)).then_some((found, cues))
     };
+    let first_found = Some(cues).filter(|cues| cues.depth.is_some()).and_then(by_places);
+    let first_found = first_found.unwrap_or_else(|| (cut(picture, first, marks, &alone, None), &alone));
+    // What was measured is wrong where cameras are, and then leaves a box that was drawn around an object half empty.
+    let fills = |found: &Option<GrayImage>| {
+        let parts =
+            found.as_ref().zip(bounds).and_then(|(mask, bounds)| Some((boxed::filled(mask, bounds)?, bounds, mask)));
+        parts.is_some_and(|(part, [x0, y0, x1, y1], mask)| {
+            let on = mask.as_raw().iter().filter(|v| **v != 0).count() as f64;
+            part >= boxed::FILLED && on <= boxed::WHOLE * (x1 - x0) * (y1 - y0)
+        })
+    };
+    let by_fit = fitted.as_ref().filter(|_| !fills(&first_found.0)).and_then(by_places).filter(|found| fills(&found.0));
+    let (found, cues) = by_fit.unwrap_or(first_found);
     let Some(found) = found else { return empty };
     let Some(bounds) = bounds_of(&found) else { return empty };
     let second = Window::around(bounds, AROUND, full);

@@ -16,6 +16,8 @@ use crate::statistics::median;
 
 /// A pixel less covered than this has no depth.
 const COVERED: f32 = 0.9;
+/// What is far is this many times as far as all that is known.
+const FAR: f32 = 4.0;
 /// Depths agree that differ by at most this part.
 pub const AGREE: f64 = 0.03;
 /// Views that are asked, the nearest ones.
@@ -51,6 +53,13 @@ impl DepthMap {
         };
         let depth = (0..(camera.size[0] * camera.size[1]) as usize).map(|pixel| one(pixel).unwrap_or(f32::NAN));
         Self { camera: *camera, depth: depth.collect() }
+    }
+
+    /// The same, where nothing is known far behind all that is: a fit shows nothing where little was seen, which is not the object.
+    pub fn far(&self) -> Self {
+        let most = self.depth.iter().copied().filter(|z| z.is_finite()).fold(0.0, f32::max);
+        let depth = self.depth.iter().map(|z| if z.is_finite() { *z } else { FAR * most }).collect();
+        Self { camera: self.camera, depth }
     }
 
     /// The depth at a pixel position, of the pixel it falls into; NaN outside.

@@ -36,6 +36,9 @@ const STEP: f32 = 0.125;
 const STEP_SPACINGS: f32 = 4.0;
 /// A piece that hangs together is the object where it has this part of all that the masked views have seen of it.
 const ATTACHED: f32 = 0.05;
+/// What lies outside the pictures of all masked views can be the object's only where its border cuts the object: within this part of the
+/// object's extent of what they have seen of it, and of colours that are rather the object's.
+const BEYOND: f32 = 0.5;
 /// A pixel less covered than this shows nothing that could be the object.
 const COVERED: f32 = 0.1;
 
@@ -48,6 +51,8 @@ pub const OBJECT: f32 = 0.35;
 pub struct Votes {
     inside: Vec<f32>,
     all: Vec<f32>,
+    /// The masked views' cameras.
+    cameras: Vec<Camera>,
 }
 
 /// What the votes say of each Gaussian.
@@ -69,7 +74,7 @@ pub struct Carried {
 impl Votes {
     /// None yet.
     pub fn new(splats: &Splats) -> Self {
-        Self { inside: vec![0.0; splats.len()], all: vec![0.0; splats.len()] }
+        Self { inside: vec![0.0; splats.len()], all: vec![0.0; splats.len()], cameras: vec![] }
     }
 
     /// Adds a view's: `inside` is the mask's part of each pixel, 0 to 1. What stands behind others there has no vote.
@@ -77,6 +82,7 @@ impl Votes {
     /// # Errors
     /// When the device has no room, or is lost.
     pub fn add(&mut self, splats: &mut Splats, camera: &Camera, inside: &[f32]) -> Result<(), Error> {
+        self.cameras.push(*camera);
         let weights: Vec<[f32; 3]> = inside.iter().map(|part| [*part, 1.0, 0.0]).collect();
         for Share { name, sums: [inside, all, _], alone } in splats.shares(camera, &weights)? {
             if all < SHOWN * alone {
@@ -97,7 +103,7 @@ impl Votes {
     /// Counts them. `positions` and `colors` are the anchors': a Gaussian that no masked view has seen votes as its anchor
     /// does, and an anchor that none has seen as those which are near it and look like it. What stands behind the object is
     /// as near to it as its own other side, but seldom of its colour; what stands elsewhere may be of its colour, but does not hang
-    /// together with it.
+    /// together with it. Beyond the pictures' borders there is little of it ([`BEYOND`]).
     pub fn count(&self, positions: &[[f32; 3]], colors: &[[f32; 3]]) -> Shares {
         let offsets = self.all.len() / positions.len().max(1);
         let of_anchors: Vec<[f32; 2]> = (0..positions.len())
@@ -123,8 +129,31 @@ impl Votes {
         let part = |a: usize| if is_seen(a) { of_anchors[a][0] / of_anchors[a][1] } else { around(a) };
         let mut priors: Vec<f32> = (0..positions.len()).into_par_iter().map(part).collect();
         let inside = |a: usize| if is_seen(a) { of_anchors[a][0] } else { 0.0 };
-        for a in apart(positions, &priors, spacing, inside).into_iter().filter(|a| !is_seen(*a)) {
-            priors[a] = 0.0;
+        let found = |a: &usize| is_seen(*a) && priors[*a] > OBJECT;
+        let extent = extent(positions, (0..positions.len()).filter(found));
+        let (object, other): (Vec<usize>, Vec<usize>) = seen.iter().partition(|a| priors[**a] > OBJECT);
+        let at = |of: &[usize], values: &[[f32; 3]]| {
+            ImmutableKdTree::<f32, 3>::new_from_slice(&of.iter().map(|a| values[*a]).collect::<Vec<_>>())
+        };
+        let distance = |tree: &ImmutableKdTree<f32, 3>, to: &[f32; 3], number: usize| {
+            let number = std::num::NonZero::new(number.min(tree.size()));
+            let near =
+                number.and_then(|number| tree.nearest_n::<SquaredEuclidean>(to, number).last().map(|n| n.distance));
+            near.map_or(f32::INFINITY, f32::sqrt)
+        };
+        let (places, looks) = (at(&object, positions), [at(&object, colors), at(&other, colors)]);
+        let framed = |a: usize| self.cameras.iter().any(|c| c.within(positions[a].map(f64::from)).is_some());
+        let possible = |a: usize| {
+            let near = || distance(&places, &positions[a], 1) <= BEYOND * extent;
+            let alike = || distance(&looks[0], &colors[a], NEIGHBOURS) <= distance(&looks[1], &colors[a], NEIGHBOURS);
+            is_seen(a) || self.cameras.is_empty() || framed(a) || near() && alike()
+        };
+        let out: Vec<bool> = (0..positions.len()).into_par_iter().map(|a| priors[a] > 0.0 && !possible(a)).collect();
+        priors.iter_mut().zip(out).filter(|(_, out)| *out).for_each(|(prior, _)| *prior = 0.0);
+        for a in apart(positions, &priors, (STEP * extent).max(STEP_SPACINGS * spacing), inside) {
+            if !is_seen(a) {
+                priors[a] = 0.0;
+            }
         }
         let mut shares =
             Shares { object: Vec::with_capacity(self.all.len()), seen: Vec::with_capacity(self.all.len()) };
@@ -141,16 +170,10 @@ impl Votes {
 }
 
 /// Anchors of which more than [`OBJECT`] is the object, by `priors`, in pieces that do not hang together with what was seen of it:
-/// `inside` are an anchor's votes for the object, none where it was not seen.
-fn apart(positions: &[[f32; 3]], priors: &[f32], spacing: f32, inside: impl Fn(usize) -> f32) -> Vec<usize> {
+/// `inside` are an anchor's votes for the object, none where it was not seen; those in neighbouring cells of this `side` hang together.
+fn apart(positions: &[[f32; 3]], priors: &[f32], side: f32, inside: impl Fn(usize) -> f32) -> Vec<usize> {
     let object: Vec<usize> = (0..positions.len()).filter(|a| priors[*a] > OBJECT).collect();
-    let seen = || object.iter().copied().filter(|a| inside(*a) > 0.0);
-    let all: f32 = seen().map(&inside).sum();
-    let middle: Option<Vec<f64>> = (0..3).map(|k| median(seen().map(|a| positions[a][k]))).collect();
-    let Some(middle) = middle else { return vec![] };
-    let off = |a: usize| (0..3).map(|k| (f64::from(positions[a][k]) - middle[k]).powi(2)).sum::<f64>().sqrt() as f32;
-    let extent = quantile(seen().map(off), 0.9).map_or(0.0, |radius| 2.0 * radius as f32);
-    let side = (STEP * extent).max(STEP_SPACINGS * spacing).max(f32::MIN_POSITIVE);
+    let all: f32 = object.iter().map(|a| inside(*a)).sum();
     let cell =
         |a: usize| -> [i64; 3] { std::array::from_fn(|k| (positions[a][k] / side).floor().clamp(-1e9, 1e9) as i64) };
     let mut cells: HashMap<[i64; 3], Vec<usize>> = HashMap::new();
@@ -171,6 +194,14 @@ fn apart(positions: &[[f32; 3]], priors: &[f32], spacing: f32, inside: impl Fn(u
         }
     }
     alone
+}
+
+/// Twice the radius around their middle that holds nine tenths of these anchors.
+fn extent(positions: &[[f32; 3]], some: impl Iterator<Item = usize> + Clone) -> f32 {
+    let middle: Option<Vec<f64>> = (0..3).map(|k| median(some.clone().map(|a| positions[a][k]))).collect();
+    let Some(middle) = middle else { return 0.0 };
+    let off = |a: usize| (0..3).map(|k| (f64::from(positions[a][k]) - middle[k]).powi(2)).sum::<f64>().sqrt() as f32;
+    quantile(some.map(off), 0.9).map_or(0.0, |radius| 2.0 * radius as f32)
 }
 
 /// Median distance of some anchors to the next.
@@ -339,6 +370,7 @@ mod tests {
         let votes = Votes {
             inside: vec![20.0, 0.0, 0.0, 1.0, 0.0, 0.2, 0.0, 0.0],
             all: vec![20.0, 0.0, 19.0, 1.0, 0.0, 0.2, 0.0, 0.0],
+            cameras: vec![],
         };
         let positions = [[0.0; 3], [1.0, 0.0, 0.0], [0.5, 0.1, 0.0], [0.5, -0.1, 0.0]];
         let (red, grey) = ([0.8, 0.2, 0.1], [0.5; 3]);
@@ -351,7 +383,7 @@ mod tests {
         assert!(near(shares.object[6], 0.525));
         assert_eq!(shares.seen, [true, true, true, true, false, false, false, false]);
         // Nobody was seen at all.
-        let votes = Votes { inside: vec![0.0; 2], all: vec![0.0; 2] };
+        let votes = Votes { inside: vec![0.0; 2], all: vec![0.0; 2], cameras: vec![] };
         assert_eq!(votes.count(&[[0.0; 3]], &[grey]).object, [0.0; 2]);
     }
 
@@ -361,7 +393,7 @@ mod tests {
         let n = 40;
         let positions: Vec<[f32; 3]> = (0..n).map(|i| [(i / 2) as f32 * 0.1, (i % 2) as f32 * 0.05, 0.0]).collect();
         let colors: Vec<[f32; 3]> = (0..n).map(|i| if i % 2 == 0 { [0.8, 0.2, 0.1] } else { [0.5; 3] }).collect();
-        let mut votes = Votes { inside: vec![0.0; n], all: vec![10.0; n] };
+        let mut votes = Votes { inside: vec![0.0; n], all: vec![10.0; n], cameras: vec![] };
         (0..n).step_by(2).for_each(|i| votes.inside[i] = 10.0);
         for unseen in [20, 21] {
             (votes.inside[unseen], votes.all[unseen]) = (0.0, 0.0);
@@ -382,8 +414,41 @@ mod tests {
         let positions: Vec<[f32; 3]> = all.iter().map(|of| of.0).collect();
         let colors: Vec<[f32; 3]> = all.iter().map(|of| of.1).collect();
         let votes = |kind: bool| all.iter().map(|of| if of.2 && (kind || of.1 == red) { 10.0 } else { 0.0 }).collect();
-        let shares = Votes { inside: votes(false), all: votes(true) }.count(&positions, &colors);
+        let shares = Votes { inside: votes(false), all: votes(true), cameras: vec![] }.count(&positions, &colors);
         assert!(shares.object[..20].iter().all(|share| *share > 0.9), "{:?}", shares.object);
         assert!(shares.object[20..].iter().all(|share| *share < 0.1), "{:?}", shares.object);
+    }
+
+    /// A row of red things that the picture's border cuts, and a grey floor of which the picture shows a part far from them: what of it lies
+    /// beyond the border is nearer to the red things than to that part, and hangs together with them.
+    #[test]
+    fn beyond_the_border_there_is_little_of_the_object() {
+        let (red, grey) = ([0.8, 0.2, 0.1], [0.5; 3]);
+        // The picture shows x from -1 to 1 at z = 2.
+        let camera = Camera {
+            rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            translation: [0.0; 3],
+            focal: [64.0; 2],
+            principal: [32.0; 2],
+            distortion: [0.0; 4],
+            size: [64; 2],
+        };
+        let line = |from: i32, to: i32, y: f32| (from..to).map(move |i| [i as f32 * 0.05, y, 2.0]);
+        let row = line(10, 40, 0.0).map(|at| (at, red));
+        let floor = line(-19, -10, 0.1).chain(line(22, 80, 0.1)).map(|at| (at, grey));
+        let all: Vec<_> = row.chain(floor).collect();
+        let positions: Vec<[f32; 3]> = all.iter().map(|of| of.0).collect();
+        let colors: Vec<[f32; 3]> = all.iter().map(|of| of.1).collect();
+        let votes = |kind: bool| -> Vec<f32> {
+            all.iter().map(|(at, color)| if at[0] < 0.99 && (kind || *color == red) { 10.0 } else { 0.0 }).collect()
+        };
+        let of =
+            |cameras: Vec<Camera>| Votes { inside: votes(false), all: votes(true), cameras }.count(&positions, &colors);
+        let floor = |shares: &Shares| (30..all.len()).filter(|a| shares.object[*a] > OBJECT).count();
+        assert!(floor(&of(vec![])) > 30, "the case is too easy");
+        let shares = of(vec![camera]);
+        assert_eq!(floor(&shares), 0);
+        // Ten are seen, and the picture's border cuts what is as long again by a half.
+        assert!(shares.object[..14].iter().all(|share| *share > 0.9), "{:?}", &shares.object[..30]);
     }
 }
