@@ -103,7 +103,7 @@ impl Votes {
     /// Counts them. `positions` and `colors` are the anchors': a Gaussian that no masked view has seen votes as its anchor
     /// does, and an anchor that none has seen as those which are near it and look like it. What stands behind the object is
     /// as near to it as its own other side, but seldom of its colour; what stands elsewhere may be of its colour, but does not hang
-    /// together with it. Beyond the pictures' borders there is little of it ([`BEYOND`]).
+    /// together with it. Beyond the pictures' borders there is little of it.
     pub fn count(&self, positions: &[[f32; 3]], colors: &[[f32; 3]]) -> Shares {
         let offsets = self.all.len() / positions.len().max(1);
         let of_anchors: Vec<[f32; 2]> = (0..positions.len())
