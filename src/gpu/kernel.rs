@@ -67,8 +67,8 @@ pub struct Interface {
     pub group: [u32; 3],
     /// True when it uses subgroup operations: the subgroup size is then pinned and subgroups are full.
     pub subgroups: bool,
-    /// Its subgroups are the least that the device has ([`DeviceInfo::narrow_subgroup_size`](super::DeviceInfo)): what they
-    /// pass over together, or the registers that they hold, is worth more than fewer of them.
+    /// True when its subgroups are the least that the device has ([`DeviceInfo::narrow_subgroup_size`](super::DeviceInfo)): what
+    /// they pass over together, or the registers that they hold, is worth more than fewer of them.
     pub narrow: bool,
     /// Its storage buffers, by binding number.
     pub bindings: &'static [Binding],

@@ -317,8 +317,7 @@ fn found(picture: &RgbImage, marks: &[Mark], cues: &Cues<'_>) -> GrayImage {
     let bounds = bounds.map(|bounds| std::array::from_fn(|k| bounds[k] * f64::from(full[k % 2])));
     let first = bounds.map_or_else(|| Window::whole(picture), |bounds| Window::around(bounds, 0.5, full));
     let boxed = marks.iter().all(|mark| mark.bounds().is_none() || matches!(mark, Mark::Box { .. }));
-    let fitted = cues.depth.filter(|_| outlined && boxed && cues.measured.is_some()).map(DepthMap::far);
-    let fitted = fitted.as_ref().map(|depth| Cues { depth: Some(depth), ..*cues });
+    let fit = cues.depth.filter(|_| outlined && boxed && cues.measured.is_some());
     let cues = &Cues { depth: cues.measured.filter(|_| outlined).or(cues.depth), ..*cues };
     let alone = Cues { depth: None, ..*cues };
     let by_places = |cues| {
@@ -336,7 +335,9 @@ fn found(picture: &RgbImage, marks: &[Mark], cues: &Cues<'_>) -> GrayImage {
             part >= boxed::FILLED && on <= boxed::WHOLE * (x1 - x0) * (y1 - y0)
         })
     };
-    let by_fit = fitted.as_ref().filter(|_| !fills(&first_found.0)).and_then(by_places).filter(|found| fills(&found.0));
+    let fit = fit.filter(|_| !fills(&first_found.0)).map(DepthMap::far);
+    let by_fit = fit.as_ref().map(|depth| Cues { depth: Some(depth), ..*cues });
+    let by_fit = by_fit.as_ref().and_then(by_places).filter(|found| fills(&found.0));
     let (found, cues) = by_fit.unwrap_or(first_found);
     let Some(found) = found else { return empty };
     let Some(bounds) = bounds_of(&found) else { return empty };

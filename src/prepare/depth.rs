@@ -16,7 +16,7 @@ use crate::statistics::median;
 
 /// A pixel less covered than this has no depth.
 const COVERED: f32 = 0.9;
-/// What is far is this many times as far as all that is known.
+/// Times as far as all that is known: where a map is far.
 const FAR: f32 = 4.0;
 /// Depths agree that differ by at most this part.
 pub const AGREE: f64 = 0.03;

@@ -36,8 +36,8 @@ const STEP: f32 = 0.125;
 const STEP_SPACINGS: f32 = 4.0;
 /// A piece that hangs together is the object where it has this part of all that the masked views have seen of it.
 const ATTACHED: f32 = 0.05;
-/// What lies outside the pictures of all masked views can be the object's only where its border cuts the object: within this part of the
-/// object's extent of what they have seen of it, and of colours that are rather the object's.
+/// Part of the object's extent from what masked views have seen of it: farther out, outside the pictures of them all, nothing is the object's,
+/// and nearer what has rather its colours.
 const BEYOND: f32 = 0.5;
 /// A pixel less covered than this shows nothing that could be the object.
 const COVERED: f32 = 0.1;
@@ -319,6 +319,18 @@ mod tests {
         GrayImage::from_fn(w, h, |x, y| Luma([if rows[y as usize].as_bytes()[x as usize] == b'#' { 255 } else { 0 }]))
     }
 
+    /// In the world's origin; at z = 2 it shows x and y from -1 to 1.
+    fn camera() -> Camera {
+        Camera {
+            rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            translation: [0.0; 3],
+            focal: [64.0; 2],
+            principal: [32.0; 2],
+            distortion: [0.0; 4],
+            size: [64; 2],
+        }
+    }
+
     #[test]
     fn specks_go_and_pieces_stay() {
         let found = without_specks(&mask(&["###...", "###..#", ".....#", "#....#"]), 0.3);
@@ -346,14 +358,7 @@ mod tests {
             harmonics: vec![[0.0; 3]; 3],
             ..Cloud::default()
         };
-        let camera = Camera {
-            rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
-            translation: [0.0; 3],
-            focal: [64.0; 2],
-            principal: [32.0; 2],
-            distortion: [0.0; 4],
-            size: [64; 2],
-        };
+        let camera = camera();
         let mut splats = Splats::new(&testing::gpu(), &Stored::Gaussians(cloud), &Config::default()).expect("room");
         let inside = |i: u32| f32::from(u8::from((i % 64u32).abs_diff(32) < 8 && (i / 64).abs_diff(32) < 8));
         let mut votes = Votes::new(&splats);
@@ -424,15 +429,6 @@ mod tests {
     #[test]
     fn beyond_the_border_there_is_little_of_the_object() {
         let (red, grey) = ([0.8, 0.2, 0.1], [0.5; 3]);
-        // The picture shows x from -1 to 1 at z = 2.
-        let camera = Camera {
-            rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
-            translation: [0.0; 3],
-            focal: [64.0; 2],
-            principal: [32.0; 2],
-            distortion: [0.0; 4],
-            size: [64; 2],
-        };
         let line = |from: i32, to: i32, y: f32| (from..to).map(move |i| [i as f32 * 0.05, y, 2.0]);
         let row = line(10, 40, 0.0).map(|at| (at, red));
         let floor = line(-19, -10, 0.1).chain(line(22, 80, 0.1)).map(|at| (at, grey));
@@ -446,7 +442,7 @@ mod tests {
             |cameras: Vec<Camera>| Votes { inside: votes(false), all: votes(true), cameras }.count(&positions, &colors);
         let floor = |shares: &Shares| (30..all.len()).filter(|a| shares.object[*a] > OBJECT).count();
         assert!(floor(&of(vec![])) > 30, "the case is too easy");
-        let shares = of(vec![camera]);
+        let shares = of(vec![camera()]);
         assert_eq!(floor(&shares), 0);
         // Ten are seen, and the picture's border cuts what is as long again by a half.
         assert!(shares.object[..14].iter().all(|share| *share > 0.9), "{:?}", &shares.object[..30]);
