@@ -17,7 +17,7 @@ use super::form::Form;
 use super::instance::{Instance, has};
 use super::kernel::{self, Interface};
 use super::ledger::{Ledger, Rehearsal};
-use super::physical::{self, DeviceInfo, Found};
+use super::physical::{self, DeviceInfo, Found, Subgroups};
 use super::spares::{self, Spares};
 use super::statistics::{self, Compiled, Statistic};
 use super::witness::Case;
@@ -129,7 +129,7 @@ pub(super) struct Inner {
     allocator: Mutex<Option<Allocator>>,
     physical: vk::PhysicalDevice,
     memory_budget: bool,
-    require_subgroups: bool,
+    subgroups: Subgroups,
     keeps_nan: bool,
     // Fields are dropped in this order: the device before its instance.
     pub device: Device,
@@ -222,7 +222,7 @@ impl Gpu {
                 .then(|| ash::khr::pipeline_executable_properties::Device::new(&instance.raw, &device)),
             debug: instance.debug_utils.then(|| ash::ext::debug_utils::Device::new(&instance.raw, &device)),
             queue: Mutex::new(queue),
-            require_subgroups: found.subgroups.chosen,
+            subgroups: found.subgroups,
             keeps_nan: found.keeps_nan,
             memory_budget: has(&found.extensions, ash::ext::memory_budget::NAME),
             physical: found.raw,
@@ -611,8 +611,9 @@ impl Inner {
         unsafe {
             let module_info = vk::ShaderModuleCreateInfo::default().code(&words);
             let module = self.device.create_shader_module(&module_info, None)?;
-            let mut size = vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default()
-                .required_subgroup_size(self.subgroup_size(kernel));
+            let threads = self.subgroup_size(kernel);
+            let mut size =
+                vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default().required_subgroup_size(threads);
             let mut stage = vk::PipelineShaderStageCreateInfo::default()
                 .stage(vk::ShaderStageFlags::COMPUTE)
                 .module(module)
@@ -621,7 +622,7 @@ impl Inner {
             if kernel.subgroups {
                 stage = stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS);
             }
-            if self.require_subgroups && (kernel.subgroups || kernel.narrow) {
+            if self.subgroups.asks(kernel, threads) {
                 stage = stage.push_next(&mut size);
             }
             let mut create = vk::ComputePipelineCreateInfo::default().layout(*layout).stage(stage);

@@ -6,6 +6,7 @@ use ash::vk;
 
 use super::error::{Error, Named};
 use super::instance::has;
+use super::kernel::Interface;
 use super::kernels::{MOST_BUFFERS, MOST_FULL_THREADS, MOST_PUSH_BYTES, MOST_SUBGROUP_THREADS, MOST_THREADS};
 
 /// Fewest threads of a subgroup that the kernels are made for.
@@ -78,7 +79,9 @@ pub(super) struct Subgroups {
     least: u32,
     most: u32,
     /// A compute kernel can ask for one of them.
-    pub chosen: bool,
+    chosen: bool,
+    /// Most of them in the workgroup of a kernel that asks for their size.
+    room: u32,
 }
 
 impl Subgroups {
@@ -100,11 +103,21 @@ impl Subgroups {
         own.into_iter().chain(sizes).filter(fits)
     }
 
-    /// The least size that kernels can have, which is as wide as the device's units are, if a workgroup may have `room` of
-    /// them or fewer.
-    fn narrow(self, room: u32) -> Option<u32> {
+    /// The least size that kernels can have, which is as wide as the device's units are.
+    fn narrow(self) -> Option<u32> {
         let usual = self.usual();
-        self.sizes().filter(|size| Some(*size) == usual || MOST_FULL_THREADS.div_ceil(*size) <= room).min()
+        self.sizes().filter(|size| Some(*size) == usual || self.holds(MOST_FULL_THREADS, *size)).min()
+    }
+
+    /// A workgroup of so many threads can ask for subgroups of this size.
+    fn holds(self, threads: u32, size: u32) -> bool {
+        self.chosen && threads.div_ceil(size) <= self.room
+    }
+
+    /// A kernel asks for subgroups of this size: where it counts on it, and where it would be faster and its workgroup may
+    /// have so many.
+    pub fn asks(self, kernel: &Interface, size: u32) -> bool {
+        (kernel.subgroups || kernel.narrow) && self.holds(kernel.group.iter().product(), size)
     }
 
     /// This size, in the place of the usual one.
@@ -112,12 +125,15 @@ impl Subgroups {
     /// # Errors
     /// What the device lacks.
     pub fn wanted(self, size: u32) -> Result<u32, String> {
-        let Self { own, least, most, chosen } = self;
+        let Self { own, least, most, chosen, .. } = self;
         if !(least..=most).contains(&size) || !size.is_power_of_two() {
             return Err(format!("subgroups of {size} threads (it has {least} to {most})"));
         }
         if !chosen && size != own {
             return Err(format!("a choice of its subgroups' size (they have {own} threads)"));
+        }
+        if chosen && !self.holds(MOST_FULL_THREADS, size) {
+            return Err(format!("workgroups of {} subgroups of {size} threads", MOST_FULL_THREADS.div_ceil(size)));
         }
         let usual = Self { own: size, ..self }.usual();
         usual.filter(|&found| found == size).ok_or_else(|| {
@@ -297,12 +313,8 @@ impl Facts {
             least: self.v13.min_subgroup_size,
             most: self.v13.max_subgroup_size,
             chosen: self.v13.required_subgroup_size_stages.contains(vk::ShaderStageFlags::COMPUTE),
+            room: self.v13.max_compute_workgroup_subgroups,
         }
-    }
-
-    /// Most subgroups of a workgroup: a limit for sizes that are asked for.
-    fn most_subgroups(&self) -> u32 {
-        if self.subgroups().chosen { self.v13.max_compute_workgroup_subgroups } else { u32::MAX }
     }
 
     fn lacks(&self) -> Vec<String> {
@@ -337,9 +349,10 @@ impl Facts {
         let size = subgroups.usual();
         let wanted = format!("subgroups of one known size of {LEAST_SUBGROUP} to {MOST_SUBGROUP_THREADS} threads");
         need(size.is_some(), &wanted);
-        let most = self.most_subgroups();
-        let full = size.map_or(0, |size| MOST_FULL_THREADS.div_ceil(size));
-        need(most >= full, &format!("workgroups of {full} subgroups"));
+        if let Some(size) = size.filter(|_| subgroups.chosen) {
+            let full = MOST_FULL_THREADS.div_ceil(size);
+            need(subgroups.holds(MOST_FULL_THREADS, size), &format!("workgroups of {full} subgroups"));
+        }
         let buffers = limits.max_per_stage_descriptor_storage_buffers.min(limits.max_descriptor_set_storage_buffers);
         need(
             buffers.min(limits.max_per_stage_resources) >= MOST_BUFFERS,
@@ -381,7 +394,7 @@ impl Facts {
                 vk::api_version_patch(version)
             ),
             subgroup_size: self.subgroups().usual().unwrap_or(v11.subgroup_size),
-            narrow_subgroup_size: self.subgroups().narrow(self.most_subgroups()).unwrap_or(v11.subgroup_size),
+            narrow_subgroup_size: self.subgroups().narrow().unwrap_or(v11.subgroup_size),
             push_descriptors: self.pushed >= MOST_BUFFERS,
             max_binding_bytes: limits.into_iter().filter(|&bytes| bytes > 0).min().unwrap_or(0),
             heap_bytes: self.heap_bytes(),
@@ -477,7 +490,7 @@ mod tests {
 
     #[test]
     fn the_size_of_subgroups_is_one_that_kernels_can_have() {
-        let sizes = |own, least, most, chosen| Subgroups { own, least, most, chosen };
+        let sizes = |own, least, most, chosen| Subgroups { own, least, most, chosen, room: 64 };
         assert_eq!(sizes(32, 32, 32, true).usual(), Some(32));
         assert_eq!(sizes(64, 32, 64, true).usual(), Some(64));
         assert_eq!(sizes(128, 64, 128, true).usual(), Some(64), "a workgroup of 64 has no full subgroup of 128");
@@ -496,6 +509,30 @@ mod tests {
         assert_eq!(sizes(16, 8, 32, false).wanted(16), Ok(16));
         let other = sizes(32, 4, 32, false).wanted(16);
         assert_eq!(other, Err("a choice of its subgroups' size (they have 32 threads)".into()));
+        let crowded = Subgroups { room: 16, ..sizes(32, 4, 32, true) }.wanted(4);
+        assert_eq!(crowded, Err(format!("workgroups of {} subgroups of 4 threads", MOST_FULL_THREADS / 4)));
+    }
+
+    /// lavapipe with vectors of 128 bits has subgroups of 4, and 32 of them in a workgroup.
+    #[test]
+    fn a_kernel_asks_for_no_more_subgroups_than_a_workgroup_may_have() {
+        let of_4 = Subgroups { own: 4, least: 4, most: 4, chosen: true, room: 32 };
+        let kernel = |threads, subgroups, narrow| Interface {
+            name: "made",
+            choice: 0,
+            bound: 0,
+            group: [threads, 1, 1],
+            subgroups,
+            narrow,
+            bindings: &[],
+            constants: &[],
+            push_bytes: 0,
+            spirv: &[],
+        };
+        assert!(of_4.asks(&kernel(128, true, false), 4) && of_4.asks(&kernel(128, false, true), 4));
+        assert!(!of_4.asks(&kernel(256, false, true), 4), "it is as right without");
+        assert!(!of_4.asks(&kernel(128, false, false), 4));
+        assert!(!Subgroups { chosen: false, ..of_4 }.asks(&kernel(128, true, true), 4));
     }
 
     #[test]
