@@ -283,6 +283,27 @@ fn a_round_of_growth_at_buffers_that_cannot_be_made() {
     assert_eq!(early, MOMENTS, "each failure ends the training");
 }
 
+/// The rows that decide are read, halves are put into their places, and the lists of the stages are made anew.
+#[test]
+fn a_round_of_plain_gaussians_waits_three_times() {
+    let Some(driver) = Driver::new() else { return };
+    let more = ["--profile", "--set", "model.form=gaussians", "--set", "model.attention.enabled=false"];
+    let ended = driver.start(driver.place.train("gaussians", &more), "gaussians", &Fault::default());
+    assert_clean(&ended, &Fault::default());
+    assert!(ended.output.status.success(), "{}", text(&ended.output.stderr));
+    let trace = &ended.trace;
+    let splits = |name: &String| name.starts_with("densify/");
+    let first = trace.iter().position(splits).expect("Gaussians are split");
+    let last = trace[..first].iter().rposition(|name| name.starts_with("optimizer/")).expect("a step went before");
+    let renders = |name: &String| name.starts_with("render/");
+    let next = first + trace[first..].iter().position(renders).expect("a step follows");
+    let round = &trace[last..next];
+    for call in ["vkQueueSubmit2", "vkWaitForFences"] {
+        let times = round.iter().filter(|name| *name == call).count();
+        assert_eq!(times, 4, "{call}: that of the step before and three of the round: {round:#?}");
+    }
+}
+
 /// A recording that runs pass by pass goes through the rest of the step when one of its submissions has failed.
 #[test]
 fn a_comparison_at_calls_that_fail() {

@@ -7,7 +7,7 @@
 //! opacity times deviation along that axis: the large ones that are seen leave the most to be told. (By the positions'
 //! gradients, one capture came out 0.4 dB worse with one seed.) Halves begin without a first moment and keep the second one,
 //! the pace of the one. It happens on the host, between steps, with the rows that change alone, and depends on the model, the
-//! seed and the step alone.
+//! seed and the step alone. A round waits for the device twice: for the rows that decide, and for the halves.
 
 use glam::{DMat3, DQuat};
 use rand::RngExt as _;
@@ -16,7 +16,7 @@ use rayon::prelude::*;
 
 use super::{Config, Round};
 use crate::gpu::kernels::densify::{prune_gather, split_scatter};
-use crate::gpu::{Buffer, Error, Gpu, Reference};
+use crate::gpu::{Buffer, Error, Gpu, Recorder, Reference};
 use crate::model::gaussians::{NORM_EPSILON, Static, sigmoid};
 
 /// Deviation of a half along the axis, of that of the whole: divided by 1.6, as by 3DGS.
@@ -68,31 +68,84 @@ const STREAM: u128 = 0x7265_6c6f_6361_7465;
 /// Share by which a round enlarges the number of plain Gaussians, as 3DGS-MCMC does.
 pub const GROWTH: f64 = 0.05;
 
-/// Which Gaussians become two: those that have faded make place for halves, and so does what is behind the last up to
-/// `target`.
-fn splits(gpu: &Gpu, gaussians: &Static, faded: f64, target: usize, round: Round) -> Result<Vec<Split>, Error> {
-    let count = gaussians.count;
-    let opacity: Vec<f64> = gaussians.logit.read(gpu, count)?.into_par_iter().map(sigmoid).collect();
-    let log_scale = gaussians.log_scale.read(gpu, count)?;
-    let quaternion = gaussians.quaternion.read(gpu, count)?;
-    let longest = |i: usize| -> (usize, f64) {
-        let of = &log_scale[3 * i..3 * i + 3];
+/// What decides who becomes two and where the halves lie, on the host.
+struct Rows {
+    position: Vec<f32>,
+    log_scale: Vec<f32>,
+    quaternion: Vec<f32>,
+    logit: Vec<f32>,
+}
+
+impl Rows {
+    /// Those of all Gaussians, in one submission.
+    fn read(gpu: &Gpu, gaussians: &Static) -> Result<Self, Error> {
+        let mut rec = gpu.recorder()?;
+        let mut copies = vec![];
+        for parameter in &gaussians.parameters()[..=LOGIT] {
+            let words = gaussians.count as usize * parameter.width as usize;
+            let copy = gpu.readback(parameter.names.value, words)?;
+            rec.copy(&parameter.value, &copy, words);
+            copies.push((copy, words));
+        }
+        rec.submit()?.wait()?;
+        let mut rows = copies.iter().map(|(copy, words)| gpu.read_range(copy, *words));
+        let mut next = || rows.next().expect("one of each parameter");
+        Ok(Self { position: next()?, log_scale: next()?, quaternion: next()?, logit: next()? })
+    }
+
+    /// The longest axis, and the deviation along it.
+    fn longest(&self, i: usize) -> (usize, f64) {
+        let of = &self.log_scale[3 * i..3 * i + 3];
         let axis = (1..3).fold(0, |longest, k| if of[k] > of[longest] { k } else { longest });
         (axis, f64::from(of[axis]).exp())
-    };
-    let weight = |i: usize| if opacity[i] < faded { 0.0 } else { opacity[i] * longest(i).1 };
-    let weights: Vec<f64> = (0..opacity.len()).into_par_iter().map(weight).collect();
-    let places: Vec<usize> = (0..opacity.len()).filter(|i| opacity[*i] < faded).chain(opacity.len()..target).collect();
-    let split = |(source, place): (usize, usize)| {
-        let (axis, deviation) = longest(source);
-        let [w, x, y, z] = std::array::from_fn(|k| f64::from(quaternion[4 * source + k]));
-        let turned = DQuat::from_xyzw(x, y, z, w);
-        let turned = DMat3::from_quat(turned / turned.length().max(NORM_EPSILON));
-        let half = half(opacity[source]).max(faded);
-        let shift = (turned.col(axis) * deviation * SHIFT).to_array();
-        Split { source, place, axis, shift, logit: (half / (1.0 - half)).ln() as f32 }
-    };
-    Ok(draw(&weights, places.len(), round).into_iter().zip(places).map(split).collect())
+    }
+
+    /// Which Gaussians become two: those that have faded make place for halves, and so does what is behind the last up to
+    /// `target`. Places come in ascending order.
+    fn splits(&self, faded: f64, target: usize, round: Round) -> Vec<Split> {
+        let opacity: Vec<f64> = self.logit.par_iter().map(|logit| sigmoid(*logit)).collect();
+        let weight = |i: usize| if opacity[i] < faded { 0.0 } else { opacity[i] * self.longest(i).1 };
+        let weights: Vec<f64> = (0..opacity.len()).into_par_iter().map(weight).collect();
+        let places: Vec<usize> =
+            (0..opacity.len()).filter(|i| opacity[*i] < faded).chain(opacity.len()..target).collect();
+        let split = |(source, place): (usize, usize)| {
+            let (axis, deviation) = self.longest(source);
+            let [w, x, y, z] = std::array::from_fn(|k| f64::from(self.quaternion[4 * source + k]));
+            let turned = DQuat::from_xyzw(x, y, z, w);
+            let turned = DMat3::from_quat(turned / turned.length().max(NORM_EPSILON));
+            let half = half(opacity[source]).max(faded);
+            let shift = (turned.col(axis) * deviation * SHIFT).to_array();
+            Split { source, place, axis, shift, logit: (half / (1.0 - half)).ln() as f32 }
+        };
+        draw(&weights, places.len(), round).into_iter().zip(places).map(split).collect()
+    }
+
+    /// The values at `which` of [`Static::parameters`] of all first halves and then of all others, where they are not those
+    /// of the whole.
+    fn halves(&self, splits: &[Split], which: usize) -> Option<Vec<f32>> {
+        let both = || [1.0, -1.0].into_iter().flat_map(|side| splits.iter().map(move |split| (side, split)));
+        match which {
+            POSITION => Some(
+                both()
+                    .flat_map(|(side, split)| {
+                        let at = |k| f64::from(self.position[3 * split.source + k]) + side * split.shift[k];
+                        [0, 1, 2].map(|k| at(k) as f32)
+                    })
+                    .collect(),
+            ),
+            LOG_SCALE => Some(
+                both()
+                    .flat_map(|(_, split)| {
+                        let mut of: [f32; 3] = std::array::from_fn(|k| self.log_scale[3 * split.source + k]);
+                        of[split.axis] += DEVIATION.ln() as f32;
+                        of
+                    })
+                    .collect(),
+            ),
+            LOGIT => Some(both().map(|(_, split)| split.logit).collect()),
+            _ => None,
+        }
+    }
 }
 
 impl Reference for split_scatter::Kernel {
@@ -104,43 +157,43 @@ impl Reference for split_scatter::Kernel {
     }
 }
 
-/// Makes two rows of one: of each of the splits a row of the parameter at `which` of [`Static::parameters`], values and both
-/// moments, and behind them as many more, the other halves.
-fn apply(splits: &[Split], tensors: &mut [Vec<f32>; 3], width: usize, which: usize) {
-    tensors[1].fill(0.0);
-    tensors.iter_mut().for_each(|tensor| tensor.extend_from_within(..));
-    let (sources, places) = tensors[0].split_at_mut(splits.len() * width);
-    for (halves, side) in [(sources, 1.0), (places, -1.0)] {
-        for (half, Split { axis, shift, logit, .. }) in halves.chunks_mut(width).zip(splits) {
-            match which {
-                POSITION => half.iter_mut().zip(shift).for_each(|(v, by)| *v = (f64::from(*v) + side * by) as f32),
-                LOG_SCALE => half[*axis] += DEVIATION.ln() as f32,
-                LOGIT => half.fill(*logit),
-                _ => {}
-            }
+/// Puts rows into a tensor.
+fn put(rec: &mut Recorder<'_>, tensor: &Buffer<f32>, places: &Buffer<u32>, width: u32, from: &Buffer<f32>) {
+    let rows = places.len() as u32;
+    let buffers = split_scatter::Buffers { places, from: &from.view(), to: &tensor.view() };
+    rec.run(split_scatter::Kernel, buffers, split_scatter::Push { rows, width }, rows as usize * width as usize);
+}
+
+/// Records that two halves take the places of each of the splits.
+fn apply(rec: &mut Recorder<'_>, gaussians: &Static, rows: &Rows, splits: &[Split]) -> Result<(), Error> {
+    let gpu = rec.gpu();
+    let [from, to] = [|split: &Split| split.source as u32, |split: &Split| split.place as u32];
+    let sources: Vec<u32> = splits.iter().map(from).collect();
+    let places: Vec<u32> = splits.iter().map(to).collect();
+    let both = gpu.constant("split_both", &[&sources[..], &places[..]].concat())?;
+    let [sources, places] = [gpu.constant("split_sources", &sources)?, gpu.constant("split_places", &places)?];
+    let rows_of = |width: u32| splits.len() * width as usize;
+    let widest = gaussians.parameters().iter().map(|parameter| parameter.width).max().unwrap_or(0);
+    let zeros = gpu.buffer("split_zeros", 2 * rows_of(widest))?;
+    rec.zero(&zeros);
+    for (which, parameter) in gaussians.parameters().into_iter().enumerate() {
+        let width = parameter.width;
+        // What the whole has, for its other half.
+        let copy = |rec: &mut Recorder<'_>, tensor: &Buffer<f32>| -> Result<(), Error> {
+            let found = gpu.buffer("split_rows", rows_of(width))?;
+            let buffers = prune_gather::Buffers { kept: &sources, from: &tensor.view(), to: &found.view() };
+            let push = prune_gather::Push { rows: splits.len() as u32, width };
+            rec.run(prune_gather::Kernel, buffers, push, rows_of(width));
+            put(rec, tensor, &places, width, &found);
+            Ok(())
+        };
+        match rows.halves(splits, which) {
+            Some(halves) => put(rec, &parameter.value, &both, width, &gpu.constant("split_halves", &halves)?),
+            None => copy(rec, &parameter.value)?,
         }
+        put(rec, &parameter.first, &both, width, &zeros);
+        copy(rec, &parameter.root)?;
     }
-}
-
-/// Rows of a parameter's buffer on the host.
-fn rows(gpu: &Gpu, buffer: &Buffer<f32>, at: &Buffer<u32>, width: u32) -> Result<Vec<f32>, Error> {
-    let rows = at.len() as u32;
-    let words = rows as usize * width as usize;
-    let found: Buffer<u32> = gpu.buffer("split_rows", words)?;
-    let mut rec = gpu.recorder()?;
-    let buffers = prune_gather::Buffers { kept: at, from: &buffer.view(), to: &found };
-    rec.run(prune_gather::Kernel, buffers, prune_gather::Push { rows, width }, words);
-    rec.submit()?.wait()?;
-    gpu.read(&found.view())
-}
-
-/// Puts rows into a parameter's buffer.
-fn put(gpu: &Gpu, buffer: &Buffer<f32>, at: &Buffer<u32>, width: u32, values: &[f32]) -> Result<(), Error> {
-    let from: Buffer<f32> = gpu.upload("split_rows", values)?;
-    let mut rec = gpu.recorder()?;
-    let buffers = split_scatter::Buffers { places: at, from: &from.view(), to: &buffer.view() };
-    rec.run(split_scatter::Kernel, buffers, split_scatter::Push { rows: at.len() as u32, width }, values.len());
-    rec.submit()?.wait()?;
     Ok(())
 }
 
@@ -154,23 +207,13 @@ pub fn run(gpu: &Gpu, gaussians: &mut Static, config: &Config, round: Round) -> 
     let count = gaussians.count as usize;
     let grown = (count as f64 * (1.0 + GROWTH)).ceil() as usize;
     let target = grown.min(config.max_gaussians as usize).min(gaussians.capacity as usize).max(count);
-    let splits = splits(gpu, gaussians, config.min_opacity, target, round)?;
-    // Places come in ascending order.
+    let rows = Rows::read(gpu, gaussians)?;
+    let splits = rows.splits(config.min_opacity, target, round);
     let Some(last) = splits.last().map(|split| split.place) else { return Ok(0) };
     let now = count.max(last + 1);
-    let sources: Vec<u32> = splits.iter().map(|split| split.source as u32).collect();
-    let places = splits.iter().map(|split| split.place as u32);
-    let both = gpu.upload("split_places", &sources.iter().copied().chain(places).collect::<Vec<_>>())?;
-    let sources = gpu.upload("split_sources", &sources)?;
-    for (which, parameter) in gaussians.parameters().into_iter().enumerate() {
-        let width = parameter.width;
-        let [value, first, root] = parameter.tensors().map(|tensor| rows(gpu, tensor, &sources, width));
-        let mut tensors = [value?, first?, root?];
-        apply(&splits, &mut tensors, width as usize, which);
-        for (to, tensor) in parameter.tensors().into_iter().zip(&tensors) {
-            put(gpu, to, &both, width, tensor)?;
-        }
-    }
+    let mut rec = gpu.recorder()?;
+    apply(&mut rec, gaussians, &rows, &splits)?;
+    rec.submit()?.wait()?;
     gaussians.count = now as u32;
     Ok(splits.iter().filter(|split| split.place < count).count() as u32)
 }

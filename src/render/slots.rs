@@ -37,9 +37,12 @@ impl Slots {
     /// As [`Gpu::buffer`].
     pub fn all(gpu: &Gpu, n: u32) -> Result<Self, Error> {
         let new = Self::new(gpu, ["all", "all_count", "all_groups"], n)?;
-        gpu.write(&new.list, &(0..n).collect::<Vec<_>>())?;
-        gpu.write(&new.count, &[n])?;
+        let list: Vec<u32> = (0..n).collect();
+        let [list, count] =
+            [("all_written", &list[..]), ("all_count_written", &[n])].map(|(name, of)| gpu.constant(name, of));
         let mut rec = gpu.recorder()?;
+        rec.copy(&list?, &new.list, n as usize);
+        rec.copy(&count?, &new.count, 1);
         new.dispatch(&mut rec);
         rec.submit()?.wait()?;
         Ok(new)
