@@ -6,13 +6,15 @@
 
 use std::collections::HashMap;
 
+use glam::DVec3;
 use image::{GrayImage, Luma};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
 
+use super::shadow::plane::{self, Support};
 use super::splats::{Share, Splats};
 use crate::gpu::Error;
-use crate::scene::{Camera, View, resample};
+use crate::scene::{Camera, View, resample, up};
 use crate::statistics::{median, quantile};
 
 /// A Gaussian of whose footprint less than this part shows in a view has no vote there. A short fit's object lets a tenth and
@@ -39,6 +41,16 @@ const ATTACHED: f32 = 0.05;
 /// Part of the object's extent from what masked views have seen of it: farther out, outside the pictures of them all, nothing is the object's,
 /// and nearer what has rather its colours.
 const BEYOND: f32 = 0.5;
+/// What masked views have not seen is none of the object up to this part of its radius above what it stands on.
+const UNDERFOOT: f64 = 0.05;
+/// Part of what lies around it that must be on the plane that it stands on: within so many radii, up to this part of the radius above and
+/// below.
+const FLAT: f64 = 0.6;
+const AROUND: f64 = 2.0;
+const LOW: f64 = 0.5;
+/// Places that tell what the object stands on, at most: of it, and around it.
+const PLACES: [usize; 2] = [500, 2000];
+
 /// A pixel less covered than this shows nothing that could be the object.
 const COVERED: f32 = 0.1;
 
@@ -103,7 +115,7 @@ impl Votes {
     /// Counts them. `positions` and `colors` are the anchors': a Gaussian that no masked view has seen votes as its anchor
     /// does, and an anchor that none has seen as those which are near it and look like it. What stands behind the object is
     /// as near to it as its own other side, but seldom of its colour; what stands elsewhere may be of its colour, but does not hang
-    /// together with it. Beyond the pictures' borders there is little of it.
+    /// together with it. Beyond the pictures' borders there is little of it, and below what it stands on nothing.
     pub fn count(&self, positions: &[[f32; 3]], colors: &[[f32; 3]]) -> Shares {
         let offsets = self.all.len() / positions.len().max(1);
         let of_anchors: Vec<[f32; 2]> = (0..positions.len())
@@ -142,11 +154,13 @@ impl Votes {
             near.map_or(f32::INFINITY, f32::sqrt)
         };
         let (places, looks) = (at(&object, positions), [at(&object, colors), at(&other, colors)]);
+        let support = self.support(positions, &object, &other, f64::from(extent));
+        let underfoot = |a: usize| support.as_ref().is_some_and(|(s, height)| s.local(point(positions[a])).z < *height);
         let framed = |a: usize| self.cameras.iter().any(|c| c.within(positions[a].map(f64::from)).is_some());
         let possible = |a: usize| {
             let near = || distance(&places, &positions[a], 1) <= BEYOND * extent;
             let alike = || distance(&looks[0], &colors[a], NEIGHBOURS) <= distance(&looks[1], &colors[a], NEIGHBOURS);
-            is_seen(a) || self.cameras.is_empty() || framed(a) || near() && alike()
+            is_seen(a) || !underfoot(a) && (self.cameras.is_empty() || framed(a) || near() && alike())
         };
         let out: Vec<bool> = (0..positions.len()).into_par_iter().map(|a| priors[a] > 0.0 && !possible(a)).collect();
         priors.iter_mut().zip(out).filter(|(_, out)| *out).for_each(|(prior, _)| *prior = 0.0);
@@ -167,6 +181,38 @@ impl Votes {
         }
         shares
     }
+
+    /// What the object stands on, and the height over it up to which what was not seen is no part of the object; nothing for what lies
+    /// flat.
+    fn support(
+        &self,
+        positions: &[[f32; 3]],
+        object: &[usize],
+        other: &[usize],
+        extent: f64,
+    ) -> Option<(Support, f64)> {
+        let some = |of: &[usize], most: usize| -> Vec<DVec3> {
+            of.iter().step_by(of.len().div_ceil(most).max(1)).map(|a| point(positions[*a])).collect()
+        };
+        let object = some(object, PLACES[0]);
+        let (middle, radius) = plane::extent(&object)?;
+        let near: Vec<usize> =
+            other.iter().copied().filter(|a| point(positions[*a]).distance(middle) <= 2.0 * extent).collect();
+        let support = plane::find(&some(&near, PLACES[1]), &object, up::estimate(&self.cameras), 0)?;
+        let height = UNDERFOOT * radius;
+        // What is low around it, most of which is a plane's: a back or a cushion is none.
+        let low = near.iter().map(|a| support.local(point(positions[*a])));
+        let (mut on, mut all) = (0, 0);
+        for local in low.filter(|p| p.z.abs() < LOW * radius && p.truncate().length() < AROUND * radius) {
+            all += 1;
+            on += i32::from(local.z.abs() < height);
+        }
+        (support.height > 4.0 * height && f64::from(on) > FLAT * f64::from(all)).then_some((support, height))
+    }
+}
+
+fn point(at: [f32; 3]) -> DVec3 {
+    DVec3::from(at.map(f64::from))
 }
 
 /// Anchors of which more than [`OBJECT`] is the object, by `priors`, in pieces that do not hang together with what was seen of it:
@@ -446,5 +492,32 @@ mod tests {
         assert_eq!(floor(&shares), 0);
         // Ten are seen, and the picture's border cuts what is as long again by a half.
         assert!(shares.object[..14].iter().all(|share| *share > 0.9), "{:?}", &shares.object[..30]);
+    }
+
+    /// A dark box on a grey floor, in its shadow behind it a piece of the floor as dark as the box that no masked view has seen: it is
+    /// the floor. At half of the box's height it would be the object.
+    #[test]
+    fn what_it_stands_on_is_none_of_the_object() {
+        let (dark, grey) = ([0.2, 0.2, 0.25], [0.6; 3]);
+        let grid = |n: [i32; 3], from: [f32; 3]| {
+            let at = move |i: i32| [i % n[0], i / n[0] % n[1], i / n[0] / n[1]];
+            (0..n.iter().product()).map(move |i| std::array::from_fn(|k| from[k] + 0.05 * at(i)[k] as f32))
+        };
+        let behind = |height: f32| {
+            let object = grid([8, 8, 4], [-0.2, 0.0, 2.0]).map(|at: [f32; 3]| (at, dark, true));
+            let floor = grid([40, 1, 10], [-1.0, 0.4, 1.5]).map(|at| (at, grey, true));
+            let shadow = grid([8, 1, 6], [-0.2, 0.4 - height, 2.2]).map(|at| (at, dark, false));
+            let all: Vec<_> = object.chain(floor).chain(shadow).collect();
+            let positions: Vec<[f32; 3]> = all.iter().map(|of| of.0).collect();
+            let colors: Vec<[f32; 3]> = all.iter().map(|of| of.1).collect();
+            let votes = |kind: bool| -> Vec<f32> {
+                all.iter().map(|of| if of.2 && (kind || of.1 == dark) { 10.0 } else { 0.0 }).collect()
+            };
+            let votes = Votes { inside: votes(false), all: votes(true), cameras: vec![camera()] };
+            let shares = votes.count(&positions, &colors);
+            let object = (0..all.len()).filter(|a| shares.object[*a] > OBJECT);
+            object.fold([0; 2], |[seen, not], a| if all[a].2 { [seen + 1, not] } else { [seen, not + 1] })
+        };
+        assert_eq!([behind(0.0), behind(0.2)], [[256, 0], [256, 48]]);
     }
 }
