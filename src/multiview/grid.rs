@@ -274,6 +274,59 @@ mod tests {
         assert!(at(0.5) < 0.004 && at(0.8) < 0.03, "{} {}", at(0.5), at(0.8));
     }
 
+    /// Depth beside the object and elsewhere against the truth: `GSCREAM_DEPTHS=SCENE:SCENE...`, as `.ci/scenes` makes them.
+    #[test]
+    #[ignore = "needs captures with true depth"]
+    fn depths_beside_true_ones() {
+        const BESIDE: i64 = 12; // pixels
+        const WRONG: f64 = 0.03;
+        let Ok(folders) = std::env::var("GSCREAM_DEPTHS") else { return };
+        for folder in folders.split(':').map(std::path::Path::new) {
+            let config = Config { masks: false, prior_folder: "none".into(), downscale: 1, ..Config::default() };
+            let scene = load(folder, &config).expect("it loads");
+            let began = std::time::Instant::now();
+            let grids = depths(&testing::gpu(), &scene).expect("a device");
+            let seconds = began.elapsed().as_secs_f64();
+            let mut counts = [[0; 4]; 2]; // beside, elsewhere: sites, confirmed, wrong of these, wrong
+            for (grid, view) in grids.iter().zip(&scene.train) {
+                let read = |what: &str, end: &str| folder.join(what).join(format!("{}.{end}", view.name));
+                let mask = image::open(read("test_masks", "png")).expect("a mask").into_luma8();
+                let bytes = std::fs::read(read("test_depth", "npy")).expect("true depth");
+                let (w, h) = mask.dimensions();
+                let truth: Vec<f32> = bytemuck::pod_collect_to_vec(&bytes[bytes.len() - 4 * (w * h) as usize..]);
+                let on = |x: i64, y: i64| {
+                    let inside = x >= 0 && y >= 0 && x < i64::from(w) && y < i64::from(h);
+                    inside && mask.get_pixel(x as u32, y as u32).0[0] != 0
+                };
+                for site in 0..grid.depth.len() {
+                    let [x, y] = [site as u32 % grid.columns, site as u32 / grid.columns].map(|n| i64::from(n * 2 + 1));
+                    let z = f64::from(truth[(y * i64::from(w) + x) as usize]);
+                    if on(x, y) || z <= 0.0 {
+                        continue;
+                    }
+                    let reach = || (-BESIDE..=BESIDE).step_by(3);
+                    let beside = reach().any(|dy| reach().any(|dx| on(x + dx, y + dy)));
+                    let wrong = !((grid.depth[site] / z - 1.0).abs() <= WRONG);
+                    let count = &mut counts[usize::from(!beside)];
+                    count[0] += 1;
+                    count[1] += usize::from(grid.confirmed[site]);
+                    count[2] += usize::from(grid.confirmed[site] && wrong);
+                    count[3] += usize::from(wrong);
+                }
+            }
+            for (name, [sites, confirmed, known, all]) in ["beside", "elsewhere"].into_iter().zip(counts) {
+                let share = |n: usize, of: usize| 100.0 * n as f64 / of.max(1) as f64;
+                println!(
+                    "{} {name}: {:.1} % confirmed, {:.2} % of these wrong, {:.2} % of all; {seconds:.0} s",
+                    folder.file_name().unwrap_or_default().display(),
+                    share(confirmed, sites),
+                    share(known, confirmed),
+                    share(all, sites)
+                );
+            }
+        }
+    }
+
     #[test]
     fn a_speck_becomes_what_is_around_it_and_an_edge_stays() {
         let camera = Camera {
