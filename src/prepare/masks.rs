@@ -41,8 +41,9 @@ const ATTACHED: f32 = 0.05;
 /// Part of the object's extent from what masked views have seen of it: farther out, outside the pictures of them all, nothing is the object's,
 /// and nearer what has rather its colours.
 const BEYOND: f32 = 0.5;
-/// What masked views have not seen is none of the object up to this part of its radius above what it stands on.
-const UNDERFOOT: f64 = 0.05;
+/// What masked views have not seen is none of the object from the first to the second part of its radius above the plane that it stands
+/// on. Farther below hangs what reaches over a table's edge.
+const UNDERFOOT: [f64; 2] = [-0.15, 0.05];
 /// Part of what lies around it that must be on the plane that it stands on: within so many radii, up to this part of the radius above and
 /// below.
 const FLAT: f64 = 0.6;
@@ -115,7 +116,7 @@ impl Votes {
     /// Counts them. `positions` and `colors` are the anchors': a Gaussian that no masked view has seen votes as its anchor
     /// does, and an anchor that none has seen as those which are near it and look like it. What stands behind the object is
     /// as near to it as its own other side, but seldom of its colour; what stands elsewhere may be of its colour, but does not hang
-    /// together with it. Beyond the pictures' borders there is little of it, and below what it stands on nothing.
+    /// together with it. Beyond the pictures' borders there is little of it, and on the plane that it stands on nothing.
     pub fn count(&self, positions: &[[f32; 3]], colors: &[[f32; 3]]) -> Shares {
         let offsets = self.all.len() / positions.len().max(1);
         let of_anchors: Vec<[f32; 2]> = (0..positions.len())
@@ -155,7 +156,7 @@ impl Votes {
         };
         let (places, looks) = (at(&object, positions), [at(&object, colors), at(&other, colors)]);
         let support = self.support(positions, &object, &other, f64::from(extent));
-        let underfoot = |a: usize| support.as_ref().is_some_and(|(s, height)| s.local(point(positions[a])).z < *height);
+        let underfoot = |a: usize| support.as_ref().is_some_and(|(s, on)| on.contains(&s.local(point(positions[a])).z));
         let framed = |a: usize| self.cameras.iter().any(|c| c.within(positions[a].map(f64::from)).is_some());
         let possible = |a: usize| {
             let near = || distance(&places, &positions[a], 1) <= BEYOND * extent;
@@ -182,15 +183,14 @@ impl Votes {
         shares
     }
 
-    /// What the object stands on, and the height over it up to which what was not seen is no part of the object; nothing for what lies
-    /// flat.
+    /// What the object stands on, and the heights over it at which what was not seen is no part of the object; nothing for what lies flat.
     fn support(
         &self,
         positions: &[[f32; 3]],
         object: &[usize],
         other: &[usize],
         extent: f64,
-    ) -> Option<(Support, f64)> {
+    ) -> Option<(Support, std::ops::Range<f64>)> {
         let some = |of: &[usize], most: usize| -> Vec<DVec3> {
             of.iter().step_by(of.len().div_ceil(most).max(1)).map(|a| point(positions[*a])).collect()
         };
@@ -199,7 +199,7 @@ impl Votes {
         let near: Vec<usize> =
             other.iter().copied().filter(|a| point(positions[*a]).distance(middle) <= 2.0 * extent).collect();
         let support = plane::find(&some(&near, PLACES[1]), &object, up::estimate(&self.cameras), 0)?;
-        let height = UNDERFOOT * radius;
+        let [below, height] = UNDERFOOT.map(|part| part * radius);
         // What is low around it, most of which is a plane's: a back or a cushion is none.
         let low = near.iter().map(|a| support.local(point(positions[*a])));
         let (mut on, mut all) = (0, 0);
@@ -207,7 +207,7 @@ impl Votes {
             all += 1;
             on += i32::from(local.z.abs() < height);
         }
-        (support.height > 4.0 * height && f64::from(on) > FLAT * f64::from(all)).then_some((support, height))
+        (support.height > 4.0 * height && f64::from(on) > FLAT * f64::from(all)).then_some((support, below..height))
     }
 }
 
@@ -495,7 +495,7 @@ mod tests {
     }
 
     /// A dark box on a grey floor, in its shadow behind it a piece of the floor as dark as the box that no masked view has seen: it is
-    /// the floor. At half of the box's height it would be the object.
+    /// the floor. At half of the box's height it would be the object, and so far below the floor.
     #[test]
     fn what_it_stands_on_is_none_of_the_object() {
         let (dark, grey) = ([0.2, 0.2, 0.25], [0.6; 3]);
@@ -518,6 +518,6 @@ mod tests {
             let object = (0..all.len()).filter(|a| shares.object[*a] > OBJECT);
             object.fold([0; 2], |[seen, not], a| if all[a].2 { [seen + 1, not] } else { [seen, not + 1] })
         };
-        assert_eq!([behind(0.0), behind(0.2)], [[256, 0], [256, 48]]);
+        assert_eq!([behind(0.0), behind(0.2), behind(-0.1)], [[256, 0], [256, 48], [256, 48]]);
     }
 }
