@@ -68,7 +68,7 @@ const STREAM: u128 = 0x7265_6c6f_6361_7465;
 /// Share by which a round enlarges the number of plain Gaussians, as 3DGS-MCMC does.
 pub const GROWTH: f64 = 0.05;
 
-/// What decides who becomes two and where the halves lie, on the host.
+/// Rows that decide who becomes two and where the halves lie, on the host.
 struct Rows {
     position: Vec<f32>,
     log_scale: Vec<f32>,
@@ -77,7 +77,7 @@ struct Rows {
 }
 
 impl Rows {
-    /// Those of all Gaussians, in one submission.
+    /// Reads the rows of all Gaussians, in one submission.
     fn read(gpu: &Gpu, gaussians: &Static) -> Result<Self, Error> {
         let mut rec = gpu.recorder()?;
         let mut copies = vec![];

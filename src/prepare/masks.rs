@@ -15,7 +15,7 @@ use super::shadow::plane::{self, Support};
 use super::splats::{Share, Splats};
 use crate::gpu::Error;
 use crate::scene::{Camera, View, resample, up};
-use crate::statistics::{median, quantile};
+use crate::statistics::median;
 
 /// A Gaussian of whose footprint less than this part shows in a view has no vote there. A short fit's object lets a tenth and
 /// more of what stands behind it through, all of it inside the mask.
@@ -41,8 +41,8 @@ const ATTACHED: f32 = 0.05;
 /// Part of the object's extent from what masked views have seen of it: farther out, outside the pictures of them all, nothing is the object's,
 /// and nearer what has rather its colours.
 const BEYOND: f32 = 0.5;
-/// What masked views have not seen is none of the object from the first to the second part of its radius above the plane that it stands
-/// on. Farther below hangs what reaches over a table's edge.
+/// Heights above the plane that the object stands on, as parts of its radius: between them nothing is the object that masked views have
+/// not seen. Farther below hangs what reaches over a table's edge.
 const UNDERFOOT: [f64; 2] = [-0.15, 0.05];
 /// Part of what lies around it that must be on the plane that it stands on: within so many radii, up to this part of the radius above and
 /// below.
@@ -142,8 +142,6 @@ impl Votes {
         let part = |a: usize| if is_seen(a) { of_anchors[a][0] / of_anchors[a][1] } else { around(a) };
         let mut priors: Vec<f32> = (0..positions.len()).into_par_iter().map(part).collect();
         let inside = |a: usize| if is_seen(a) { of_anchors[a][0] } else { 0.0 };
-        let found = |a: &usize| is_seen(*a) && priors[*a] > OBJECT;
-        let extent = extent(positions, (0..positions.len()).filter(found));
         let (object, other): (Vec<usize>, Vec<usize>) = seen.iter().partition(|a| priors[**a] > OBJECT);
         let at = |of: &[usize], values: &[[f32; 3]]| {
             ImmutableKdTree::<f32, 3>::new_from_slice(&of.iter().map(|a| values[*a]).collect::<Vec<_>>())
@@ -155,7 +153,12 @@ impl Votes {
             near.map_or(f32::INFINITY, f32::sqrt)
         };
         let (places, looks) = (at(&object, positions), [at(&object, colors), at(&other, colors)]);
-        let support = self.support(positions, &object, &other, f64::from(extent));
+        let points = |of: &[usize]| -> Vec<DVec3> { of.iter().map(|a| point(positions[*a])).collect() };
+        let ball = plane::ball(&points(&object));
+        let extent = ball.map_or(0.0, |(_, radius)| 2.0 * radius as f32);
+        // Where all was seen nobody asks.
+        let asked = ball.filter(|_| (0..positions.len()).any(|a| !is_seen(a) && priors[a] > 0.0));
+        let support = asked.and_then(|ball| self.support(&points(&object), points(&other).into_iter(), ball));
         let underfoot = |a: usize| support.as_ref().is_some_and(|(s, on)| on.contains(&s.local(point(positions[a])).z));
         let framed = |a: usize| self.cameras.iter().any(|c| c.within(positions[a].map(f64::from)).is_some());
         let possible = |a: usize| {
@@ -183,25 +186,23 @@ impl Votes {
         shares
     }
 
-    /// What the object stands on, and the heights over it at which what was not seen is no part of the object; nothing for what lies flat.
+    /// The plane that the object stands on, and the heights over it at which what was not seen is no part of the object; nothing for what
+    /// lies flat. The object lies within a radius around its middle.
     fn support(
         &self,
-        positions: &[[f32; 3]],
-        object: &[usize],
-        other: &[usize],
-        extent: f64,
+        object: &[DVec3],
+        other: impl Iterator<Item = DVec3>,
+        (middle, radius): (DVec3, f64),
     ) -> Option<(Support, std::ops::Range<f64>)> {
-        let some = |of: &[usize], most: usize| -> Vec<DVec3> {
-            of.iter().step_by(of.len().div_ceil(most).max(1)).map(|a| point(positions[*a])).collect()
+        let some = |of: &[DVec3], most: usize| -> Vec<DVec3> {
+            of.iter().step_by(of.len().div_ceil(most).max(1)).copied().collect()
         };
-        let object = some(object, PLACES[0]);
-        let (middle, radius) = plane::extent(&object)?;
-        let near: Vec<usize> =
-            other.iter().copied().filter(|a| point(positions[*a]).distance(middle) <= 2.0 * extent).collect();
-        let support = plane::find(&some(&near, PLACES[1]), &object, up::estimate(&self.cameras), 0)?;
+        let near: Vec<DVec3> = other.filter(|p| p.distance(middle) <= 4.0 * radius).collect();
+        let (around, object) = (some(&near, PLACES[1]), some(object, PLACES[0]));
+        let support = plane::find(&around, &object, up::estimate(&self.cameras), 0)?;
         let [below, height] = UNDERFOOT.map(|part| part * radius);
         // What is low around it, most of which is a plane's: a back or a cushion is none.
-        let low = near.iter().map(|a| support.local(point(positions[*a])));
+        let low = near.iter().map(|p| support.local(*p));
         let (mut on, mut all) = (0, 0);
         for local in low.filter(|p| p.z.abs() < LOW * radius && p.truncate().length() < AROUND * radius) {
             all += 1;
@@ -240,14 +241,6 @@ fn apart(positions: &[[f32; 3]], priors: &[f32], side: f32, inside: impl Fn(usiz
         }
     }
     alone
-}
-
-/// Twice the radius around their middle that holds nine tenths of these anchors.
-fn extent(positions: &[[f32; 3]], some: impl Iterator<Item = usize> + Clone) -> f32 {
-    let middle: Option<Vec<f64>> = (0..3).map(|k| median(some.clone().map(|a| positions[a][k]))).collect();
-    let Some(middle) = middle else { return 0.0 };
-    let off = |a: usize| (0..3).map(|k| (f64::from(positions[a][k]) - middle[k]).powi(2)).sum::<f64>().sqrt() as f32;
-    quantile(some.map(off), 0.9).map_or(0.0, |radius| 2.0 * radius as f32)
 }
 
 /// Median distance of some anchors to the next.

@@ -51,14 +51,15 @@ fn middle(points: &[DVec3]) -> DVec3 {
     DVec3::from(std::array::from_fn(|axis| median(points.iter().map(|p| p[axis])).expect("there are points")))
 }
 
-/// The object's middle and the radius around it that nine in ten of its places lie in; nothing where there are too few.
+/// The middle of places and the radius around it that nine in ten of them lie in; nothing without any.
+pub fn ball(points: &[DVec3]) -> Option<(DVec3, f64)> {
+    let middle = (!points.is_empty()).then(|| middle(points))?;
+    Some((middle, quantile(points.iter().map(|p| (*p - middle).length()), 0.9)?))
+}
+
+/// The [`ball`] of an object; nothing where it has too few places.
 pub fn extent(object: &[DVec3]) -> Option<(DVec3, f64)> {
-    if object.len() < 20 {
-        return None;
-    }
-    let middle = middle(object);
-    let radius = quantile(object.iter().map(|p| (*p - middle).length()), 0.9)?;
-    (radius > 0.0).then_some((middle, radius))
+    ball(object).filter(|(_, radius)| object.len() >= 20 && *radius > 0.0)
 }
 
 /// The plane that the object rests on: of `around`, places on what surrounds it, those near it count most. `up` is the
