@@ -53,6 +53,8 @@ const LEAST: f64 = 0.06;
 const TRIES: usize = 1500;
 /// A point lies on a plane if it is off by at most this part of its camera's distance from the plane.
 pub(super) const THICKNESS: f64 = 0.01;
+/// Part of what is known around a hole that other views must confirm for the view's own planes to be looked for in that alone.
+const SURE: f64 = 0.05;
 /// Part of a view's own plane's points that lie within twice [`planes::THICKNESS`] of a common one for it to be the same.
 const COMMON: f64 = 0.5;
 
@@ -241,7 +243,15 @@ impl Sights {
         let rays: Vec<Option<[f64; 2]>> = sites.iter().map(|site| Some(own.ray(*site))).collect();
         let disparity: Vec<f32> = sites.iter().map(|site| (1.0 / own.depth[*site]) as f32).collect();
         let hole: Vec<bool> = sites.iter().map(|site| own.hole[*site]).collect();
-        let planes = own.planes_among(common, &sites, planes::around(&disparity, &rays, &hole, seed));
+        // On what is bare lie planes of noise.
+        let known = |cell: &usize| !hole[*cell] && disparity[*cell].is_finite();
+        let sure = |cell: &usize| known(cell) && own.grid.confirmed[sites[*cell]];
+        let [all, few] = [(0..sites.len()).filter(known).count(), (0..sites.len()).filter(sure).count()];
+        let among: Vec<f32> = match few as f64 >= SURE * all as f64 {
+            true => (0..sites.len()).map(|cell| if sure(&cell) { disparity[cell] } else { f32::NAN }).collect(),
+            false => disparity,
+        };
+        let planes = own.planes_among(common, &sites, planes::around(&among, &rays, &hole, seed));
         if planes.is_empty() || !own.grid.trusted {
             return Flat { planes, ..Flat::default() };
         }
@@ -458,6 +468,17 @@ mod tests {
             assert!(patch.len() > 30, "{}", patch.len());
             let flat = patch.iter().filter(|site| (sight.depth[**site] / 4.0 - 1.0).abs() < 0.005).count();
             assert!(flat * 10 > patch.len() * 9, "{flat} of {}", patch.len());
+        }
+    }
+
+    /// What lies on a plane before the wall is one if other views confirm it, and a bare wall's noise otherwise.
+    #[test]
+    fn noise_makes_no_plane() {
+        for confirmed in [false, true] {
+            let (sights, _) = patched(|_, _| 90, confirmed);
+            let planes = sights.flat(2, &[], &sights.points(), 0.1, 1).planes;
+            assert!(planes.iter().any(|plane| (1.0 / plane[2] / 4.0 - 1.0).abs() < 0.01), "{planes:?}");
+            assert_eq!(planes.len(), if confirmed { 2 } else { 1 }, "{planes:?}");
         }
     }
 

@@ -64,7 +64,8 @@ impl Sights {
         if !known.is_finite() || known == 0.0 {
             Witness::Silent
         } else if z < (1.0 - APART) * known {
-            Witness::Through
+            // What is bare is measured anywhere, and proves nothing unless others confirm it.
+            if hole || sight.grid.confirmed[site] { Witness::Through } else { Witness::Silent }
         } else if object {
             Witness::Silent
         } else if (z / known - 1.0).abs() <= SAME {
@@ -175,6 +176,25 @@ mod tests {
             assert!(block.iter().all(|site| sights.0[2].depth[*site].is_nan() != confirmed));
             let others = (0..5).filter(|view| *view != 2).map(|view| &sights.0[view]);
             assert!(others.flat_map(|sight| sight.depth.iter().zip(&sight.hole)).all(|(z, hole)| z.is_nan() == *hole));
+        }
+    }
+
+    /// Depths behind the wall prove that it is not there where others confirm them, not where they are of a bare wall's noise.
+    #[test]
+    fn noise_looks_through_nothing() {
+        for confirmed in [false, true] {
+            let (mut grids, cameras, masks) = views(0.2);
+            for grid in &mut grids[..3] {
+                for site in (0..grid.depth.len()).filter(|site| grid.depth[*site] > 3.0).collect::<Vec<_>>() {
+                    (grid.depth[site], grid.confirmed[site]) = (5.0, confirmed);
+                }
+            }
+            let mut sights = Sights::new(grids, &cameras, &masks, &masks);
+            // The fourth is asked; the fifth has the wall where it is.
+            sights.0[4].grid.trusted = false;
+            let wall = DVec3::new(0.9, 0.5, 4.0);
+            assert_eq!(sights.is_refuted(3, wall), confirmed);
+            assert_eq!(sights.against(3, wall) == 1.0, confirmed);
         }
     }
 
