@@ -3,7 +3,7 @@
 //! A mask says of every pixel whether it is of its object, so that each object's masks vote by themselves: who marks one object
 //! in one photograph and another one in the next does not say that the first is not there.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use image::{GrayImage, RgbImage};
@@ -159,6 +159,36 @@ impl<'a> Carrier<'a> {
         Ok(all)
     }
 
+    /// Masks that were cut, without what stands behind the object by the fit: what is seen through its gaps. Those of photographs in
+    /// `wrong` places stay. And the names of the others that have lost something, and `[anchor]` whether it is of what they have lost.
+    fn before(
+        &self,
+        splats: &mut Splats,
+        given: &BTreeMap<String, Given>,
+        wrong: &BTreeSet<&str>,
+    ) -> Result<(BTreeMap<String, Given>, Vec<String>, Vec<bool>), Error> {
+        let cut = |view: &&View| {
+            given.get(&view.name).is_some_and(|given| !given.drawn.is_empty()) && !wrong.contains(view.name.as_str())
+        };
+        let views: Vec<&View> = self.scene.train.iter().filter(cut).collect();
+        let mut votes = masks::Votes::new(splats);
+        for view in &views {
+            votes.add(splats, &view.camera, &masks::parts(&given[&view.name].mask, view.camera.size))?;
+        }
+        let behind = votes.behind(self.fit.positions());
+        let (mut all, mut lost) = (given.clone(), vec![]);
+        for view in views.into_iter().filter(|_| behind.contains(&true)) {
+            let part = masks::part_of(splats, &view.camera, &behind)?;
+            let Some(Given { mask, .. }) = all.get_mut(&view.name) else { continue };
+            let away = masks::threshold(&part, view.camera.size, mask.dimensions().into(), 0.5);
+            let both: Vec<usize> =
+                (0..away.as_raw().len()).filter(|i| mask.as_raw()[*i] != 0 && away.as_raw()[*i] != 0).collect();
+            both.iter().for_each(|i| mask.as_mut()[*i] = 0);
+            lost.extend((!both.is_empty()).then(|| view.name.clone()));
+        }
+        Ok((all, lost, behind))
+    }
+
     /// `[view][pixel]` of the fit's pictures: whether what is there is none of the object, by the given masks and the depth that
     /// is measured between the photographs.
     fn beside(&self, given: &BTreeMap<String, Given>) -> Vec<Vec<bool>> {
@@ -177,14 +207,17 @@ impl<'a> Carrier<'a> {
         watch: &mut dyn Watch,
     ) -> Result<Carried, Error> {
         let scene = self.scene;
-        let given = &self.placed(splats, given)?;
         let wrong = misplaced::wrong(scene, &self.grids);
+        let placed = self.placed(splats, given)?;
+        let (given, lost, behind) = self.before(splats, &placed, &wrong)?;
+        let given = &given;
         let (voters, misplaced) = misplaced::voters(scene, &wrong, given)?;
         let mut votes = masks::Votes::new(splats);
         for view in &voters {
             votes.add(splats, &view.camera, &masks::parts(&given[&view.name].mask, view.camera.size))?;
             self.turn(watch)?;
         }
+        votes.deny(&behind);
         let mut shares = votes.count(self.fit.positions(), &self.colors);
         let others: Vec<usize> =
             (0..scene.train.len()).filter(|at| !given.contains_key(&scene.train[*at].name)).collect();
@@ -226,6 +259,7 @@ impl<'a> Carrier<'a> {
                 votes.add(splats, &view.camera, &masks::parts(mask, view.camera.size))?;
                 watch.go_on()?;
             }
+            votes.deny(&behind);
             shares = votes.count(self.fit.positions(), &self.colors);
             carried = carry(&shares, splats)?;
         }
@@ -237,7 +271,12 @@ impl<'a> Carrier<'a> {
         let names: Vec<&str> = voters.iter().map(|view| view.name.as_str()).collect();
         let masks = self.large(given, &names, outlines, watch)?;
         let shown = masks.iter().filter(|(mask, _)| mask.as_raw().iter().any(|v| *v != 0)).count();
-        let notes = misplaced.into_iter().chain(self.notes(shown, thin, &moved, object)).collect();
+        let lost: Vec<&str> = lost.iter().map(String::as_str).collect();
+        let lost = (!lost.is_empty()).then(|| {
+            let names = abridged(&lost);
+            format!("what stands behind the object and apart from it is none of it, and was taken out of its mask in {names}")
+        });
+        let notes = misplaced.into_iter().chain(lost).chain(self.notes(shown, thin, &moved, object)).collect();
         Ok(Carried { masks, shown, notes })
     }
 

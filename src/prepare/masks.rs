@@ -15,7 +15,7 @@ use super::shadow::plane::{self, Support};
 use super::splats::{Share, Splats};
 use crate::gpu::Error;
 use crate::scene::{Camera, View, resample, up};
-use crate::statistics::median;
+use crate::statistics::{median, quantile};
 
 /// A Gaussian of whose footprint less than this part shows in a view has no vote there. A short fit's object lets a tenth and
 /// more of what stands behind it through, all of it inside the mask.
@@ -38,6 +38,11 @@ const STEP: f32 = 0.125;
 const STEP_SPACINGS: f32 = 4.0;
 /// A piece that hangs together is the object where it has this part of all that the masked views have seen of it.
 const ATTACHED: f32 = 0.05;
+/// A piece is behind the object where it has less than this part of its votes, and begins farther away than the object ends by this part
+/// of its extent; and the part of each that is nearer or farther.
+const SMALL: f32 = 0.25;
+const BEHIND: f64 = 0.25;
+const NEAREST: f64 = 0.05;
 /// Part of the object's extent from what masked views have seen of it: farther out, outside the pictures of them all, nothing is the object's,
 /// and nearer what has rather its colours.
 const BEYOND: f32 = 0.5;
@@ -113,6 +118,13 @@ impl Votes {
         self.all.iter_mut().zip(&others.all).for_each(|(sum, votes)| *sum += votes);
     }
 
+    /// Takes the votes for these anchors away: they are none of the object.
+    pub fn deny(&mut self, anchors: &[bool]) {
+        let offsets = self.all.len() / anchors.len().max(1);
+        let votes = self.inside.iter_mut().enumerate();
+        votes.filter(|(g, _)| anchors[g / offsets]).for_each(|(_, inside)| *inside = 0.0);
+    }
+
     /// Counts them. `positions` and `colors` are the anchors': a Gaussian that no masked view has seen votes as its anchor
     /// does, and an anchor that none has seen as those which are near it and look like it. What stands behind the object is
     /// as near to it as its own other side, but seldom of its colour; what stands elsewhere may be of its colour, but does not hang
@@ -186,6 +198,48 @@ impl Votes {
         shares
     }
 
+    /// `[anchor]` whether it is of what is seen through the object's gaps, or beside it where the masks are too wide: a small piece of what
+    /// they cover that is apart from the rest, and behind it in all masked views that show it.
+    pub fn behind(&self, positions: &[[f32; 3]]) -> Vec<bool> {
+        let offsets = self.all.len() / positions.len().max(1);
+        let of = |votes: &[f32], a: usize| votes[a * offsets..(a + 1) * offsets].iter().sum::<f32>();
+        let covered: Vec<usize> = (0..positions.len())
+            .filter(|a| {
+                let all = of(&self.all, *a);
+                all > SEEN && of(&self.inside, *a) > OBJECT * all
+            })
+            .collect();
+        let votes = |piece: &[usize]| piece.iter().map(|a| of(&self.inside, *a)).sum::<f32>();
+        let points = |piece: &[usize]| -> Vec<DVec3> { piece.iter().map(|a| point(positions[*a])).collect() };
+        let apart = |side: f32| {
+            let mut pieces = pieces(positions, &covered, side);
+            pieces.sort_by(|a, b| votes(b).total_cmp(&votes(a)));
+            let extent = pieces.first().and_then(|main| plane::ball(&points(main))).map(|(_, radius)| 2.0 * radius);
+            (pieces, extent)
+        };
+        let mut found = vec![false; positions.len()];
+        // What is behind makes the whole larger than the object is.
+        let least = STEP_SPACINGS * spacing(positions);
+        let Some(extent) = apart(least).1 else { return found };
+        let (pieces, Some(extent)) = apart(least.max(STEP * extent as f32)) else { return found };
+        let main = points(&pieces[0]);
+        for piece in pieces[1..].iter().filter(|piece| votes(piece) < SMALL * votes(&pieces[0])) {
+            let own = points(piece);
+            let shown = |camera: &&Camera| own.iter().any(|p| camera.within(p.to_array()).is_some());
+            let is_behind = |camera: &Camera| {
+                let far = |of: &[DVec3], share: f64| {
+                    quantile(of.iter().map(|p| p.distance(DVec3::from(camera.center()))), share)
+                };
+                far(&own, NEAREST) > far(&main, 1.0 - NEAREST).map(|far| far + BEHIND * extent)
+            };
+            let mut shown = self.cameras.iter().filter(shown).peekable();
+            if shown.peek().is_some() && shown.all(is_behind) {
+                piece.iter().for_each(|a| found[*a] = true);
+            }
+        }
+        found
+    }
+
     /// The plane that the object stands on, and the heights over it at which what was not seen is no part of the object; nothing for what
     /// lies flat. The object lies within a radius around its middle.
     fn support(
@@ -216,17 +270,14 @@ fn point(at: [f32; 3]) -> DVec3 {
     DVec3::from(at.map(f64::from))
 }
 
-/// Anchors of which more than [`OBJECT`] is the object, by `priors`, in pieces that do not hang together with what was seen of it:
-/// `inside` are an anchor's votes for the object, none where it was not seen; those in neighbouring cells of this `side` hang together.
-fn apart(positions: &[[f32; 3]], priors: &[f32], side: f32, inside: impl Fn(usize) -> f32) -> Vec<usize> {
-    let object: Vec<usize> = (0..positions.len()).filter(|a| priors[*a] > OBJECT).collect();
-    let all: f32 = object.iter().map(|a| inside(*a)).sum();
+/// Pieces of these anchors that hang together: those in neighbouring cells of this side do.
+fn pieces(positions: &[[f32; 3]], of: &[usize], side: f32) -> Vec<Vec<usize>> {
     let cell =
         |a: usize| -> [i64; 3] { std::array::from_fn(|k| (positions[a][k] / side).floor().clamp(-1e9, 1e9) as i64) };
     let mut cells: HashMap<[i64; 3], Vec<usize>> = HashMap::new();
-    object.iter().for_each(|a| cells.entry(cell(*a)).or_default().push(*a));
-    let mut alone = vec![];
-    for a in &object {
+    of.iter().for_each(|a| cells.entry(cell(*a)).or_default().push(*a));
+    let mut found = vec![];
+    for a in of {
         let mut piece = vec![];
         let mut open: Vec<[i64; 3]> = vec![cell(*a)];
         while let Some([x, y, z]) = open.pop() {
@@ -236,11 +287,19 @@ fn apart(positions: &[[f32; 3]], priors: &[f32], side: f32, inside: impl Fn(usiz
                 (-1..=1).flat_map(|dz| (-1..=1).flat_map(move |dy| (-1..=1).map(move |dx| [x + dx, y + dy, z + dz])));
             open.extend(around.filter(|cell| cells.contains_key(cell)));
         }
-        if piece.iter().map(|a| inside(*a)).sum::<f32>() < ATTACHED * all {
-            alone.extend(piece);
-        }
+        found.extend((!piece.is_empty()).then_some(piece));
     }
-    alone
+    found
+}
+
+/// Anchors of which more than [`OBJECT`] is the object, by `priors`, in pieces that do not hang together with what was seen of it:
+/// `inside` are an anchor's votes for the object, none where it was not seen; those in neighbouring cells of this `side` hang together.
+fn apart(positions: &[[f32; 3]], priors: &[f32], side: f32, inside: impl Fn(usize) -> f32) -> Vec<usize> {
+    let object: Vec<usize> = (0..positions.len()).filter(|a| priors[*a] > OBJECT).collect();
+    let votes = |of: &[usize]| of.iter().map(|a| inside(*a)).sum::<f32>();
+    let all = votes(&object);
+    let pieces = pieces(positions, &object, side).into_iter();
+    pieces.filter(|piece| votes(piece) < ATTACHED * all).flatten().collect()
 }
 
 /// Median distance of some anchors to the next.
@@ -267,6 +326,17 @@ pub fn colors(splats: &mut Splats, views: &[View]) -> Result<Vec<[f32; 3]>, Erro
         }
     }
     Ok(sums.into_iter().map(|s| if s[3] > 0.0 { std::array::from_fn(|c| s[c] / s[3]) } else { [0.5; 3] }).collect())
+}
+
+/// `[pixel]` of a view the part of what covers it that is of these anchors.
+///
+/// # Errors
+/// When the device has no room, or is lost.
+pub fn part_of(splats: &mut Splats, camera: &Camera, anchors: &[bool]) -> Result<Vec<f32>, Error> {
+    let offsets = splats.offsets();
+    let drawn = splats.paint(camera, |name, _| Some([f32::from(anchors[name as usize / offsets]), 0.0, 0.0]))?;
+    let pixels = drawn.rgb.iter().zip(&drawn.transmittance);
+    Ok(pixels.map(|(rgb, left)| if 1.0 - left < COVERED { 0.0 } else { rgb[0] / (1.0 - left) }).collect())
 }
 
 impl Shares {
@@ -512,5 +582,27 @@ mod tests {
             object.fold([0; 2], |[seen, not], a| if all[a].2 { [seen + 1, not] } else { [seen, not + 1] })
         };
         assert_eq!([behind(0.0), behind(0.2), behind(-0.1)], [[256, 0], [256, 48], [256, 48]]);
+    }
+
+    /// What is seen through an object's gaps stands behind it and apart from it. What stands beside it may be of it, and what has as much
+    /// of the mask.
+    #[test]
+    fn what_is_seen_through_gaps_is_behind() {
+        let square = |x: f32, z: f32, side: usize| {
+            let at = move |i: usize| [x + 0.05 * (i % side) as f32, 0.05 * (i / side) as f32 - 0.2, z];
+            (0..side * side).map(at).collect::<Vec<_>>()
+        };
+        for (aside, deep, votes, is_behind) in
+            [(0.0, 4.0, 1.0, true), (0.0, 2.2, 1.0, false), (1.0, 2.0, 1.0, false), (0.0, 4.0, 50.0, false)]
+        {
+            let (object, piece) = (square(0.0, 2.0, 8), square(aside, deep, 3));
+            let places = [object.as_slice(), &piece].concat();
+            let inside: Vec<f32> =
+                (0..places.len()).map(|a| if a < object.len() { 9.0 } else { 9.0 * votes }).collect();
+            let votes = Votes { all: inside.clone(), inside, cameras: vec![camera()] };
+            let behind = votes.behind(&places);
+            assert!(behind[..object.len()].iter().all(|behind| !behind), "{aside} {deep}");
+            assert!(behind[object.len()..].iter().all(|behind| *behind == is_behind), "{aside} {deep}");
+        }
     }
 }
