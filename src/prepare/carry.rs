@@ -159,34 +159,34 @@ impl<'a> Carrier<'a> {
         Ok(all)
     }
 
-    /// Masks that were cut, without what stands behind the object by the fit: what is seen through its gaps. Those of photographs in
-    /// `wrong` places stay. And the names of the others that have lost something, and `[anchor]` whether it is of what they have lost.
-    fn before(
+    /// Takes out of masks that were cut what stands behind the object by the fit: what is seen through its gaps. Those of photographs in
+    /// `wrong` places stay. Returns the names of the others that have lost something, and `[anchor]` whether it is of that.
+    fn clear_behind(
         &self,
         splats: &mut Splats,
-        given: &BTreeMap<String, Given>,
+        given: &mut BTreeMap<String, Given>,
         wrong: &BTreeSet<&str>,
-    ) -> Result<(BTreeMap<String, Given>, Vec<String>, Vec<bool>), Error> {
+    ) -> Result<(Vec<&'a str>, Vec<bool>), Error> {
         let cut = |view: &&View| {
             given.get(&view.name).is_some_and(|given| !given.drawn.is_empty()) && !wrong.contains(view.name.as_str())
         };
-        let views: Vec<&View> = self.scene.train.iter().filter(cut).collect();
+        let views: Vec<&'a View> = self.scene.train.iter().filter(cut).collect();
         let mut votes = masks::Votes::new(splats);
         for view in &views {
             votes.add(splats, &view.camera, &masks::parts(&given[&view.name].mask, view.camera.size))?;
         }
         let behind = votes.behind(self.fit.positions());
-        let (mut all, mut lost) = (given.clone(), vec![]);
+        let mut lost = vec![];
         for view in views.into_iter().filter(|_| behind.contains(&true)) {
             let part = masks::part_of(splats, &view.camera, &behind)?;
-            let Some(Given { mask, .. }) = all.get_mut(&view.name) else { continue };
+            let Some(Given { mask, .. }) = given.get_mut(&view.name) else { continue };
             let away = masks::threshold(&part, view.camera.size, mask.dimensions().into(), 0.5);
             let both: Vec<usize> =
                 (0..away.as_raw().len()).filter(|i| mask.as_raw()[*i] != 0 && away.as_raw()[*i] != 0).collect();
             both.iter().for_each(|i| mask.as_mut()[*i] = 0);
-            lost.extend((!both.is_empty()).then(|| view.name.clone()));
+            lost.extend((!both.is_empty()).then_some(view.name.as_str()));
         }
-        Ok((all, lost, behind))
+        Ok((lost, behind))
     }
 
     /// `[view][pixel]` of the fit's pictures: whether what is there is none of the object, by the given masks and the depth that
@@ -208,9 +208,9 @@ impl<'a> Carrier<'a> {
     ) -> Result<Carried, Error> {
         let scene = self.scene;
         let wrong = misplaced::wrong(scene, &self.grids);
-        let placed = self.placed(splats, given)?;
-        let (given, lost, behind) = self.before(splats, &placed, &wrong)?;
-        let given = &given;
+        let mut placed = self.placed(splats, given)?;
+        let (lost, behind) = self.clear_behind(splats, &mut placed, &wrong)?;
+        let given = &placed;
         let (voters, misplaced) = misplaced::voters(scene, &wrong, given)?;
         let mut votes = masks::Votes::new(splats);
         for view in &voters {
@@ -271,7 +271,6 @@ impl<'a> Carrier<'a> {
         let names: Vec<&str> = voters.iter().map(|view| view.name.as_str()).collect();
         let masks = self.large(given, &names, outlines, watch)?;
         let shown = masks.iter().filter(|(mask, _)| mask.as_raw().iter().any(|v| *v != 0)).count();
-        let lost: Vec<&str> = lost.iter().map(String::as_str).collect();
         let lost = (!lost.is_empty()).then(|| {
             let names = abridged(&lost);
             format!("what stands behind the object and apart from it is none of it, and was taken out of its mask in {names}")
