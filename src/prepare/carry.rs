@@ -159,18 +159,18 @@ impl<'a> Carrier<'a> {
         Ok(all)
     }
 
-    /// Takes out of masks that were cut what stands behind the object by the fit: what is seen through its gaps. Those of photographs in
-    /// `wrong` places stay. Returns the names of the others that have lost something, and `[anchor]` whether it is of that.
+    /// Finds what stands behind the object by the fit where all masks were cut: what is seen through its gaps. It is taken out of those
+    /// that nobody has seen. Those of photographs in `wrong` places are not asked. Returns the names of the views whose masks have lost
+    /// something, and `[anchor]` whether it is of what was found.
     fn clear_behind(
         &self,
         splats: &mut Splats,
         given: &mut BTreeMap<String, Given>,
         wrong: &BTreeSet<&str>,
     ) -> Result<(Vec<&'a str>, Vec<bool>), Error> {
-        let cut = |view: &&View| {
-            given.get(&view.name).is_some_and(|given| !given.drawn.is_empty()) && !wrong.contains(view.name.as_str())
-        };
-        let views: Vec<&'a View> = self.scene.train.iter().filter(cut).collect();
+        let asked = |view: &&View| given.contains_key(&view.name) && !wrong.contains(view.name.as_str());
+        let all_cut = given.values().all(|given| given.cut);
+        let views: Vec<&'a View> = self.scene.train.iter().filter(asked).filter(|_| all_cut).collect();
         let mut votes = masks::Votes::new(splats);
         for view in &views {
             votes.add(splats, &view.camera, &masks::parts(&given[&view.name].mask, view.camera.size))?;
@@ -179,7 +179,9 @@ impl<'a> Carrier<'a> {
         let mut lost = vec![];
         for view in views.into_iter().filter(|_| behind.contains(&true)) {
             let part = masks::part_of(splats, &view.camera, &behind)?;
-            let Some(Given { mask, .. }) = given.get_mut(&view.name) else { continue };
+            let Some(Given { mask, .. }) = given.get_mut(&view.name).filter(|given| !given.drawn.is_empty()) else {
+                continue;
+            };
             let away = masks::threshold(&part, view.camera.size, mask.dimensions().into(), 0.5);
             let both: Vec<usize> =
                 (0..away.as_raw().len()).filter(|i| mask.as_raw()[*i] != 0 && away.as_raw()[*i] != 0).collect();

@@ -17,6 +17,8 @@ use crate::scene::{self, resample};
 pub enum Evidence {
     /// A mask, not 0 on the object.
     Mask(PathBuf),
+    /// A mask that was cut by marks. It stays as it is, but what stands behind the object in it is not carried to other views.
+    Cut(PathBuf),
     /// A box around it: x0, y0 and one past x1, y1, in pixels of the photograph.
     Box([u32; 4]),
     /// A picture of strokes: white or green on the object, black or red beside it, transparent or grey elsewhere.
@@ -33,7 +35,7 @@ impl Evidence {
     /// The option that says so.
     fn option(&self) -> &'static str {
         match self {
-            Self::Mask(_) => "--mask",
+            Self::Mask(_) | Self::Cut(_) => "--mask",
             Self::Box(_) => "--box",
             Self::Strokes(_) => "--strokes",
             Self::Lasso(_) => "--lasso",
@@ -57,7 +59,7 @@ impl Evidence {
             Self::Lasso(points) => Some(Mark::Lasso { points: points.iter().map(|point| at(*point)).collect() }),
             Self::Click(point) => Some(Mark::Object { at: at(*point), scale: 0 }),
             Self::Not(point) => Some(Mark::Background { at: at(*point) }),
-            Self::Mask(_) | Self::Strokes(_) | Self::Box(_) => None,
+            Self::Mask(_) | Self::Cut(_) | Self::Strokes(_) | Self::Box(_) => None,
         }
     }
 }
@@ -140,6 +142,8 @@ pub(super) struct Given {
     pub from: String,
     /// All that was drawn, if the mask was cut from it alone: it can be cut again once more is known of the view.
     pub drawn: Vec<Drawn>,
+    /// Whether it was cut from something drawn, by the program or on its page.
+    pub cut: bool,
 }
 
 /// A drawing that a minimum cut makes a mask of.
@@ -170,7 +174,7 @@ impl Drawn {
 impl Given {
     /// A mask that counts as it is.
     pub fn fixed(mask: GrayImage, from: String) -> Self {
-        Self { mask, from, drawn: vec![] }
+        Self { mask, from, drawn: vec![], cut: false }
     }
 
     /// The mask cut again from what was drawn in its photograph, by places in space as well; the same where nothing was drawn
@@ -184,7 +188,7 @@ impl Given {
         let cuts = self.drawn.iter().map(|drawn| drawn.cut(&picture, &cues));
         let cuts: Option<Vec<GrayImage>> = cuts.collect();
         let Some(mask) = cuts.and_then(|cuts| cuts.into_iter().reduce(joined)) else { return Ok(self.clone()) };
-        Ok(Self { mask, from: format!("{}, by places in space", self.from), drawn: self.drawn.clone() })
+        Ok(Self { mask, from: format!("{}, by places in space", self.from), ..self.clone() })
     }
 }
 
@@ -246,9 +250,13 @@ fn given(capture: &Capture, object: &Object) -> Result<BTreeMap<String, Given>, 
         let given = match evidence {
             Evidence::Lasso(_) | Evidence::Click(_) | Evidence::Not(_) => of_marks(object, &stem, photograph, size)?,
             Evidence::Box(_) if marked => of_marks(object, &stem, photograph, size)?,
-            Evidence::Mask(path) => {
+            Evidence::Mask(path) | Evidence::Cut(path) => {
                 let mask = checked(path, read_mask(path, size)?, size, false)?;
-                Given::fixed(mask, format!("--mask {}", path.display()))
+                let (cut, how) = match evidence {
+                    Evidence::Cut(_) => (true, ", cut by marks"),
+                    _ => (false, ""),
+                };
+                Given { cut, ..Given::fixed(mask, format!("--mask {}{how}", path.display())) }
             }
             Evidence::Box(bounds) => {
                 let [x0, y0, x1, y1] = *bounds;
@@ -271,7 +279,12 @@ fn given(capture: &Capture, object: &Object) -> Result<BTreeMap<String, Given>, 
                          or give a mask"
                     ))
                 })?;
-                Given { mask, from: format!("--box {x0},{y0},{x1},{y1} and a graph cut"), drawn: vec![drawn] }
+                Given {
+                    mask,
+                    from: format!("--box {x0},{y0},{x1},{y1} and a graph cut"),
+                    drawn: vec![drawn],
+                    cut: true,
+                }
             }
             Evidence::Strokes(path) => {
                 let picture = scene::photograph(photograph, 1)?;
@@ -290,7 +303,7 @@ fn given(capture: &Capture, object: &Object) -> Result<BTreeMap<String, Given>, 
                         "--strokes {name}: no stroke on the object lies within the box; draw one there"
                     )));
                 }
-                Given::fixed(mask, format!("--strokes {}{within}", path.display()))
+                Given { cut: true, ..Given::fixed(mask, format!("--strokes {}{within}", path.display())) }
             }
         };
         let mask = capture.mask(&stem, given.mask);
@@ -300,15 +313,16 @@ fn given(capture: &Capture, object: &Object) -> Result<BTreeMap<String, Given>, 
                  has it nearer to the middle"
             )));
         }
-        let joins = matches!(evidence, Evidence::Mask(_) | Evidence::Box(_)) && !marked;
+        let joins = matches!(evidence, Evidence::Mask(_) | Evidence::Cut(_) | Evidence::Box(_)) && !marked;
         let given = match all.remove(&stem) {
             Some(before) if joins && named.contains(&stem) => {
                 let all_drawn = !before.drawn.is_empty() && !given.drawn.is_empty();
                 let drawn = if all_drawn { [before.drawn, given.drawn].concat() } else { vec![] };
-                Given { mask: joined(before.mask, mask), from: format!("{}, {}", before.from, given.from), drawn }
+                let cut = before.cut && given.cut;
+                Given { mask: joined(before.mask, mask), from: format!("{}, {}", before.from, given.from), drawn, cut }
             }
             // Of a photograph that the scene has resampled the drawing is elsewhere.
-            _ if capture.is_resampled(&stem) => Given::fixed(mask, given.from),
+            _ if capture.is_resampled(&stem) => Given { mask, drawn: vec![], ..given },
             _ => Given { mask, ..given },
         };
         if joins {
@@ -361,7 +375,7 @@ fn of_marks(object: &Object, stem: &str, photograph: &Path, size: [u32; 2]) -> R
             )
         }));
     };
-    Ok(Given { mask, from, drawn: vec![drawn] })
+    Ok(Given { mask, from, drawn: vec![drawn], cut: true })
 }
 
 /// Masks in the scene's folder that are not the program's own: the user has put or corrected them there.

@@ -94,7 +94,7 @@ pub fn wanted<'a>(
     let objects = ticked.map(|entry| {
         // A name may have a dot in it, where an extension would begin.
         let masks = all(&entry.folder(first), photographs.clone())?.into_iter();
-        let evidence = masks.map(|(name, path)| (format!("{name}.png"), Evidence::Mask(path))).collect();
+        let evidence = masks.map(|(name, path)| (format!("{name}.png"), Evidence::Cut(path))).collect();
         Ok(Object { name: entry.name.clone(), evidence, delivered: entry.number == 1 })
     });
     objects.collect()
