@@ -31,6 +31,8 @@ const OTHERS: usize = 6;
 /// Difference of a channel from the median of the views from which on one of them shows a light's reflection.
 const GLARE: f32 = 0.06;
 
+/// Least part of what is to be filled that must be known of the same surface around it: of less the rest cannot be made.
+const SHOWN: f64 = 0.3;
 /// Least share of what lies on another plane in a hole, and nearly on this one, for them to be filled as one: a bench and a hedge as
 /// high as it. What of one goes on into the other, its border too, is copied with both.
 const NEARLY_ONE: f64 = 0.8;
@@ -138,7 +140,7 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
             if let Some(chart) = Chart::new(*plane, &rays, focal, AROUND) {
                 let mut texture = charted(sights, photographs, of, filling, &behind, &chart, &its);
                 let wanted = texture.hole.clone();
-                let filled = texture::fill(&mut texture);
+                let filled = is_shown(&texture) && texture::fill(&mut texture);
                 for i in left.iter().filter(|_| filled) {
                     let color = ray(*i).and_then(|ray| chart.pixel(ray)).and_then(|at| texel(&texture, &wanted, at));
                     if let Some(color) = color {
@@ -156,6 +158,12 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
     if filling.guessed.contains(&true) {
         smooth(filling, [w, h]);
     }
+}
+
+/// Whether enough is known of a surface for its hole to be made of it.
+fn is_shown(texture: &Texture) -> bool {
+    let count = |of: &[bool]| of.iter().filter(|is| **is).count() as f64;
+    count(&texture.source) >= SHOWN * count(&texture.hole)
 }
 
 /// Whether two surfaces of a view are of one material, as far as that is known.
@@ -355,7 +363,7 @@ fn borders(filling: &mut Filling, size: [usize; 2], wanted: &[bool], half: f64) 
     }
 }
 
-/// Fills the parts that are left and `wanted` in the picture itself, each from the same surface, else from any.
+/// Fills the parts that are left and `wanted` in the picture itself, each from the same surface where enough of that is seen, else from any.
 fn in_picture(filling: &mut Filling, size: [usize; 2], wanted: &[bool], surface: impl Fn(usize) -> u8 + Sync) {
     for same in [true, false] {
         let left: Vec<usize> = (0..wanted.len()).filter(|i| wanted[*i] && filling.guessed[*i]).collect();
@@ -369,7 +377,7 @@ fn in_picture(filling: &mut Filling, size: [usize; 2], wanted: &[bool], surface:
                 part.iter().for_each(|i| wanted[*i] = true);
                 let source = |i: usize| !filling.guessed[i] && (!same || surface(i) == label);
                 let (cells, mut texture) = around(&part, size, |i| filling.rgb[i], |i| wanted[i], source);
-                if texture::fill(&mut texture) {
+                if (!same || is_shown(&texture)) && texture::fill(&mut texture) {
                     for (cell, i) in cells.iter().enumerate().filter(|(cell, i)| wanted[**i] && !texture.hole[*cell]) {
                         filling.rgb[*i] = texture.rgb[cell];
                         filling.guessed[*i] = false;
@@ -422,6 +430,31 @@ mod tests {
             assert!(places().zip(&found).all(|((x, y), thick)| !*thick || square(x, y)), "{size:?}");
             let middle = (50 + w / 40) * w + w / 2 + w / 40;
             assert!(found[middle as usize], "{size:?}");
+        }
+    }
+
+    /// A bright rail of which hardly anything is seen is no wall: what is behind it is made of what is around.
+    #[test]
+    fn little_makes_no_large_surface() {
+        let size @ [w, h] = [64, 64];
+        let hole = |i: usize| (16..48).contains(&(i % w)) && (16..48).contains(&(i / w));
+        for (rail, bright) in [(2, false), (14, true)] {
+            let of = |i: usize| u8::from(hole(i) || (16 - rail..16).contains(&(i / w)) && (16..48).contains(&(i % w)));
+            let noise = |i: usize| ((i * 2_654_435_761) % 1000) as f32 / 20_000.0;
+            let color = |i: usize| [if of(i) == 1 { 0.9 } else { 0.3 } + noise(i); 3];
+            let wanted: Vec<bool> = (0..w * h).map(hole).collect();
+            let mut filling = Filling {
+                rgb: (0..w * h).map(color).collect(),
+                guessed: wanted.clone(),
+                seen: vec![false; w * h],
+                doubtful: vec![false; w * h],
+                behind: vec![],
+            };
+            in_picture(&mut filling, size, &wanted, of);
+            let filled = (0..w * h).filter(|i| hole(*i) && !filling.guessed[*i]).map(|i| filling.rgb[i][0]);
+            let (sum, count) = filled.fold((0.0, 0), |(sum, n), v| (sum + v, n + 1));
+            assert!(count > 900, "{count}");
+            assert_eq!(sum / count as f32 > 0.6, bright, "{}", sum / count as f32);
         }
     }
 
