@@ -3,7 +3,7 @@
 //! A mask says of every pixel whether it is of its object, so that each object's masks vote by themselves: who marks one object
 //! in one photograph and another one in the next does not say that the first is not there.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use image::{GrayImage, RgbImage};
@@ -159,36 +159,27 @@ impl<'a> Carrier<'a> {
         Ok(all)
     }
 
-    /// Finds what stands behind the object by the fit where all masks were cut: what is seen through its gaps. It is taken out of those
-    /// that nobody has seen. Those of photographs in `wrong` places are not asked. Returns the names of the views whose masks have lost
-    /// something, and `[anchor]` whether it is of what was found.
+    /// Takes what shows these anchors out of masks in these views that were cut and that nobody has seen. Returns the names of those that
+    /// have lost something.
     fn clear_behind(
-        &self,
         splats: &mut Splats,
         given: &mut BTreeMap<String, Given>,
-        wrong: &BTreeSet<&str>,
-    ) -> Result<(Vec<&'a str>, Vec<bool>), Error> {
-        let asked = |view: &&View| given.contains_key(&view.name) && !wrong.contains(view.name.as_str());
-        let all_cut = given.values().all(|given| given.cut);
-        let views: Vec<&'a View> = self.scene.train.iter().filter(asked).filter(|_| all_cut).collect();
-        let mut votes = masks::Votes::new(splats);
-        for view in &views {
-            votes.add(splats, &view.camera, &masks::parts(&given[&view.name].mask, view.camera.size))?;
-        }
-        let behind = votes.behind(self.fit.positions());
+        views: &[&'a View],
+        behind: &[bool],
+    ) -> Result<Vec<&'a str>, Error> {
         let mut lost = vec![];
-        for view in views.into_iter().filter(|_| behind.contains(&true)) {
-            let part = masks::part_of(splats, &view.camera, &behind)?;
+        for view in views.iter().filter(|_| behind.contains(&true)) {
             let Some(Given { mask, .. }) = given.get_mut(&view.name).filter(|given| !given.drawn.is_empty()) else {
                 continue;
             };
+            let part = masks::part_of(splats, &view.camera, behind)?;
             let away = masks::threshold(&part, view.camera.size, mask.dimensions().into(), 0.5);
             let both: Vec<usize> =
                 (0..away.as_raw().len()).filter(|i| mask.as_raw()[*i] != 0 && away.as_raw()[*i] != 0).collect();
             both.iter().for_each(|i| mask.as_mut()[*i] = 0);
             lost.extend((!both.is_empty()).then_some(view.name.as_str()));
         }
-        Ok((lost, behind))
+        Ok(lost)
     }
 
     /// `[view][pixel]` of the fit's pictures: whether what is there is none of the object, by the given masks and the depth that
@@ -210,15 +201,28 @@ impl<'a> Carrier<'a> {
     ) -> Result<Carried, Error> {
         let scene = self.scene;
         let wrong = misplaced::wrong(scene, &self.grids);
-        let mut placed = self.placed(splats, given)?;
-        let (lost, behind) = self.clear_behind(splats, &mut placed, &wrong)?;
-        let given = &placed;
-        let (voters, misplaced) = misplaced::voters(scene, &wrong, given)?;
+        let mut given = self.placed(splats, given)?;
+        let (voters, misplaced) = misplaced::voters(scene, &wrong, &given)?;
+        let vote = |splats: &mut Splats, given: &BTreeMap<String, Given>, masks: &mut masks::Votes, view: &View| {
+            masks.add(splats, &view.camera, &masks::parts(&given[&view.name].mask, view.camera.size))
+        };
         let mut votes = masks::Votes::new(splats);
         for view in &voters {
-            votes.add(splats, &view.camera, &masks::parts(&given[&view.name].mask, view.camera.size))?;
+            vote(splats, &given, &mut votes, view)?;
             self.turn(watch)?;
         }
+        // Masks that were not cut are believed: they may be of things behind one another.
+        let positions = self.fit.positions();
+        let all_cut = given.values().all(|given| given.cut);
+        let behind = if all_cut { votes.behind(positions) } else { vec![false; positions.len()] };
+        let lost = Self::clear_behind(splats, &mut given, &voters, &behind)?;
+        if !lost.is_empty() {
+            votes = masks::Votes::new(splats);
+            for view in &voters {
+                vote(splats, &given, &mut votes, view)?;
+            }
+        }
+        let given = &given;
         votes.deny(&behind);
         let mut shares = votes.count(self.fit.positions(), &self.colors);
         let others: Vec<usize> =

@@ -14,6 +14,7 @@ use rayon::prelude::*;
 use super::shadow::plane::{self, Support};
 use super::splats::{Share, Splats};
 use crate::gpu::Error;
+use crate::render::view::Rendered;
 use crate::scene::{Camera, View, resample, up};
 use crate::statistics::{median, quantile};
 
@@ -335,8 +336,14 @@ pub fn colors(splats: &mut Splats, views: &[View]) -> Result<Vec<[f32; 3]>, Erro
 pub fn part_of(splats: &mut Splats, camera: &Camera, anchors: &[bool]) -> Result<Vec<f32>, Error> {
     let offsets = splats.offsets();
     let drawn = splats.paint(camera, |name, _| Some([f32::from(anchors[name as usize / offsets]), 0.0, 0.0]))?;
-    let pixels = drawn.rgb.iter().zip(&drawn.transmittance);
-    Ok(pixels.map(|(rgb, left)| if 1.0 - left < COVERED { 0.0 } else { rgb[0] / (1.0 - left) }).collect())
+    Ok(of_cover(&drawn, 0))
+}
+
+/// `[pixel]` a channel of what covers it.
+fn of_cover(drawn: &Rendered, channel: usize) -> Vec<f32> {
+    let covered = drawn.transmittance.iter().map(|left| 1.0 - left);
+    let parts = drawn.rgb.iter().zip(covered);
+    parts.map(|(rgb, covered)| if covered < COVERED { 0.0 } else { rgb[channel] / covered }).collect()
 }
 
 impl Shares {
@@ -350,12 +357,7 @@ impl Shares {
             Some([self.object[name], f32::from(self.seen[name]), 0.0])
         };
         let drawn = splats.paint(camera, look)?;
-        let of = |channel: usize| {
-            let covered = drawn.transmittance.iter().map(|left| 1.0 - left);
-            let parts = drawn.rgb.iter().zip(covered);
-            parts.map(|(rgb, covered)| if covered < COVERED { 0.0 } else { rgb[channel] / covered }).collect()
-        };
-        Ok(Carried { object: of(0), evidence: of(1) })
+        Ok(Carried { object: of_cover(&drawn, 0), evidence: of_cover(&drawn, 1) })
     }
 }
 
@@ -584,8 +586,7 @@ mod tests {
         assert_eq!([behind(0.0), behind(0.2), behind(-0.1)], [[256, 0], [256, 48], [256, 48]]);
     }
 
-    /// What is seen through an object's gaps stands behind it and apart from it. What stands beside it may be of it, and what has as much
-    /// of the mask.
+    /// A piece behind the object, seen through its gaps, is none of it. One beside it may be of it, and one that has as much of the mask.
     #[test]
     fn what_is_seen_through_gaps_is_behind() {
         let square = |x: f32, z: f32, side: usize| {

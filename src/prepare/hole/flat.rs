@@ -471,7 +471,7 @@ mod tests {
         }
     }
 
-    /// What lies on a plane before the wall is one if other views confirm it, and a bare wall's noise otherwise.
+    /// A patch before the wall makes a plane of its own if other views confirm it, and is a bare wall's noise otherwise.
     #[test]
     fn noise_makes_no_plane() {
         for confirmed in [false, true] {

@@ -190,7 +190,7 @@ mod tests {
                 }
             }
             let mut sights = Sights::new(grids, &cameras, &masks, &masks);
-            // The fourth is asked; the fifth has the wall where it is.
+            // The fourth view has the wall, and the fifth says nothing.
             sights.0[4].grid.trusted = false;
             let wall = DVec3::new(0.9, 0.5, 4.0);
             assert_eq!(sights.is_refuted(3, wall), confirmed);
