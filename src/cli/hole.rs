@@ -206,10 +206,10 @@ impl Work<'_> {
             go_on_without(run, &mut loaded)?;
         }
         if begun && Record::read(run)?.complete.is_some() {
-            return Ok(loaded.as_read());
+            return loaded.to_go_on(self.gpu);
         }
         let goes_on = begun && !checkpoint::list(run).is_empty();
-        let ready = if goes_on { loaded.as_read() } else { loaded.ready(self.gpu)? };
+        let ready = if goes_on { loaded.to_go_on(self.gpu)? } else { loaded.ready(self.gpu)? };
         let manner = Manner { go_on: begun, ..Manner::default() };
         train::train(self.gpu, &ready.scene, &ready.settings, &scene_name, run, &manner, &Judge::default())?;
         Ok(ready)

@@ -184,7 +184,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     with_gpu(&options, |gpu| {
         // A checkpoint has the anchors.
         let goes_on = begun && !checkpoint::list(&folder).is_empty();
-        let Ready { scene, settings } = if goes_on { loaded.as_read() } else { loaded.ready(gpu)? };
+        let Ready { scene, settings } = if goes_on { loaded.to_go_on(gpu)? } else { loaded.ready(gpu)? };
         let (settings, clock) = match args.minutes {
             Some(time) => {
                 let (settings, clock) =

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use super::picture::Picture;
 use super::{STRIDE, Sites, agree, depth, fill, fuse, neighbors};
 use crate::gpu::{Error, Gpu};
-use crate::scene::{Camera, Point, Scene};
+use crate::scene::{Camera, Point, Scene, View};
 use crate::statistics::quantile;
 
 /// Depths within this share of one another are of one surface.
@@ -97,6 +97,25 @@ impl DepthGrid {
         z.is_finite().then(|| DVec3::from(self.camera.along(self.ray(at), z)))
     }
 
+    /// Depth z at a place in sites, linear in its inverse between sites of one surface; NaN where other views confirm none.
+    fn between(&self, place: [f64; 2]) -> f64 {
+        let inverse = |at: [f64; 2]| {
+            let site = self.site(at[0] as i64, at[1] as i64).filter(|site| self.confirmed[*site]);
+            site.map_or(f64::NAN, |site| 1.0 / self.depth[site])
+        };
+        let own = inverse(place.map(f64::floor));
+        let [x, y] = place.map(|v| v - 0.5);
+        let (mut sum, mut total) = (0.0, 0.0);
+        for (dx, dy) in [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)] {
+            let (u, v) = (x.floor() + dx, y.floor() + dy);
+            let (there, weight) = (inverse([u, v]), (1.0 - (x - u).abs()) * (1.0 - (y - v).abs()));
+            if (there / own - 1.0).abs() <= SAME {
+                (sum, total) = (sum + weight * there, total + weight);
+            }
+        }
+        total / sum
+    }
+
     /// Replaces depths that hardly any of the sites around share by the median of these.
     fn despeckle(&mut self) {
         let (w, h) = (i64::from(self.columns), i64::from(self.rows));
@@ -130,6 +149,21 @@ pub fn depths(gpu: &Gpu, scene: &Scene) -> Result<Vec<DepthGrid>, Error> {
     Ok(Matched::new(gpu, scene)?.depths(scene))
 }
 
+/// Depth z of each pixel of a view as `others` of the same place measure it, `[row-major pixel]`, scene units; NaN where they do not agree. Masks
+/// are not looked at: all of them show the place as it is.
+///
+/// # Errors
+/// When the device has no room or is lost.
+pub fn depth_of(gpu: &Gpu, view: &View, others: &[View], points: &[Point]) -> Result<Vec<f32>, Error> {
+    let views: Vec<View> = [view].into_iter().chain(others).map(|view| View { mask: None, ..view.clone() }).collect();
+    let grid = Matched::of(gpu, &views, points)?.grids(&views).swap_remove(0);
+    let depth = |pixel: usize| {
+        let ray = view.camera.unproject(view.camera.pixel_center(pixel))?;
+        Some(grid.between(grid.place(ray)) as f32)
+    };
+    Ok((0..view.image.as_raw().len() / 3).into_par_iter().map(|pixel| depth(pixel).unwrap_or(f32::NAN)).collect())
+}
+
 /// The photographs of a scene, matched with each other, whatever their masks are.
 pub struct Matched {
     neighbors: neighbors::Neighbors,
@@ -145,13 +179,17 @@ impl Matched {
     /// # Errors
     /// When the device has no room or is lost.
     pub fn new(gpu: &Gpu, scene: &Scene) -> Result<Self, Error> {
-        let pictures: Vec<Picture> = scene.train.par_iter().map(|view| Picture::new(view, 1)).collect();
-        let neighbors = neighbors::choose(&pictures, pictures.len(), &scene.points);
-        let maps = depth::estimate(gpu, &pictures, &neighbors.of, &scene.points)?;
+        Self::of(gpu, &scene.train, &scene.points)
+    }
+
+    fn of(gpu: &Gpu, views: &[View], points: &[Point]) -> Result<Self, Error> {
+        let pictures: Vec<Picture> = views.par_iter().map(|view| Picture::new(view, 1)).collect();
+        let neighbors = neighbors::choose(&pictures, pictures.len(), points);
+        let maps = depth::estimate(gpu, &pictures, &neighbors.of, points)?;
         let confirmed = fuse::confirm(&pictures, &neighbors.of, &maps);
         let mut surfaces = seen_by_most(&pictures, confirmed.clone());
         let views = pictures.par_iter().zip(&mut surfaces);
-        views.for_each(|(picture, surface)| add_points(picture, surface, &scene.points));
+        views.for_each(|(picture, surface)| add_points(picture, surface, points));
         Ok(Self { neighbors, confirmed, surfaces })
     }
 
@@ -169,26 +207,27 @@ impl Matched {
 
     /// [`depths`] of the same views, with the masks that they have in this scene.
     pub fn depths(&self, scene: &Scene) -> Vec<DepthGrid> {
-        let pictures = scene.train.par_iter().map(|view| Picture::new(view, 1)).collect();
-        grids(pictures, self)
+        self.grids(&scene.train)
     }
-}
 
-fn grids(pictures: Vec<Picture>, Matched { neighbors, confirmed, surfaces }: &Matched) -> Vec<DepthGrid> {
-    let wrong = agree::wrong(&agree::shares(&pictures, neighbors, confirmed));
-    let filled = fill::fill(&pictures, surfaces);
-    let all = pictures.into_par_iter().zip(surfaces).zip(filled).zip(wrong);
-    let grids = all.map(|(((picture, surface), filled), wrong)| {
-        let Sites { columns, rows } = picture.sites;
-        let confirmed = surface.iter().map(|z| z.is_finite()).collect();
-        let depth = surface.iter().zip(filled).map(|(known, filled)| if known.is_finite() { *known } else { filled });
-        let depth = depth.collect();
-        let Picture { camera, colors, .. } = picture;
-        let mut grid = DepthGrid { camera, stride: STRIDE, columns, rows, depth, confirmed, colors, trusted: !wrong };
-        grid.despeckle();
-        grid
-    });
-    grids.collect()
+    fn grids(&self, views: &[View]) -> Vec<DepthGrid> {
+        let pictures: Vec<Picture> = views.par_iter().map(|view| Picture::new(view, 1)).collect();
+        let wrong = agree::wrong(&agree::shares(&pictures, &self.neighbors, &self.confirmed));
+        let filled = fill::fill(&pictures, &self.surfaces);
+        let all = pictures.into_par_iter().zip(&self.surfaces).zip(filled).zip(wrong);
+        let grids = all.map(|(((picture, surface), filled), wrong)| {
+            let Sites { columns, rows } = picture.sites;
+            let confirmed = surface.iter().map(|z| z.is_finite()).collect();
+            let depth = surface.iter().zip(filled);
+            let depth = depth.map(|(known, filled)| if known.is_finite() { *known } else { filled }).collect();
+            let Picture { camera, colors, .. } = picture;
+            let mut grid =
+                DepthGrid { camera, stride: STRIDE, columns, rows, depth, confirmed, colors, trusted: !wrong };
+            grid.despeckle();
+            grid
+        });
+        grids.collect()
+    }
 }
 
 /// The depths that more views confirm than see through: a weave that repeats itself matches at a wrong depth in neighbours,

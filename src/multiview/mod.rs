@@ -29,7 +29,7 @@ mod score;
 use crate::gpu::{Error, Gpu};
 use crate::scene::{Point, Scene, View};
 
-pub use grid::{DepthGrid, Matched, depths};
+pub use grid::{DepthGrid, Matched, depth_of, depths};
 use picture::Picture;
 
 /// Pixels from site to site: anchors stand some three pixels apart.

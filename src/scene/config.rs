@@ -99,7 +99,7 @@ const MOST_DILATION: u32 = 1024;
 /// and [`Config::truth_prior`].
 pub const NONE: &str = "none";
 /// What [`Config::truth_prior`] says for depth measured over the other test views.
-pub(super) const STEREO_PRIOR: &str = "stereo";
+pub const STEREO_PRIOR: &str = "stereo";
 
 impl Default for Config {
     fn default() -> Self {

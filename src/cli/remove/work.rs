@@ -307,7 +307,7 @@ impl Job<'_> {
             train::go_on_without(run, &mut loaded)?;
         }
         let work::Ready { scene, settings } = if same && !checkpoint::list(run).is_empty() {
-            loaded.as_read()
+            loaded.to_go_on(gpu)?
         } else {
             audience.begin("points", 0);
             loaded.ready(gpu)?

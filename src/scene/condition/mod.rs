@@ -9,7 +9,6 @@
 //! - [`judge`]: pixels around the masks that other views do not confirm are the object's too.
 //! - [`points`]: points on the object are left out, and the hole gets points from the reference view's prior, behind its
 //!   depth edges too.
-//! - [`stereo`]: a reference that shows the truth gets the depth that the test views measure, where that is asked for.
 //! - [`reference`](mod@reference): an inpainted picture counts in its hole alone, and less where other views see past the
 //!   object.
 //!
@@ -20,7 +19,6 @@ mod points;
 mod reference;
 mod rim;
 mod sparse;
-mod stereo;
 mod unit;
 
 use super::{Config, STEREO_PRIOR, Scene, exposure};
@@ -39,12 +37,12 @@ pub fn condition(scene: &mut Scene, config: &Config) {
     if config.seed_hole {
         points::drop_object(scene);
     }
-    if config.truth_prior == STEREO_PRIOR {
-        stereo::measure_prior(scene);
-    }
     if config.check_priors {
         sparse::check_priors(scene);
-        reference::guess_priors(scene);
+        // What photographs are going to measure is not guessed.
+        if config.truth_prior != STEREO_PRIOR {
+            reference::guess_priors(scene);
+        }
     }
     let depths = reference::hole_depths(scene);
     if config.seed_hole {
