@@ -30,11 +30,6 @@ const HIDDEN: f64 = 1e3;
 const MANY: usize = 16;
 /// Mean difference of the channels from the median up to which photographs agree on the colour of a point.
 const ALIKE: f64 = 0.04;
-/// A site that all photographs have right beside the object is believed where so many sites within so many sites of it, which they
-/// show farther from the object, are of its colour, and of its depth up to this part.
-const LIKE_RIM: usize = 3;
-const RIM: i64 = 12;
-const NEAR_RIM: f64 = 0.25;
 /// Views that look through a guessed point of which so many make it doubtful.
 const THROUGH: usize = 2;
 /// Share of a hole that is doubtful from which on all that is guessed in it is.
@@ -118,15 +113,13 @@ struct Asked {
     /// Photographs that show it, with the cost of each.
     shown: Vec<(usize, f64)>,
     witnesses: Witnesses,
-    /// The median of the colours that are shown, 0 to 255, and that of those that are shown farther from the object.
-    middle: [f64; 3],
-    clear: Option<[f64; 3]>,
-    /// `[photograph]` the difference from it.
+    /// `[photograph]` the difference of its colour from the median of all.
     apart: Vec<f64>,
 }
 
 impl Asked {
-    fn told(self, believed: bool) -> Told {
+    fn told(self) -> Told {
+        let believed = self.witnesses.suffice() && !self.witnesses.is_rim();
         let doubtful = self.witnesses.doubt(believed, self.apart);
         Told { shown: if believed { self.shown } else { vec![] }, doubtful }
     }
@@ -157,7 +150,6 @@ fn asked(sights: &Sights, of: usize, site: usize) -> Option<Asked> {
     let point = own.point(site, own.depth[site]);
     let (to, distance) = ((point - eye).normalize(), point.distance(eye));
     let mut found: Vec<(usize, f64, [f64; 3])> = vec![];
-    let mut clear: Vec<[f64; 3]> = vec![];
     let mut witnesses = Witnesses::default();
     for (view, sight) in sights.0.iter().enumerate().filter(|(view, sight)| *view != of && sight.grid.trusted) {
         if let Some((there, z)) = sight.see(point) {
@@ -171,47 +163,20 @@ fn asked(sights: &Sights, of: usize, site: usize) -> Option<Asked> {
         let color = sight.grid.colors[there].map(f64::from);
         found.push((view, ANGLE * angle + COARSER * (-finer).max(0.0), color));
         let beside = sight.near_hole(there);
-        clear.extend((!beside).then_some(color));
         witnesses.show += 1;
         witnesses.beside += usize::from(beside);
         witnesses.confirmed |= sight.grid.confirmed[there];
     }
     let middle = middle(found.iter().map(|(.., color)| *color)).unwrap_or_default();
-    let clear = self::middle(clear.into_iter());
     let apart: Vec<f64> = found.iter().map(|(_, _, color)| unlike(*color, middle)).collect();
     let shown = found.iter().zip(&apart).map(|((view, cost, _), apart)| (*view, cost + UNLIKE * apart)).collect();
-    Some(Asked { shown, witnesses, middle, clear, apart })
+    Some(Asked { shown, witnesses, apart })
 }
 
 /// Each `[site]` in and next to a view's hole as the photographs tell it.
 fn candidates(sights: &Sights, of: usize) -> Vec<Told> {
-    let own = &sights.0[of];
-    let sites = 0..own.hole.len();
-    let asked: Vec<Option<Asked>> = sites.clone().into_par_iter().map(|site| asked(sights, of, site)).collect();
-    // What a site looks like that is surely none of the object.
-    let known = |site: usize| match &asked[site] {
-        Some(asked) => asked.clear.filter(|_| asked.witnesses.suffice()),
-        None => (!own.hole[site]).then(|| own.grid.colors[site].map(f64::from)),
-    };
-    let known: Vec<Option<[f64; 3]>> = sites.clone().map(known).collect();
-    let looks_like_what_is_near = |site: usize, color: [f64; 3]| {
-        let alike = |near: &usize| {
-            (own.depth[*near] / own.depth[site] - 1.0).abs() <= NEAR_RIM
-                && known[*near].is_some_and(|known| unlike(known, color) <= ALIKE)
-        };
-        own.grid.around(site, RIM).filter(alike).nth(LIKE_RIM - 1).is_some()
-    };
-    let believed: Vec<bool> = sites
-        .into_par_iter()
-        .map(|site| {
-            asked[site].as_ref().is_some_and(|asked| {
-                let witnesses = &asked.witnesses;
-                witnesses.suffice() && (!witnesses.is_rim() || looks_like_what_is_near(site, asked.middle))
-            })
-        })
-        .collect();
-    let told = asked.into_iter().zip(believed);
-    told.map(|(asked, believed)| asked.map_or_else(Told::default, |asked| asked.told(believed))).collect()
+    let sites = (0..sights.0[of].hole.len()).into_par_iter();
+    sites.map(|site| asked(sights, of, site).map_or_else(Told::default, Asked::told)).collect()
 }
 
 /// The photograph that each `[site]` in and next to a view's hole is taken from, by what is told of them.
@@ -601,10 +566,10 @@ mod tests {
         assert!(!of(3, false, 5, &[0.0, 0.01, 0.3]) && of(3, true, 0, &[0.0, 0.1, 0.3]) && of(2, true, 0, &[0.0, 0.1]));
     }
 
-    /// A rim that all views have right beside the object is believed where it looks like the wall that they show farther off, and not
-    /// where it has the object's own colour.
+    /// What all views have right beside the object is believed of none, be it of the object's own colour or of the wall's: its depth is the
+    /// object's as likely.
     #[test]
-    fn a_rim_that_looks_like_the_wall_is_the_wall() {
+    fn what_all_have_beside_the_object_is_guessed() {
         use super::super::surface::tests::{SIZE, views};
         let (wall, object) = ([150u8, 145, 140], [30u8, 60, 160]);
         let told = |rim: [u8; 3]| {
@@ -637,8 +602,9 @@ mod tests {
             let told = candidates(&sights, 2);
             (rims.iter().filter(|site| !told[**site].shown.is_empty()).count(), rims.len())
         };
-        let (painted, count) = told(wall);
-        assert!(count > 4 && painted == count, "{painted} of {count}");
-        assert_eq!(told(object).0, 0);
+        for rim in [wall, object] {
+            let (painted, count) = told(rim);
+            assert!(count > 4 && painted == 0, "{painted} of {count}");
+        }
     }
 }

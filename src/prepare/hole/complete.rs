@@ -48,6 +48,11 @@ fn beside(grid: &DepthGrid, inside: &[bool], of: impl Fn(usize) -> bool) -> Vec<
     (0..found.len()).filter(|site| found[*site]).collect()
 }
 
+/// Whether a view shows something before a point, as others confirm.
+fn hides(grid: &DepthGrid, point: DVec3) -> bool {
+    grid.see(point).is_some_and(|(site, _, z)| grid.confirmed[site] && z > (1.0 + APART) * grid.depth[site])
+}
+
 /// Points of the object, with what they look like: those deep inside a mask that most of the masks cover.
 pub struct Object(Vec<(DVec3, [u8; 3])>);
 
@@ -55,7 +60,9 @@ impl Object {
     /// By what is `inside` the masks of the views.
     fn new(grids: &[DepthGrid], inside: &[Vec<bool>]) -> Self {
         let on_object = |point: DVec3| {
-            let (framed, covered) = framing(grids.iter(), inside, point);
+            // A view that shows something before the point tells nothing of it: what stands behind the object is in its mask, too.
+            let views = grids.iter().zip(inside).filter(|(grid, _)| !hides(grid, point));
+            let (framed, covered) = framing(views, point);
             framed >= HULL_VIEWS && covered as f64 >= SHARED * framed as f64
         };
         let points = grids.par_iter().zip(inside).flat_map_iter(|(grid, inside)| {
@@ -123,9 +130,8 @@ pub fn complete(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage]
                 grid.around(site, 1).any(|at| !inside[at] && apart(at) <= 3 * LIKE_ITSELF)
             };
             for (point, color) in &points {
-                let Some((site, _, z)) = grid.see(*point) else { continue };
-                let hidden = grid.confirmed[site] && z > (1.0 + APART) * grid.depth[site];
-                let shows = !inside[site] && !hidden;
+                let Some((site, ..)) = grid.see(*point) else { continue };
+                let shows = !inside[site] && !hides(grid, *point);
                 count[site] = [count[site][0] + 1, count[site][1] + u32::from(shows && looks(site, *color))];
             }
             let object = |site: usize| count[site][1] >= FEWEST_POINTS && 2 * count[site][1] >= count[site][0];
@@ -158,7 +164,7 @@ pub fn complete(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage]
 pub fn clear_strays(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage], given: &[bool]) -> Vec<usize> {
     let inside = inside(grids, cameras, masks);
     let is_stray = |point: DVec3| {
-        let (framed, covered) = framing(grids.iter(), &inside, point);
+        let (framed, covered) = framing(grids.iter().zip(&inside), point);
         framed >= HULL_VIEWS && (covered as f64) < STRAY * framed as f64
     };
     let strays = |view: usize| -> Vec<usize> {

@@ -31,7 +31,7 @@ fn before(grids: &[DepthGrid], views: &[View], masks: &[GrayImage]) -> Vec<Vec<b
     let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
     let inside = surface::inside(grids, &cameras, masks);
     let is_objects = |point: DVec3| {
-        let (framed, covered) = surface::framing(grids.iter(), &inside, point);
+        let (framed, covered) = surface::framing(grids.iter().zip(&inside), point);
         covered as f64 > COVERED * framed as f64
     };
     let of = |(grid, inside): (&DepthGrid, &Vec<bool>)| -> Vec<bool> {

@@ -361,12 +361,8 @@ pub(super) fn inside(grids: &[DepthGrid], cameras: &[Camera], masks: &[GrayImage
 }
 
 /// How many trusted views have a point in the picture, and in how many of these it is inside.
-pub(super) fn framing<'a>(
-    grids: impl Iterator<Item = &'a DepthGrid>,
-    inside: &[Vec<bool>],
-    point: DVec3,
-) -> (usize, usize) {
-    let trusted = grids.zip(inside).filter(|(grid, _)| grid.trusted);
+pub(super) fn framing<'a>(views: impl Iterator<Item = (&'a DepthGrid, &'a Vec<bool>)>, point: DVec3) -> (usize, usize) {
+    let trusted = views.filter(|(grid, _)| grid.trusted);
     let framing = trusted.filter_map(|(grid, inside)| Some(inside[grid.see(point)?.0]));
     framing.fold((0, 0), |(n, k), inside| (n + 1, k + usize::from(inside)))
 }
@@ -383,7 +379,7 @@ impl Sights {
         let views = grids.into_par_iter().zip(cameras).zip(masks);
         let mut sights = Self(views.map(|((grid, camera), mask)| Sight::new(grid, camera, mask)).collect());
         let on_object = |point: DVec3| {
-            let (framed, covered) = framing(sights.0.iter().map(|sight| &sight.grid), &inside, point);
+            let (framed, covered) = framing(sights.0.iter().map(|sight| &sight.grid).zip(&inside), point);
             framed >= HULL_VIEWS && covered as f64 >= HULL * framed as f64
         };
         let bled: Vec<Vec<usize>> = (sights.0.par_iter().zip(&inside))

@@ -58,8 +58,13 @@ const FADES: f64 = 0.6;
 const BUSIER: f32 = 1.5;
 const STILL: f32 = 0.05;
 const LINE: f64 = 2.5;
-/// Half the width of the squares over which surroundings are averaged, pixels.
+/// Half the width of the squares over which surroundings are averaged, pixels; and of those over which a thing is told from what is beside it.
 const SURROUNDINGS: usize = 8;
+const THING: usize = 2;
+/// Share of a rim that has no more than its usual contrast, and difference of colours up to which what does not hang together with a rim
+/// looks like what does.
+const USUAL: f64 = 0.9;
+const LOOKS_LIKE: f32 = 0.12;
 /// Cost of a pixel whose copy is no source.
 const NO_SOURCE: f64 = 1e4;
 /// Cost per channel sum of the difference of two copies along a seam.
@@ -273,11 +278,29 @@ impl Texture {
         busiest.map_or(f32::INFINITY, |busiest| (BUSIER * busiest).max(STILL))
     }
 
+    /// `[pixel]` what hangs together with a rim, by steps that are usual on it.
+    fn reached(&self, rim: &[usize]) -> Vec<bool> {
+        let usual = quantile(rim.iter().map(|i| self.contrast(*i)), USUAL).unwrap_or(f64::INFINITY) as f32;
+        let step = (BUSIER * usual).max(STILL);
+        let (mut reached, mut open) = (vec![false; self.hole.len()], rim.to_vec());
+        open.iter().for_each(|i| reached[*i] = true);
+        while let Some(i) = open.pop() {
+            for j in planes::neighbours(i, self.size) {
+                if self.source[j] && !reached[j] && self.apart(i, j) <= step {
+                    reached[j] = true;
+                    open.push(j);
+                }
+            }
+        }
+        reached
+    }
+
     /// Finds what may be copied into each part of the hole: nothing of a material that is nowhere beside it, where there is enough of
-    /// those that are. What a surface is covered with elsewhere does not begin just where the object hides it. `lines` are those
-    /// across the hole that have been filled.
+    /// those that are, and nothing of a thing apart, as a picture on a bare wall. What a surface is covered with elsewhere does not begin just
+    /// where the object hides it. `lines` are those across the hole that have been filled.
     fn materials(&self, lines: &[Line]) -> Materials {
         let around: Vec<[f32; 3]> = (0..self.hole.len()).into_par_iter().map(|i| self.mean_around(i)).collect();
+        let near: Vec<[f32; 3]> = (0..self.hole.len()).into_par_iter().map(|i| self.mean_within(i, THING)).collect();
         let known: Vec<usize> = (0..self.source.len()).filter(|i| self.source[*i]).collect();
         let (mut of, mut all, mut regions) = (vec![0; self.hole.len()], vec![], vec![]);
         let mut left = self.hole.clone();
@@ -291,8 +314,13 @@ impl Texture {
             rim.sort_unstable();
             rim.dedup();
             let plain = self.plain(&rim, lines);
+            let reached = self.reached(&rim);
+            let some: Vec<usize> = known.iter().copied().filter(|i| reached[*i]).collect();
+            let some: Vec<usize> = some.iter().copied().step_by(some.len().div_ceil(4 * SAMPLES).max(1)).collect();
+            let is_apart = |i: usize| !reached[i] && some.iter().all(|on| of_another(near[i], near[*on]) > LOOKS_LIKE);
             let like = |i: &usize| {
-                self.contrast(*i) <= plain && rim.iter().any(|rim| of_another(around[*i], around[*rim]) <= MATERIAL)
+                let alike = || rim.iter().any(|rim| of_another(around[*i], around[*rim]) <= MATERIAL);
+                self.contrast(*i) <= plain && alike() && !is_apart(*i)
             };
             let like: Vec<usize> = known.par_iter().copied().filter(like).collect();
             let enough = like.len() as f64 >= ENOUGH * part.len() as f64;
@@ -673,6 +701,21 @@ mod tests {
         for i in (0..truth.len()).filter(|i| before[*i]) {
             assert!((0..3).all(|c| (floor.rgb[i][c] - truth[i][c]).abs() < 0.03), "{i}: {:?}", floor.rgb[i]);
         }
+    }
+
+    /// A picture on a wall, in a colour near that of a cupboard beside the hole, does not come under itself.
+    #[test]
+    fn a_picture_on_the_wall_is_not_copied() {
+        let hole = |x: usize, y: usize| (40..120).contains(&x) && (70..110).contains(&y);
+        let is_picture = |x: usize, y: usize| (60..100).contains(&x) && (20..50).contains(&y);
+        let color = |x: usize, y: usize| match (is_picture(x, y), x >= 120 && y >= 80) {
+            (true, _) => [0.66, 0.6, 0.36],
+            (false, true) => [0.6, 0.5, 0.4],
+            (false, false) => [0.76, 0.75, 0.72],
+        };
+        let (wall, _) = texture([160, 130], hole, color);
+        let allowed = &wall.materials(&[]).allowed[0];
+        assert!(allowed[20 * 160 + 20] && !allowed[35 * 160 + 80]);
     }
 
     /// The joint that runs into a hole in the middle of tiles goes through it, though a plain part would fit nearly all of the rim.
