@@ -218,6 +218,19 @@ mod tests {
         assert!(masks.iter().zip(&whole).enumerate().all(|(view, (now, whole))| view == 3 || now == whole));
     }
 
+    /// The wall beside the object is in one mask, which is far too wide, and behind the object in three others, so that most masks cover it:
+    /// it is none of the object where a view shows it.
+    #[test]
+    fn what_stands_behind_the_object_completes_nothing() {
+        let (grids, cameras, mut masks) = views(0.5);
+        masks[0].iter_mut().for_each(|v| *v = 255);
+        let inside = inside(&grids, &cameras, &masks);
+        let wall = DVec3::new(-0.8, 0.0, 4.0);
+        let hidden = grids.iter().filter(|grid| hides(grid, wall)).count();
+        assert_eq!((framing(grids.iter().zip(&inside), wall), hidden), ((5, 4), 3));
+        assert!(complete(&grids, &cameras, &mut masks).is_empty());
+    }
+
     /// A piece of the wall in one mask, apart from the object, goes; a second piece of the object that something hides in two stays, and so
     /// does what was given.
     #[test]
