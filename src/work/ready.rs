@@ -109,14 +109,18 @@ impl Loaded {
         let Some(reference) = self.scene.references.first().filter(|_| asked) else { return Ok(()) };
         let Scene { train, test, points, .. } = &self.scene;
         let view = &train[reference.view];
-        let note = if test.len() < FEWEST_VIEWS {
-            format!("its depth is not measured, for there are fewer than {FEWEST_VIEWS} other test views")
-        } else {
-            let values = multiview::depth_of(gpu, view, test, points)?;
-            self.measured = Some(Prior { kind: PriorKind::Depth, values });
-            "its depth is measured by stereo over the other test views".into()
-        };
-        eprintln!("scene: reference {}: {note}", view.name);
+        let name = &view.name;
+        if test.len() < FEWEST_VIEWS {
+            eprintln!(
+                "scene: reference {name}: its depth is not measured, for there are fewer than {FEWEST_VIEWS} other test views"
+            );
+            return Ok(());
+        }
+        let values = multiview::depth_of(gpu, view, test, points)?;
+        eprintln!(
+            "scene: reference {name}: its depth is measured by stereo over the other test views, in place of any guess"
+        );
+        self.measured = Some(Prior { kind: PriorKind::Depth, values });
         self.scene = load_with(&self.path, &self.settings, self.measured.as_ref())?;
         Ok(())
     }
@@ -151,7 +155,7 @@ impl Loaded {
         self.to_go_on(gpu)
     }
 
-    /// The same without the points of stereo, for a run that goes on: its checkpoint has them.
+    /// Makes ready a run that goes on: it needs no points of stereo, for its checkpoint has them.
     ///
     /// # Errors
     /// As [`Self::ready`].
@@ -180,7 +184,7 @@ mod tests {
         settings.scene.truth_prior = STEREO_PRIOR.into();
         settings.scene.dense = false;
         let loaded = Loaded::read(&dir, settings).expect("it loads");
-        assert!(loaded.scene.references[0].prior.is_none());
+        assert!(loaded.scene.references[0].prior.is_some(), "a guess, until it is measured");
         let Ready { scene, .. } = loaded.to_go_on(&testing::gpu()).expect("it is measured");
         let reference = &scene.references[0];
         let prior = reference.prior.as_ref().expect("a prior");

@@ -566,7 +566,7 @@ mod tests {
         assert!(!of(3, false, 5, &[0.0, 0.01, 0.3]) && of(3, true, 0, &[0.0, 0.1, 0.3]) && of(2, true, 0, &[0.0, 0.1]));
     }
 
-    /// What all views have right beside the object is believed of none, be it of the object's own colour or of the wall's: its depth is the
+    /// No view is believed about what all have right beside the object, be it of the object's own colour or of the wall's: its depth is the
     /// object's as likely.
     #[test]
     fn what_all_have_beside_the_object_is_guessed() {

@@ -122,9 +122,14 @@ fn gradual(texture: &Texture, means: &[[f32; 3]], of: &mut [u8]) {
     }
 }
 
+/// `[pixel]` the mean colour that says what each is of.
+pub fn looks(texture: &Texture) -> Vec<[f32; 3]> {
+    (0..texture.hole.len()).into_par_iter().map(|i| texture.mean_within(i, REACH)).collect()
+}
+
 impl Regions {
-    /// The regions around a part of a hole; nothing where there is one alone.
-    pub fn around(texture: &Texture, part: &[usize]) -> Option<Self> {
+    /// The regions around a part of a hole, by its [`looks`]; nothing where there is one alone.
+    pub fn around(texture: &Texture, part: &[usize], looks: &[[f32; 3]]) -> Option<Self> {
         let [w, h] = texture.size;
         let bounds = |of: &dyn Fn(usize) -> usize, end: usize| {
             let (low, high) = part.iter().fold((end, 0), |(low, high), i| (low.min(of(*i)), high.max(of(*i) + 1)));
@@ -134,8 +139,7 @@ impl Regions {
         let (columns, rows) = (bounds(&|i| i % w, w), bounds(&|i| i / w, h));
         let size = [columns.len(), rows.len()];
         let pixels: Vec<usize> = rows.flat_map(|y| columns.clone().map(move |x| y * w + x)).collect();
-        let color = |i: usize| Some(texture.mean_within(i, REACH)).filter(|_| texture.source[i]);
-        let all: Vec<Option<[f32; 3]>> = (0..w * h).into_par_iter().map(color).collect();
+        let all: Vec<Option<[f32; 3]>> = (0..w * h).map(|i| texture.source[i].then_some(looks[i])).collect();
         let colors: Vec<Option<[f32; 3]>> = pixels.iter().map(|i| all[*i]).collect();
         let known: Vec<[f32; 3]> = colors.iter().flatten().copied().collect();
         let mut means = if known.len() < FEWEST { vec![] } else { materials(&known) };
@@ -441,7 +445,7 @@ mod tests {
         };
         let small = holed([120, 90], 18.0, color(1.0));
         let hole = part(&small);
-        let regions = Regions::around(&small, &hole).expect("two");
+        let regions = Regions::around(&small, &hole, &looks(&small)).expect("two");
         assert!(regions.hold(&small, &hole, &small.source));
         let edges = regions.edges(&small, &hole);
         assert_eq!(edges.len(), 1);
@@ -472,7 +476,7 @@ mod tests {
         };
         let small = holed([120, 90], 18.0, color(1.0));
         let hole = part(&small);
-        let regions = Regions::around(&small, &hole).expect("two");
+        let regions = Regions::around(&small, &hole, &looks(&small)).expect("two");
         let found = regions.ends(&small, &hole, &holed([480, 360], 72.0, color(4.0)), 4.0);
         let edge = found.iter().find(|line| line.ends[0].x < 200.0).expect("the edge");
         // Each half of what is seen of it is found to a pixel; what is farther away is off by as much more as it is farther from them.
@@ -487,9 +491,13 @@ mod tests {
     fn tiles_and_bends_are_left_alone() {
         let tiles = holed([120, 90], 18.0, |x, y| if (x / 12 + y / 12) % 2 == 0 { [0.2; 3] } else { [0.8; 3] });
         let hole = part(&tiles);
-        assert!(Regions::around(&tiles, &hole).is_none_or(|regions| !regions.hold(&tiles, &hole, &tiles.source)));
+        assert!(Regions::around(&tiles, &hole, &looks(&tiles)).is_none_or(|regions| !regions.hold(
+            &tiles,
+            &hole,
+            &tiles.source
+        )));
         let bent = holed([120, 90], 18.0, |x, y| if y > 45 && x > 60 { [0.2, 0.4, 0.2] } else { [0.6, 0.6, 0.7] });
         let hole = part(&bent);
-        assert!(Regions::around(&bent, &hole).expect("two").edges(&bent, &hole).is_empty());
+        assert!(Regions::around(&bent, &hole, &looks(&bent)).expect("two").edges(&bent, &hole).is_empty());
     }
 }

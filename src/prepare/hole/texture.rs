@@ -16,7 +16,7 @@ use super::gradient::{self, Equation};
 use super::holed::Texture;
 use super::lines::{self, Grey, Line, Piece};
 use super::material::{ENOUGH, MATERIAL, of_another};
-use super::regions::{Edge, Regions};
+use super::regions::{self, Edge, Regions};
 use super::similar::{DIFFERENT, RADIUS, Shift, most_alike};
 use crate::prepare::planes;
 use crate::scene::resample;
@@ -58,9 +58,8 @@ const FADES: f64 = 0.6;
 const BUSIER: f32 = 1.5;
 const STILL: f32 = 0.05;
 const LINE: f64 = 2.5;
-/// Half the width of the squares over which surroundings are averaged, pixels; and of those over which a thing is told from what is beside it.
+/// Half the width of the squares over which surroundings are averaged, pixels.
 const SURROUNDINGS: usize = 8;
-const THING: usize = 2;
 /// Share of a rim that has no more than its usual contrast, and difference of colours up to which what does not hang together with a rim
 /// looks like what does.
 const USUAL: f64 = 0.9;
@@ -282,17 +281,11 @@ impl Texture {
     fn reached(&self, rim: &[usize]) -> Vec<bool> {
         let usual = quantile(rim.iter().map(|i| self.contrast(*i)), USUAL).unwrap_or(f64::INFINITY) as f32;
         let step = (BUSIER * usual).max(STILL);
-        let (mut reached, mut open) = (vec![false; self.hole.len()], rim.to_vec());
-        open.iter().for_each(|i| reached[*i] = true);
-        while let Some(i) = open.pop() {
-            for j in planes::neighbours(i, self.size) {
-                if self.source[j] && !reached[j] && self.apart(i, j) <= step {
-                    reached[j] = true;
-                    open.push(j);
-                }
-            }
+        let mut left = self.source.clone();
+        for first in rim {
+            planes::connected_if(*first, &mut left, self.size, |a, b| self.apart(a, b) <= step);
         }
-        reached
+        self.source.iter().zip(left).map(|(source, left)| *source && !left).collect()
     }
 
     /// Finds what may be copied into each part of the hole: nothing of a material that is nowhere beside it, where there is enough of
@@ -300,7 +293,7 @@ impl Texture {
     /// where the object hides it. `lines` are those across the hole that have been filled.
     fn materials(&self, lines: &[Line]) -> Materials {
         let around: Vec<[f32; 3]> = (0..self.hole.len()).into_par_iter().map(|i| self.mean_around(i)).collect();
-        let near: Vec<[f32; 3]> = (0..self.hole.len()).into_par_iter().map(|i| self.mean_within(i, THING)).collect();
+        let looks = regions::looks(self);
         let known: Vec<usize> = (0..self.source.len()).filter(|i| self.source[*i]).collect();
         let (mut of, mut all, mut regions) = (vec![0; self.hole.len()], vec![], vec![]);
         let mut left = self.hole.clone();
@@ -317,7 +310,8 @@ impl Texture {
             let reached = self.reached(&rim);
             let some: Vec<usize> = known.iter().copied().filter(|i| reached[*i]).collect();
             let some: Vec<usize> = some.iter().copied().step_by(some.len().div_ceil(4 * SAMPLES).max(1)).collect();
-            let is_apart = |i: usize| !reached[i] && some.iter().all(|on| of_another(near[i], near[*on]) > LOOKS_LIKE);
+            let is_apart =
+                |i: usize| !reached[i] && some.iter().all(|on| of_another(looks[i], looks[*on]) > LOOKS_LIKE);
             let like = |i: &usize| {
                 let alike = || rim.iter().any(|rim| of_another(around[*i], around[*rim]) <= MATERIAL);
                 self.contrast(*i) <= plain && alike() && !is_apart(*i)
@@ -326,7 +320,7 @@ impl Texture {
             let enough = like.len() as f64 >= ENOUGH * part.len() as f64;
             let mut allowed = vec![!enough; self.source.len()];
             like.into_iter().for_each(|i| allowed[i] = true);
-            regions.push(Regions::around(self, &part).filter(|regions| regions.hold(self, &part, &allowed)));
+            regions.push(Regions::around(self, &part, &looks).filter(|regions| regions.hold(self, &part, &allowed)));
             part.into_iter().for_each(|i| of[i] = all.len());
             all.push(allowed);
         }
@@ -427,7 +421,8 @@ fn parts(small: &Texture) -> Vec<(Vec<usize>, Regions)> {
     let mut left = small.hole.clone();
     let parts = (0..left.len()).map(|first| planes::connected(first, &mut left, small.size));
     let large = parts.filter(|part| part.len() >= LEAST_PART);
-    large.filter_map(|part| Regions::around(small, &part).map(|regions| (part, regions))).collect()
+    let looks = regions::looks(small);
+    large.filter_map(|part| Regions::around(small, &part, &looks).map(|regions| (part, regions))).collect()
 }
 
 /// Straight borders of regions that go into the hole, from where they do to where they come out of it, or would.

@@ -21,7 +21,7 @@ mod rim;
 mod sparse;
 mod unit;
 
-use super::{Config, STEREO_PRIOR, Scene, exposure};
+use super::{Config, Scene, exposure};
 
 pub(crate) use points::on_object;
 pub(crate) use sparse::samples;
@@ -39,10 +39,7 @@ pub fn condition(scene: &mut Scene, config: &Config) {
     }
     if config.check_priors {
         sparse::check_priors(scene);
-        // What photographs are going to measure is not guessed.
-        if config.truth_prior != STEREO_PRIOR {
-            reference::guess_priors(scene);
-        }
+        reference::guess_priors(scene);
     }
     let depths = reference::hole_depths(scene);
     if config.seed_hole {
