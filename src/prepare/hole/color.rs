@@ -350,6 +350,17 @@ fn alike(one: [f32; 3], other: [f32; 3]) -> bool {
     (0..3).all(|c| (one[c] - other[c]).abs() <= BRIGHTER && (one[c] - gain * other[c]).abs() <= OF_ANOTHER_HUE)
 }
 
+/// A colour that photographs show, as it became when they were joined: in another light at most. Where pieces of several do not meet
+/// by a pixel or two, at a seam across stripes, what is off adds up to glaring colours that none of them shows.
+fn in_its_light(shown: [f32; 3], joined: [f32; 3]) -> [f32; 3] {
+    let off: [f32; 3] = std::array::from_fn(|c| joined[c] - shown[c]);
+    let brighter = off.iter().sum::<f32>() / 3.0;
+    let hue = off.map(|off| off - brighter);
+    let largest = hue.iter().fold(0.0, |largest: f32, hue| largest.max(hue.abs()));
+    let kept = if largest > OF_ANOTHER_HUE { OF_ANOTHER_HUE / largest } else { 1.0 };
+    std::array::from_fn(|c| (shown[c] + brighter.clamp(-BRIGHTER, BRIGHTER) + kept * hue[c]).clamp(0.0, 1.0))
+}
+
 /// What photographs tell of the colours of a view's hole.
 pub fn gather(sights: &Sights, photographs: &[Photograph<'_>], of: usize) -> Filling {
     let (own, sight) = (&photographs[of], &sights.0[of]);
@@ -406,6 +417,9 @@ pub fn gather(sights: &Sights, photographs: &[Photograph<'_>], of: usize) -> Fil
         (filling.guessed[i], filling.seen[i]) = (false, true);
     }
     gradient::solve(&mut filling.rgb, w, &equations);
+    for i in (0..w * h).filter(|i| hole(*i) && filling.seen[*i]) {
+        filling.rgb[i] = in_its_light(mixed[i], filling.rgb[i]);
+    }
     let doubts = filling.doubtful.iter().filter(|doubtful| **doubtful).count() as f64;
     if doubts > DISTRUST * own.hole.as_raw().iter().filter(|hole| **hole != 0).count() as f64 {
         // What is around such a hole is not known, either, and a guess goes on from there; but under the object lies what it
@@ -462,6 +476,19 @@ mod tests {
     use image::{GrayImage, RgbImage};
 
     use super::*;
+
+    /// A little light stays as it is, much of it is less, and what became blue is grey again.
+    #[test]
+    fn what_is_joined_keeps_its_hue() {
+        let grey = [0.5f32; 3];
+        assert_eq!(in_its_light(grey, [0.6, 0.6, 0.6]), [0.6; 3]);
+        let lit = in_its_light(grey, [0.58, 0.6, 0.62]);
+        assert!((0..3).all(|c| (lit[c] - [0.58, 0.6, 0.62][c]).abs() < 1e-6), "{lit:?}");
+        let glaring = in_its_light(grey, [0.3, 0.5, 1.0]);
+        assert!(glaring[2] - glaring[0] <= 2.0 * OF_ANOTHER_HUE + 1e-6, "{glaring:?}");
+        assert!((glaring.iter().sum::<f32>() / 3.0 - 0.6).abs() < 1e-6, "{glaring:?}");
+        assert!(in_its_light(grey, [1.0; 3]).iter().all(|v| (v - 0.5 - BRIGHTER).abs() < 1e-6));
+    }
 
     /// The middle view has a board at z = 3, left of its middle, before the wall, and it was filled. The fifth has the board three
     /// pixels too far: the first two of these show wall that nobody has seen, and the third wall that the middle view has.
