@@ -450,64 +450,6 @@ stage.addEventListener('wheel', (e) => {
 }, { passive: false });
 new ResizeObserver(place).observe(stage);
 
-// ---------------------------------------------------------------- before and after
-
-const compares = () => document.body.dataset.look === 'compare';
-
-// The part of the picture's width, 0 to 1, that shows the photograph.
-function divide(share) {
-  $('slider').value = 100 * share;
-  $('picture').style.setProperty('--split', $('slider').value);
-}
-
-// The view without the object, asked for until it is drawn.
-async function fetchAfter(key, source) {
-  const image = $('after');
-  while (image.dataset.key === key) {
-    const answer = await fetch(source).catch(() => undefined);
-    const picture = answer?.ok ? await answer.blob() : undefined;
-    if (image.dataset.key !== key) return;
-    if (picture) {
-      URL.revokeObjectURL(image.src);
-      image.src = URL.createObjectURL(picture);
-      image.dataset.drawn = key;
-      draw();
-      return;
-    }
-    if (answer && answer.status !== 503) {
-      say(`${current} cannot be drawn without the object.`);
-      return;
-    }
-    await new Promise((resolve) => setTimeout(resolve, 300));
-  }
-}
-
-// The views that can be shown.
-const offered = () => compares() ? state.compare : repaints() ? state.filled : order;
-
-function compare(look) {
-  const on = look === 'compare';
-  document.body.dataset.look = look;
-  if (look && !offered().includes(current)) current = order.find((name) => offered().includes(name));
-  const image = $('after'), key = on ? `${current} ${state.removals}` : '';
-  const source = (path) => url(path, current, `&v=${state.removals}`);
-  const filled = () => url('filled.jpg', current, `&v=${state.removals}-${state.painting.count}`);
-  const photo = on ? source('before.jpg') : look ? filled() : url('photo.jpg', current);
-  if ($('photo').getAttribute('src') !== photo) {
-    $('photo').src = photo;
-    $('photo').alt = `Photograph ${current}`;
-    place();
-  }
-  if (image.dataset.key !== key) {
-    image.dataset.key = key;
-    if (key) fetchAfter(key, source('after.jpg'));
-  }
-  const drawn = on && image.dataset.drawn === key;
-  image.hidden = $('edge').hidden = !drawn;
-  $('split').hidden = !on;
-  return on && !drawn;
-}
-
 $('slider').oninput = () => divide($('slider').value / 100);
 divide(0.5);
 for (const input of document.querySelectorAll('input[name=look]')) input.onchange = () => draw();

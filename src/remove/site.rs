@@ -19,6 +19,7 @@ const PAGE: &str = include_str!("page.html");
 const STYLE: &str = include_str!("page.css");
 const PROGRAM: &str = include_str!("page.js");
 const REPAINT: &str = include_str!("repaint.js");
+const COMPARE: &str = include_str!("compare.js");
 /// Width of a thumbnail, pixels.
 const THUMB: u32 = 240;
 /// Colours of a mask's inside and rim.
@@ -86,6 +87,12 @@ fn field(query: &str, name: &str) -> Option<String> {
 
 fn jpeg(picture: &image::RgbImage, quality: u8) -> Result<Vec<u8>, Refusal> {
     scene::jpeg(picture, quality).map_err(|_| Refusal::Busy)
+}
+
+/// A JPEG picture in another size.
+fn reduced(whole: &[u8], size: [u32; 2]) -> Result<Vec<u8>, Refusal> {
+    let picture = image::load_from_memory(whole).map_err(|_| Refusal::NotFound)?;
+    jpeg(&resample::photograph(&picture.to_rgb8(), size), 80)
 }
 
 /// A mask as a picture to lay over its photograph.
@@ -338,6 +345,7 @@ impl Site for Session {
             "/page.css" => Ok(text("text/css", STYLE)),
             "/page.js" => Ok(text("text/javascript", PROGRAM)),
             "/repaint.js" => Ok(text("text/javascript", REPAINT)),
+            "/compare.js" => Ok(text("text/javascript", COMPARE)),
             "/api/state" => Ok(owned("application/json", self.status().into_bytes())),
             "/photo.jpg" => {
                 let number = self.named(query)?;
@@ -354,7 +362,12 @@ impl Site for Session {
                 let filled = self.filled(self.named(query)?).ok_or(Refusal::NotFound)?;
                 Ok(owned("image/jpeg", jpeg(&filled, 92)?))
             }
-            "/after.jpg" => Ok(owned("image/jpeg", self.after(self.named(query)?)?)),
+            "/after.jpg" => {
+                let number = self.named(query)?;
+                let whole = self.after(number)?;
+                let small = field(query, "small").is_some();
+                Ok(owned("image/jpeg", if small { reduced(&whole, thumb(self.photos[number].size))? } else { whole }))
+            }
             "/thumb.jpg" => Ok(owned("image/jpeg", self.thumbnail(self.named(query)?)?)),
             "/overlay.png" => {
                 let small = field(query, "small").is_some();

@@ -106,7 +106,14 @@ fn the_page_and_its_pictures_are_there_and_name_nothing_but_views() {
     let (status, page) = get(address, "/");
     let page = String::from_utf8(page).unwrap();
     assert!(status == 200 && !page.contains(DOOR));
-    for path in ["/page.js", "/page.css", "/photo.jpg?view=a", "/thumb.jpg?view=c%20%26%20%3Cd%3E"] {
+    for path in [
+        "/page.js",
+        "/repaint.js",
+        "/compare.js",
+        "/page.css",
+        "/photo.jpg?view=a",
+        "/thumb.jpg?view=c%20%26%20%3Cd%3E",
+    ] {
         assert_eq!(get(address, path).0, 200, "{path}");
     }
     // Nothing is looked up by a path, and there is nothing yet to download or to look at.
@@ -444,8 +451,13 @@ fn views_without_the_object_are_drawn_when_they_are_looked_at() {
         assert_eq!(get(address, &format!("/after.jpg?view={view}")).0, 503);
     }
     assert!(matches!(session.wish(Duration::ZERO), Wish::Draw(1)));
-    session.drew(1, Some(b"jpeg".to_vec()));
-    assert_eq!(get(address, "/after.jpg?view=b"), (200, b"jpeg".to_vec()));
+    let jpeg = crate::scene::jpeg(&photograph(), 90).unwrap();
+    session.drew(1, Some(jpeg.clone()));
+    assert_eq!(get(address, "/after.jpg?view=b"), (200, jpeg));
+    let (status, small) = get(address, "/after.jpg?view=b&small=1");
+    let [small, thumbnail] =
+        [small, get(address, "/thumb.jpg?view=b").1].map(|of| image::load_from_memory(&of).unwrap());
+    assert_eq!((status, small.width(), small.height()), (200, thumbnail.width(), thumbnail.height()));
     assert!(matches!(session.wish(Duration::ZERO), Wish::Draw(0)));
     // It failed, and is not asked for again.
     session.drew(0, None);

@@ -74,9 +74,17 @@ try {
     await page.keyboard.press('ArrowRight');
     await page.waitForFunction((old) => document.getElementById('name').textContent !== old, { timeout: 10_000 }, name);
   }
+  // The strip shows all views without the object, and the photographs once nothing is compared.
+  const strip = (of) => {
+    const all = [...document.querySelectorAll('.thumb:not([hidden]) img:first-child')];
+    return all.every((one) => one.src.includes(of)) && all[0].naturalWidth > 0;
+  };
+  await page.waitForFunction(strip, { timeout: 60_000, polling: 200 }, 'blob:');
+  await shoot('strip');
   await page.focus('input[name=look]:checked');
   await page.keyboard.press('ArrowLeft');
   await until(() => !document.getElementById('viewer').hidden && document.getElementById('split').hidden);
+  await page.waitForFunction(strip, { timeout: 60_000, polling: 200 }, 'thumb.jpg');
   const files = await page.evaluate(async () => Promise.all([...document.querySelectorAll('#files a')].map(async (link) => {
     const bytes = await (await fetch(link.href)).arrayBuffer();
     return [link.download, bytes.byteLength];
