@@ -216,7 +216,7 @@ mod tests {
             columns(20..30).save(&map).expect("a map");
             let (image, covered) = (view.image.clone(), columns(20..40));
             // In the second one nothing is believed in the left quarter.
-            scene.holes.push(Hole { view: at, image, covered, filled: columns(20 + 5 * at as u32..40) });
+            scene.holes.push(Hole { view: at, image, covered, filled: columns(20 + 5 * at as u32..40), depth: None });
         }
         let camera = scene.train[0].camera;
         let place = |column: f64, z: f64| camera.lift([column, 30.0], z).expect("a ray").map(|v| v as f32);

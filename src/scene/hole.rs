@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 
+use super::npy::{self, Map};
 use super::{Config, Error, Notes, Reference, View, decode, resample};
 
 /// Folder of the filled holes within a scene, `hole/NAME.png`: in proportion as large as the photographs; alpha is 255 in the
@@ -15,6 +16,9 @@ pub const DOUBTFUL: u8 = 128;
 /// Folder of maps of what no photograph shows within a scene that `prepare` made: `NAME.png` of each view with a hole, as large as its
 /// filled picture, white where that is guessed, or painted by the user.
 pub const GUESSED: &str = "prepare/guessed";
+/// Where the depth of what views show without the object is within a scene that `prepare` made: `NAME.npy` of each view whose hole was
+/// filled, depth z in the model's unit, NaN where it is not known.
+pub const BEHIND: &str = "prepare/behind/";
 /// File in [`HOLE`] that names the reference pictures which the holes were filled with: of each in a line the BLAKE3 hash of
 /// its bytes and its path below the scene.
 pub const MADE_WITH: &str = "made_with";
@@ -30,6 +34,8 @@ pub struct Hole {
     pub covered: GrayImage,
     /// 255 where `image` is to be trained on though it is not the photograph's, as large as it.
     pub filled: GrayImage,
+    /// `[pixel]` depth z of what is filled, scene units; NaN where it is not known. Nothing where `prepare` has told none.
+    pub depth: Option<Vec<f32>>,
 }
 
 /// Whether the holes were filled with the reference picture that is there: an exchanged one shows something else in them.
@@ -41,11 +47,26 @@ fn are_current(scene: &Path) -> bool {
     })
 }
 
-/// The hole of view `at`, filled by a file.
+/// The depth of what a view shows without the object, at its size; nothing where there is no such file.
+///
+/// # Errors
+/// A file that is no map.
+fn behind(dir: &Path, view: &View) -> Result<Option<Vec<f32>>, Error> {
+    let path = dir.join(format!("{BEHIND}{}.npy", view.name));
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let Map { values, size: [w, h] } = npy::read(&path)?;
+    let [across, down] = view.camera.size;
+    let at = |i: u32| (i / across * h / down) * w + i % across * w / across;
+    Ok(Some((0..across * down).map(|i| values[at(i) as usize]).collect()))
+}
+
+/// The hole of view `at`, filled by a file, of the scene at `dir`.
 ///
 /// # Errors
 /// A file that is no picture, or is in other proportions than the photograph.
-fn read(path: &Path, at: usize, view: &View) -> Result<Hole, Error> {
+fn read(dir: &Path, path: &Path, at: usize, view: &View) -> Result<Hole, Error> {
     let picture = decode(path)?.into_rgba8();
     let size @ [w, h] = view.camera.size;
     let (from, expected) = (f64::from(picture.width()), f64::from(picture.width()) * f64::from(h) / f64::from(w));
@@ -81,7 +102,7 @@ fn read(path: &Path, at: usize, view: &View) -> Result<Hole, Error> {
     }
     let [covered, filled] =
         [covered, filled].map(|bytes| GrayImage::from_raw(size[0], size[1], bytes).expect("a byte per pixel"));
-    Ok(Hole { view: at, image, covered, filled })
+    Ok(Hole { view: at, image, covered, filled, depth: behind(dir, view)? })
 }
 
 /// Reads the filled holes, `files` by view, where they go with the reference that is there. The masks become those of what was filled, the
@@ -112,7 +133,7 @@ pub(super) fn read_all(
         ));
         return Ok(vec![]);
     }
-    let one = |(at, view, path): &(usize, &View, &PathBuf)| read(path, *at, view);
+    let one = |(at, view, path): &(usize, &View, &PathBuf)| read(dir, path, *at, view);
     let holes: Vec<Result<Hole, Error>> = filled.par_iter().map(one).collect();
     let mut holes = holes.into_iter().collect::<Result<Vec<_>, Error>>()?;
     for hole in &holes {
@@ -146,7 +167,7 @@ mod tests {
         };
         let image = RgbImage::from_pixel(8, 4, image::Rgb([10; 3]));
         let view = View { name: "view".into(), camera, image, mask: None, weight: None, prior: None, depth: None };
-        let hole = read(&path, 0, &view).expect("a hole");
+        let hole = read(folder.path(), &path, 0, &view).expect("a hole");
         for x in 0..8 {
             let is = [&hole.covered, &hole.filled].map(|of| of.get_pixel(x, 2).0[0] > 0);
             assert_eq!(is, [alpha(x) > 0, alpha(x) == 255], "{x}");

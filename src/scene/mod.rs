@@ -52,11 +52,11 @@ use rayon::prelude::*;
 
 pub use camera::{Camera, distort, undistort};
 pub use condition::{condition, footprint, normalize, typical};
-pub(crate) use condition::{on_object, samples};
+pub(crate) use condition::{on_object, samples, seed_views};
 pub use config::{Config, NONE, STEREO_PRIOR};
 pub use error::Error;
 pub(crate) use exposure::even_out;
-pub use hole::{DOUBTFUL, GUESSED, HOLE, Hole, MADE_WITH};
+pub use hole::{BEHIND, DOUBTFUL, GUESSED, HOLE, Hole, MADE_WITH};
 pub(crate) use layout::{PICTURES, stem};
 pub use note::{Note, Notes};
 pub use picture::{decode, dimensions, is_turned, jpeg, object_mask};
@@ -385,6 +385,9 @@ impl Scene {
         for view in self.train.iter_mut().chain(&mut self.test) {
             view.camera.translation = view.camera.translation.map(|t| t / unit);
             view.depth.iter_mut().flatten().for_each(|z| *z = (f64::from(*z) / unit) as f32);
+        }
+        for z in self.holes.iter_mut().filter_map(|hole| hole.depth.as_mut()).flatten() {
+            *z = (f64::from(*z) / unit) as f32;
         }
         for point in self.points.iter_mut().chain(&mut self.dense) {
             point.position = point.position.map(|x| (f64::from(x) / unit) as f32);

@@ -396,7 +396,7 @@ fn resized(scene: &Scene, from: u32, to: u32) -> Scene {
     let holes = scene.holes.iter().map(|hole| {
         let [w, h] = scaled([hole.image.width(), hole.image.height()]);
         let blank = GrayImage::new(w, h);
-        Hole { view: hole.view, image: RgbImage::new(w, h), covered: blank.clone(), filled: blank }
+        Hole { view: hole.view, image: RgbImage::new(w, h), covered: blank.clone(), filled: blank, depth: None }
     });
     Scene {
         train: scene.train.iter().map(view).collect(),

@@ -152,6 +152,11 @@ impl Loaded {
             let all = settings.scene.leave_out.iter().cloned().chain(found.wrong).collect();
             self.leave_out(all)?;
         }
+        if self.settings.scene.seed_hole {
+            let said = self.scene.notes.len();
+            scene::seed_views(&mut self.scene);
+            self.scene.notes[said..].iter().for_each(|note| eprintln!("scene: {note}"));
+        }
         self.to_go_on(gpu)
     }
 

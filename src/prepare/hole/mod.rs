@@ -119,8 +119,7 @@ pub fn reference_path(view: &str) -> String {
     format!("reference/{view}.png")
 }
 
-/// Where the depth of what views show without the object is, below the scene's folder: as `reference/NAME_depth.npy`.
-pub(super) const BEHIND: &str = "prepare/behind/";
+pub(super) use crate::scene::BEHIND;
 
 fn behind_path(view: &str) -> String {
     format!("{BEHIND}{view}.npy")

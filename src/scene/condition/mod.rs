@@ -8,7 +8,7 @@
 //! - [`rim`]: masks fall off around the object, and a note says by how much the inpainted picture was repainted beyond them.
 //! - [`judge`]: pixels around the masks that other views do not confirm are the object's too.
 //! - [`points`]: points on the object are left out, and the hole gets points from the reference view's prior, behind its
-//!   depth edges too.
+//!   depth edges too; once those of stereo are there the holes of all other views get some where none are.
 //! - [`reference`](mod@reference): an inpainted picture counts in its hole alone, and less where other views see past the
 //!   object.
 //!
@@ -23,7 +23,7 @@ mod unit;
 
 use super::{Config, Scene, exposure};
 
-pub(crate) use points::on_object;
+pub(crate) use points::{on_object, seed_views};
 pub(crate) use sparse::samples;
 pub use unit::{footprint, normalize, typical};
 

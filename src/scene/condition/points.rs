@@ -1,5 +1,7 @@
 //! The points that anchors start from: none on the object, some in the hole.
 
+use std::collections::BTreeSet;
+
 use rayon::prelude::*;
 
 use crate::scene::{Camera, Point, Scene, View};
@@ -129,11 +131,57 @@ pub(super) fn seed_behind_edges(scene: &mut Scene, depths: &[Option<Vec<f32>>]) 
     }
 }
 
+/// Side of the squares of a hole that have points or get some, pixels, and pixels between those that they get.
+const SQUARE: usize = 4;
+const EVERY: usize = 2;
+/// Relative difference in depth up to which a point is of what a hole shows.
+const ON_IT: f64 = 0.04;
+
+/// Adds points to the filled holes of views that are no references, at the depth that `prepare` has found there, to all squares of a hole
+/// that none of the scene's points is on. Where nothing is to begin with nothing is learnt: the background's black would stay.
+pub fn seed_views(scene: &mut Scene) {
+    let mut points = scene.starts();
+    let before = points.len();
+    for hole in &scene.holes {
+        let Some(depth) = &hole.depth else { continue };
+        let camera = &scene.train[hole.view].camera;
+        let w = camera.size[0] as usize;
+        let square = |pixel: usize| (pixel / w / SQUARE) * w.div_ceil(SQUARE) + pixel % w / SQUARE;
+        let has = |point: &Point| {
+            let position = point.position.map(f64::from);
+            let pixel = camera.pixel_of(position)?;
+            let apart = camera.to_camera(position)[2] / f64::from(depth[pixel]) - 1.0;
+            (apart.abs() <= ON_IT).then(|| square(pixel))
+        };
+        let seeded: BTreeSet<usize> = points.par_iter().filter_map(has).collect();
+        let wanted = |pixel: &usize| {
+            let even = (pixel / w).is_multiple_of(EVERY) && (pixel % w).is_multiple_of(EVERY);
+            even && hole.filled.as_raw()[*pixel] != 0 && depth[*pixel].is_finite() && !seeded.contains(&square(*pixel))
+        };
+        let more = (0..depth.len()).filter(wanted).filter_map(|pixel| {
+            let position = camera.lift(camera.pixel_center(pixel), f64::from(depth[pixel]))?;
+            let color = hole.image.get_pixel((pixel % w) as u32, (pixel / w) as u32).0;
+            Some(Point { position: position.map(|v| v as f32), color })
+        });
+        points.extend(more.collect::<Vec<_>>());
+    }
+    let added = points.split_off(before);
+    if !added.is_empty() {
+        scene.notes.push(format!(
+            "{} points are added in the holes of views other than the reference, where there were none (scene.seed_hole)",
+            added.len()
+        ));
+        scene.dense.extend(added);
+    }
+}
+
 #[cfg(test)]
 mod tests {
+    use image::GrayImage;
+
     use super::super::reference;
     use super::*;
-    use crate::scene::{Config, load, synthetic};
+    use crate::scene::{Config, Hole, load, synthetic};
 
     /// The object is a sphere of radius 0.2 or so on a stand; the room is exact, so what stands where is known.
     #[test]
@@ -173,6 +221,56 @@ mod tests {
         drop_object(&mut full);
         assert_eq!(full.points.len(), read.points.len());
         assert!(full.notes.last().expect("a note").contains("inverted"));
+    }
+
+    /// Two views show one wall in their holes. It has points to begin with in every square of either hole, as dense as they are there and
+    /// no denser where both see it, and none where nothing is filled.
+    #[test]
+    fn every_hole_has_something_to_begin_with() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let dir = folder.path().join("scene");
+        synthetic::write(&dir, &synthetic::Options::default()).expect("a scene");
+        let mut scene = load(&dir, &Config::default()).expect("it loads");
+        scene.points.clear();
+        for view in [0, 1] {
+            let View { camera, image, .. } = &scene.train[view];
+            let [w, h] = camera.size;
+            let filled = GrayImage::from_fn(w, h, |x, y| {
+                image::Luma([if (20..60).contains(&x) && (16..48).contains(&y) { 255 } else { 0 }])
+            });
+            // The wall is what is 4 before the first camera.
+            let first = &scene.train[0].camera;
+            let depth = |pixel: usize| {
+                let ray = camera.unproject(camera.pixel_center(pixel)).expect("no distortion");
+                let [near, far] = [1.0, 2.0].map(|z| first.to_camera(camera.along(ray, z))[2]);
+                (1.0 + (4.0 - near) / (far - near)) as f32
+            };
+            let depth = (0..(w * h) as usize).map(depth).collect();
+            scene.holes.push(Hole { view, image: image.clone(), covered: filled.clone(), filled, depth: Some(depth) });
+        }
+        let both = scene.clone();
+        seed_views(&mut scene);
+        assert_eq!(scene.notes.len(), both.notes.len() + 1);
+        for (at, Hole { view, depth, .. }) in scene.holes.iter().enumerate() {
+            let camera = &scene.train[*view].camera;
+            let w = camera.size[0] as usize;
+            let depth = depth.as_ref().expect("one");
+            let pixels = scene.dense.iter().filter_map(|point| camera.pixel_of(point.position.map(f64::from)));
+            let squares: BTreeSet<[usize; 2]> = pixels.map(|i| [i % w / SQUARE, i / w / SQUARE]).collect();
+            for (x, y) in (5..15).flat_map(|x| (4..12).map(move |y| (x, y))) {
+                assert!(squares.contains(&[x, y]), "hole {at}, square {x}, {y}");
+            }
+            assert!(depth.iter().all(|z| z.is_finite()));
+        }
+        let first = (40 / EVERY) * (32 / EVERY);
+        assert!((first..2 * first).contains(&scene.dense.len()), "{}", scene.dense.len());
+        let again = scene.dense.len();
+        seed_views(&mut scene);
+        assert_eq!(scene.dense.len(), again);
+        let mut untold = both;
+        untold.holes.iter_mut().for_each(|hole| hole.depth = None);
+        seed_views(&mut untold);
+        assert!(untold.dense.is_empty());
     }
 
     /// A step in depth: the far side goes on behind the near one, no further than another camera looks behind it.
