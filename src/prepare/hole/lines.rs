@@ -24,6 +24,8 @@ const END: f64 = 0.35;
 const LEAST_END: f64 = 12.0;
 /// An end may be this part of that long where the other is so much longer: what the line is on ends there.
 const SHORT: f64 = 0.5;
+/// Shortest end of all, pixels: a joint that comes out of the hole right before a wall.
+const SHORTEST: usize = 3;
 /// Shortest way through the hole that counts, pixels.
 const LEAST_GAP: usize = 4;
 /// How many times as strong a line is as what this share of the surroundings does not exceed, and its least strength, summed over
@@ -241,7 +243,9 @@ fn line(nearly: &Row<'_>, here: &Row<'_>, [first, last]: [usize; 2], least: f64)
     }
     let known = (END * (last - first) as f64).max(LEAST_END).ceil() as usize;
     let short = (SHORT * known as f64).ceil() as usize;
-    let ends = [[known; 2], [short, 2 * known - short], [2 * known - short, short]];
+    // The less there is at one end, the more at the other.
+    let [some, few] = [short, SHORTEST].map(|n| [n, 2 * known - n]);
+    let ends = [[known; 2], some, [some[1], some[0]], few, [few[1], few[0]]];
     ends.into_iter().find_map(|ends| with_ends(nearly, here, [first, last], ends, least))
 }
 
@@ -478,11 +482,14 @@ mod tests {
     fn a_line_may_end_at_a_wall() {
         let floor = |x: f64| if (x - 57.0).abs() <= 1.0 { 0.4 } else { 0.7 };
         let short = |wall: f64| found(|x, y| if y < wall { 0.2 } else { floor(x) });
-        let lines = short(20.0);
-        assert_eq!(lines.len(), 1, "{lines:?}");
-        let [a, b] = lines[0].ends.map(|end| end.y);
-        assert_eq!(lines[0].short, [a < b, b < a]);
-        assert_eq!(short(27.0).len(), 0);
+        for wall in [20.0, 27.0] {
+            let lines = short(wall);
+            assert_eq!(lines.len(), 1, "{lines:?}");
+            let [a, b] = lines[0].ends.map(|end| end.y);
+            assert_eq!(lines[0].short, [a < b, b < a]);
+        }
+        // Nothing of it comes out.
+        assert_eq!(short(31.0).len(), 0);
     }
 
     /// Leaves of all sizes, at many seeds: hardly any way through them is a line.
