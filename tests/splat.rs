@@ -10,9 +10,12 @@ use gscream_vk::math::harmonics::{ZEROTH, coefficients};
 use gscream_vk::model::config::Form;
 use gscream_vk::model::gaussians::{Cloud, sigmoid};
 use gscream_vk::model::parameter::Parameter;
-use gscream_vk::splat::cameras;
-use gscream_vk::splat::fill;
-use gscream_vk::splat::read::{Container, decode, of_degree};
+use gscream_vk::model::stored::Stored;
+use gscream_vk::prepare::fit::Fit;
+use gscream_vk::scene::{self, Hole, PriorKind, synthetic};
+use gscream_vk::splat::cameras::{self, Posed};
+use gscream_vk::splat::read::{Container, Splat, decode, of_degree};
+use gscream_vk::splat::{chosen, fill};
 use gscream_vk::train::begin;
 use gscream_vk::train::run::{Run, Silent};
 
@@ -525,6 +528,138 @@ fn cameras_of_3dgs_stand_where_they_say() {
         let error = cameras::read(Path::new(&path)).expect_err(what).to_string();
         assert!(error.contains(what), "{error}");
     }
+}
+
+/// What `export` says of its cameras is read as well, with the place where the axis goes through the picture.
+#[test]
+fn cameras_of_export_stand_where_they_say() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let entry = |name: &str, principal: &str| {
+        format!(
+            r#"{{"name":"{name}","center":[1,2,3],"rotation":[[0,1,0],[0,0,1],[1,0,0]],"fov":90,"size":[200,100],"roll":0{principal}}}"#
+        )
+    };
+    let all = [entry("a", ""), entry("b", r#","principal":[0.25,0.5]"#), entry("c", r#","principal":null"#)].join(",");
+    std::fs::write(folder.path().join("export.json"), format!(r#"{{"version":"1","cameras":[{all}]}}"#))
+        .expect("a file");
+    let found = cameras::beside(&folder.path().join("scene.ply")).expect("it is beside the splat");
+    let posed = cameras::read(&found).expect("cameras");
+    for (one, column) in posed.iter().zip([400.0, 200.0, 400.0]) {
+        let camera = one.camera;
+        assert_eq!((camera.size, camera.focal), ([800, 400], [400.0; 2]));
+        // Ahead is x of the world.
+        let [x, y] = camera.project([11.0, 2.0, 3.0]).expect("it is ahead");
+        assert!((x - column).abs() < 1e-3 && (y - 200.0).abs() < 1e-3, "{x} {y}");
+    }
+    std::fs::write(folder.path().join("export.json"), "{}").expect("a file");
+    let error = cameras::read(&found).expect_err("no cameras").to_string();
+    assert!(error.contains("neither a cameras.json"), "{error}");
+}
+
+/// A fine ball on a floor, before a wall: Gaussians are as large as pixels of a camera before it, a little above, would be.
+fn on_a_floor() -> Splat {
+    let mut cloud = Cloud::default();
+    let mut put = |position: [f32; 3], color: f32| {
+        let far = position.iter().zip([0.0, 2.0, 5.0]).map(|(a, b): (&f32, f32)| (a - b).powi(2)).sum::<f32>().sqrt();
+        cloud.position.push(position);
+        cloud.log_scale.push([(0.01 * far).ln(); 3]);
+        cloud.rotation.push([1.0, 0.0, 0.0, 0.0]);
+        cloud.logit.push(4.0);
+        cloud.harmonics.push([color; 3]);
+    };
+    for i in 0..100 {
+        for j in 0..100 {
+            let [u, v] = [i, j].map(|k| 0.08 * k as f32 - 4.0);
+            put([u, 0.0, v], 0.5);
+            put([u, v + 4.0, -4.0], -0.5);
+        }
+    }
+    let golden = 2.399_963_f32;
+    for i in 0..6000 {
+        let height = 1.0 - (2 * i + 1) as f32 / 6000.0;
+        let around = (1.0 - height * height).sqrt();
+        let (sin, cos) = (golden * i as f32).sin_cos();
+        put([0.6 * cos * around, 0.6 + 0.6 * height, 0.6 * sin * around], 0.0);
+    }
+    decode(own::encode(&cloud)).expect("our own file")
+}
+
+/// Views of a splat without cameras show what it is of, from above the floor, upright, each near another.
+#[test]
+fn views_are_chosen_where_there_are_no_cameras() {
+    let gpu = testing::gpu();
+    let splat = on_a_floor();
+    let posed = chosen::cameras(&gpu, &splat, 24, &mut |_| Ok(())).expect("views");
+    assert!((12..=24).contains(&posed.len()), "{}", posed.len());
+    for Posed { name, camera } in &posed {
+        let center = camera.center();
+        assert!(center[1] > 0.2 && center[2] > -4.0, "{name} stands at {center:?}");
+        assert!(camera.rotation[1][1] < 0.0, "{name}: down is down");
+        assert!(camera.within([0.0, 0.6, 0.0]).is_some(), "{name} sees the ball");
+    }
+    let ways: Vec<[f64; 3]> = posed
+        .iter()
+        .map(|one| {
+            let [x, y, z] = one.camera.center();
+            let far = (x * x + (y - 0.6).powi(2) + z * z).sqrt();
+            [x / far, (y - 0.6) / far, z / far]
+        })
+        .collect();
+    for (i, a) in ways.iter().enumerate() {
+        let near = ways.iter().enumerate().filter(|(j, _)| *j != i);
+        let near = near.map(|(_, b)| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>()).fold(-1.0, f64::max);
+        // Half a radian, and what the middle of the densest is off the ball's.
+        assert!(near > 0.8, "{}: {near}", posed[i].name);
+    }
+    // Nothing opaque is nothing to look at.
+    let mut faint = splat;
+    faint.cloud.logit.fill(-6.0);
+    let error = chosen::cameras(&gpu, &faint, 24, &mut |_| Ok(())).expect_err("nothing to see").to_string();
+    assert!(error.contains("--cameras"), "{error}");
+}
+
+/// Each view's filled hole begins with Gaussians where no earlier one has: the same surface again with none, another one with all of its own.
+#[test]
+fn all_views_holes_begin_with_something() {
+    let gpu = testing::gpu();
+    let folder = tempfile::tempdir().expect("a folder");
+    let dir = folder.path().join("scene");
+    synthetic::write(&dir, &synthetic::Options::default()).expect("a scene");
+    let mut scene = scene::load(&dir, &scene::Config::default()).expect("it loads");
+    let reference = scene.references[0].clone();
+    let rest = Cloud {
+        position: vec![[0.0, 0.0, -1e4]],
+        log_scale: vec![[-3.0; 3]],
+        rotation: vec![[1.0, 0.0, 0.0, 0.0]],
+        logit: vec![-3.0],
+        harmonics: vec![[0.0; 3]],
+        ..Cloud::default()
+    };
+    let fit = Fit { model: Stored::Gaussians(rest.clone()), settings: Settings::default() };
+    let begun = |scene: &scene::Scene| fill::begin(&gpu, scene, &dir, &rest, &fit).expect("a fill").len();
+    scene.holes.clear();
+    let alone = begun(&scene);
+    assert!(alone > 100, "{alone}");
+    let camera = scene.train[reference.view].camera;
+    let prior = reference.prior.as_ref().expect("the built-in scene's");
+    let depth: Vec<f32> =
+        prior.values.iter().map(|v| if prior.kind == PriorKind::Disparity { 1.0 / v } else { *v }).collect();
+    let filled = scene.train[reference.view].mask.clone().expect("one");
+    let inside = filled.as_raw().iter().filter(|inside| **inside != 0).count();
+    let hole = |depth: Vec<f32>| Hole {
+        view: reference.view,
+        image: reference.image.clone(),
+        covered: filled.clone(),
+        filled: filled.clone(),
+        depth: Some(depth),
+    };
+    assert_eq!(reference.image.dimensions(), (camera.size[0], camera.size[1]));
+    scene.holes = vec![hole(depth.clone())];
+    assert_eq!(begun(&scene), alone);
+    scene.holes.push(hole(depth.iter().map(|z| 0.8 * z).collect()));
+    assert_eq!(begun(&scene), alone + inside);
+    scene.holes.push(hole(vec![f32::NAN; depth.len()]));
+    assert_eq!(begun(&scene), alone + inside);
 }
 
 #[test]

@@ -184,6 +184,9 @@ pub(super) struct Pose {
     pub fov: f64,
     /// Width and height in pixels.
     pub size: [u32; 2],
+    /// Where the axis goes through the picture, in parts of its width and height; the middle if left out.
+    #[serde(default)]
+    pub principal: Option<[f32; 2]>,
     /// How far it is rolled out of the horizon, in degrees.
     pub roll: f64,
 }
@@ -198,6 +201,7 @@ impl Pose {
             rotation: camera.rotation,
             fov: 2.0 * half.atan().to_degrees(),
             size: camera.size,
+            principal: Some(std::array::from_fn(|c| camera.principal[c] / camera.size[c] as f32)),
             roll: up::roll(camera).to_degrees(),
         }
     }

@@ -51,8 +51,8 @@ use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 
 pub use camera::{Camera, distort, undistort};
+pub(crate) use condition::{bare, on_object, samples, seed_views};
 pub use condition::{condition, footprint, normalize, typical};
-pub(crate) use condition::{on_object, samples, seed_views};
 pub use config::{Config, NONE, STEREO_PRIOR};
 pub use error::Error;
 pub(crate) use exposure::even_out;

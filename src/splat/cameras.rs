@@ -1,4 +1,5 @@
-//! Where a splat is looked at from: a COLMAP model, or the `cameras.json` that 3DGS writes beside its splat.
+//! Where a splat is looked at from: a COLMAP model, the `cameras.json` that 3DGS writes beside its splat, or the `export.json`
+//! that [`export`](crate::export) does.
 //!
 //! Each entry of `cameras.json` has `img_name`, `width`, `height`, `fx`, `fy`, the camera's `position` in the world, and
 //! `rotation`, row by row, which takes directions of the camera to those of the world.
@@ -13,6 +14,9 @@ use crate::scene::{self, Camera, colmap};
 
 /// Longer side of the pictures, pixels: larger cameras are reduced.
 pub const SIDE: u32 = 800;
+
+/// The files of cameras that are looked for beside a splat.
+const BESIDE: [&str; 2] = ["cameras.json", "export.json"];
 
 /// A camera with its name.
 #[derive(Clone, Debug, PartialEq)]
@@ -34,12 +38,12 @@ struct Entry {
     fy: f64,
 }
 
-/// The cameras that a splat comes with: `cameras.json` beside it, or two folders above it, where 3DGS puts it.
+/// The file of cameras that a splat comes with: one of these beside it, or two folders above it, where 3DGS puts `cameras.json`.
 pub fn beside(splat: &Path) -> Option<PathBuf> {
     let folder = splat.parent()?;
     let above = folder.parent().and_then(Path::parent);
     let places = [Some(folder), above].into_iter().flatten();
-    places.map(|folder| folder.join("cameras.json")).find(|path| path.is_file())
+    places.flat_map(|folder| BESIDE.map(|name| folder.join(name))).find(|path| path.is_file())
 }
 
 /// The cameras of a file or of a folder with a COLMAP model, by name.
@@ -112,37 +116,69 @@ fn of_colmap(path: &Path) -> Result<Vec<Posed>, Error> {
     let (lenses, images) = colmap::lenses(path)?;
     let each = images.iter().map(|image| {
         let lens = &lenses[&image.camera];
-        let camera = Camera {
-            rotation: [[0.0; 3]; 3],
-            translation: [0.0; 3],
-            focal: lens.focal.map(|v| v as f32),
-            principal: lens.principal.map(|v| v as f32),
-            distortion: [0.0; 4],
-            size: lens.size,
-        };
+        let camera = Camera { principal: lens.principal.map(|v| v as f32), ..pinhole(lens.size, lens.focal) };
         posed(&image.name, image.rotation, image.center(), camera)
     });
     Ok(each.collect())
 }
 
+/// What [`export`](crate::export) says of a camera.
+#[derive(Deserialize)]
+struct Exported {
+    name: String,
+    center: [f64; 3],
+    /// Right, down and ahead.
+    rotation: [[f64; 3]; 3],
+    /// Across the longer side, degrees.
+    fov: f64,
+    size: [u32; 2],
+    /// In parts of the size.
+    principal: Option<[f32; 2]>,
+}
+
+impl Exported {
+    /// Pictures as large as may be: those that it was trained on were small.
+    fn posed(&self) -> Posed {
+        let longest = self.size[0].max(self.size[1]).max(1);
+        let size = self.size.map(|side| (u64::from(side) * u64::from(SIDE) / u64::from(longest)) as u32);
+        let focal = 0.5 * f64::from(SIDE) / (0.5 * self.fov.to_radians()).tan();
+        let part = self.principal.unwrap_or([0.5; 2]);
+        let principal = std::array::from_fn(|c| part[c] * size[c] as f32);
+        posed(&self.name, self.rotation, self.center, Camera { principal, ..pinhole(size, [focal; 2]) })
+    }
+}
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Listed {
+    Theirs(Vec<Entry>),
+    Ours { cameras: Vec<Exported> },
+}
+
+/// A camera whose axis goes through the middle of its picture.
+fn pinhole(size: [u32; 2], focal: [f64; 2]) -> Camera {
+    Camera {
+        rotation: [[0.0; 3]; 3],
+        translation: [0.0; 3],
+        focal: focal.map(|v| v as f32),
+        principal: size.map(|side| side as f32 / 2.0),
+        distortion: [0.0; 4],
+        size,
+    }
+}
+
 fn of_json(path: &Path) -> Result<Vec<Posed>, Error> {
     let bytes = std::fs::read(path).map_err(|source| Error::Io { path: path.to_owned(), source })?;
     let refuse = |what: String| Error::File { path: path.to_owned(), what };
-    let entries: Vec<Entry> =
-        serde_json::from_slice(&bytes).map_err(|error| refuse(format!("not a cameras.json of 3DGS ({error})")))?;
-    let each = entries.iter().map(|entry| {
-        let size = [entry.width, entry.height];
-        let camera = Camera {
-            rotation: [[0.0; 3]; 3],
-            translation: [0.0; 3],
-            focal: [entry.fx, entry.fy].map(|v| v as f32),
-            principal: size.map(|side| side as f32 / 2.0),
-            distortion: [0.0; 4],
-            size,
-        };
+    let listed: Listed = serde_json::from_slice(&bytes)
+        .map_err(|error| refuse(format!("neither a cameras.json of 3DGS nor an export.json of export ({error})")))?;
+    let theirs = |entry: &Entry| {
         let to_world = entry.rotation;
         let to_camera = std::array::from_fn(|i| std::array::from_fn(|j| to_world[j][i]));
-        posed(&entry.img_name, to_camera, entry.position, camera)
-    });
-    Ok(each.collect())
+        posed(&entry.img_name, to_camera, entry.position, pinhole([entry.width, entry.height], [entry.fx, entry.fy]))
+    };
+    Ok(match listed {
+        Listed::Theirs(entries) => entries.iter().map(theirs).collect(),
+        Listed::Ours { cameras } => cameras.iter().map(Exported::posed).collect(),
+    })
 }

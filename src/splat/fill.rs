@@ -1,9 +1,11 @@
 //! What is taken out of a splat and what is put in its place: the Gaussians that the masks vote out, and those that the
-//! reference picture's hole begins with.
+//! holes of all views begin with.
 
 use std::path::Path;
 
+use image::RgbImage;
 use image::imageops::{FilterType, resize};
+use rayon::prelude::*;
 
 use super::Error;
 use super::views::{Artist, Seen};
@@ -13,7 +15,8 @@ use crate::model::gaussians::{Cloud, logit};
 use crate::prepare::fit::Fit;
 use crate::prepare::masks::{self, Votes};
 use crate::prepare::splats::Splats;
-use crate::scene::{self, PriorKind, Scene, resample};
+use crate::render::view::Rendered;
+use crate::scene::{self, Camera, PriorKind, Scene, resample};
 
 /// A Gaussian with more than this share inside the masks is the object's.
 const OBJECT: f32 = 0.5;
@@ -50,8 +53,41 @@ pub fn object(
     Ok(shares.object.iter().map(|share| *share > OBJECT).collect())
 }
 
+/// What one view shows in its hole.
+struct Shown<'a> {
+    camera: &'a Camera,
+    image: &'a RgbImage,
+    /// \[pixel\] along the axis, scene units.
+    depth: &'a [f32],
+    /// \[pixel\] of the hole.
+    inside: &'a [bool],
+}
+
+impl Shown<'_> {
+    /// Adds a Gaussian at each pixel of the hole where `drawn`, the rest of the splat, is not what the picture shows.
+    fn begin(&self, drawn: &Rendered, cloud: &mut Cloud) {
+        let camera = self.camera;
+        for i in (0..self.depth.len()).filter(|i| self.inside[*i]) {
+            let (x, y) = (i as u32 % camera.size[0], i as u32 / camera.size[0]);
+            let color = self.image.get_pixel(x, y).0.map(|v| f32::from(v) / 255.0);
+            let off = (0..3).map(|c| (color[c] - drawn.rgb[i][c]).abs()).fold(0.0, f32::max);
+            let z = f64::from(self.depth[i]);
+            if (off < DIFFERS && drawn.transmittance[i] < OPEN) || !z.is_finite() || z <= 0.0 {
+                continue;
+            }
+            let Some(point) = camera.lift(camera.pixel_center(i), z) else { continue };
+            let width = WIDTH * z / f64::from(camera.focal[0].min(camera.focal[1]));
+            cloud.position.push(point.map(|v| v as f32));
+            cloud.log_scale.push([width.ln() as f32; 3]);
+            cloud.rotation.push([1.0, 0.0, 0.0, 0.0]);
+            cloud.logit.push(logit(OPACITY));
+            cloud.harmonics.push(color.map(|v| ((f64::from(v) - 0.5) / ZEROTH) as f32));
+        }
+    }
+}
+
 /// A Gaussian for each pixel of the reference's hole where the rest of the splat is not what the reference shows, at the
-/// reference's depth.
+/// reference's depth; and then of every other view's filled hole, on what no earlier one has shown.
 ///
 /// # Errors
 /// A scene without a reference, or without its depth; when the device has no room, or is lost.
@@ -63,36 +99,27 @@ pub fn begin(gpu: &Gpu, scene: &Scene, root: &Path, rest: &Cloud, fit: &Fit) -> 
     let prior = reference.prior.as_ref().ok_or_else(|| missing("depth of the reference picture"))?;
     let view = &scene.train[reference.view];
     let mask = view.mask.as_ref().ok_or_else(|| missing("mask of the reference view"))?;
-    let camera = &view.camera;
-    let hole = resample::dilate(mask, MARGIN);
-    let drawn = Artist::new(gpu, rest, &fit.settings.render)?.draw(camera)?;
-    let [w, h] = camera.size;
-    let shown = if reference.image.dimensions() == (w, h) {
-        reference.image.clone()
-    } else {
-        resize(&reference.image, w, h, FilterType::Triangle)
-    };
-    let depth_of = |i: usize| match prior.kind {
-        PriorKind::Disparity => 1.0 / f64::from(prior.values[i]),
-        _ => f64::from(prior.values[i]),
-    };
+    let mut artist = Artist::new(gpu, rest, &fit.settings.render)?;
     let mut cloud = Cloud::default();
-    for (i, inside) in hole.as_raw().iter().enumerate().filter(|(i, inside)| **inside != 0 && *i < prior.values.len()) {
-        debug_assert!(*inside != 0, "filtered");
-        let (x, y) = (i as u32 % w, i as u32 / w);
-        let color = shown.get_pixel(x, y).0.map(|v| f32::from(v) / 255.0);
-        let off = (0..3).map(|c| (color[c] - drawn.rgb[i][c]).abs()).fold(0.0, f32::max);
-        let z = depth_of(i);
-        if (off < DIFFERS && drawn.transmittance[i] < OPEN) || !z.is_finite() || z <= 0.0 {
-            continue;
+    let [w, h] = view.camera.size;
+    let image = match reference.image.dimensions() == (w, h) {
+        true => &reference.image,
+        false => &resize(&reference.image, w, h, FilterType::Triangle),
+    };
+    let inside: Vec<bool> = resample::dilate(mask, MARGIN).as_raw().iter().map(|inside| *inside != 0).collect();
+    let depth: Vec<f32> = match prior.kind {
+        PriorKind::Disparity => prior.values.iter().map(|disparity| 1.0 / disparity).collect(),
+        _ => prior.values.clone(),
+    };
+    let shown = Shown { camera: &view.camera, image, depth: &depth, inside: &inside };
+    shown.begin(&artist.draw(&view.camera)?, &mut cloud);
+    for hole in &scene.holes {
+        let (camera, Some(depth)) = (&scene.train[hole.view].camera, &hole.depth) else { continue };
+        let inside = scene::bare(hole, depth, camera, cloud.position.par_iter().copied());
+        if inside.contains(&true) {
+            let shown = Shown { camera, image: &hole.image, depth, inside: &inside };
+            shown.begin(&artist.draw(camera)?, &mut cloud);
         }
-        let Some(point) = camera.lift(camera.pixel_center(i), z) else { continue };
-        let width = WIDTH * z / f64::from(camera.focal[0].min(camera.focal[1]));
-        cloud.position.push(point.map(|v| v as f32));
-        cloud.log_scale.push([width.ln() as f32; 3]);
-        cloud.rotation.push([1.0, 0.0, 0.0, 0.0]);
-        cloud.logit.push(logit(OPACITY));
-        cloud.harmonics.push(color.map(|v| ((f64::from(v) - 0.5) / ZEROTH) as f32));
     }
     Ok(cloud)
 }

@@ -1,6 +1,7 @@
 #![doc = include_str!("README.md")]
 
 pub mod cameras;
+pub mod chosen;
 pub mod fill;
 pub mod frame;
 pub mod ply;

@@ -4,11 +4,13 @@ use std::fmt::Write as _;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
+use glam::{DVec3, Vec3};
 use image::{ImageFormat, RgbImage};
 
+use super::Error;
 use super::cameras::Posed;
+use super::frame::{self, Place};
 use super::read::{Splat, of_degree};
-use super::{Error, frame};
 use crate::export;
 use crate::gpu::Gpu;
 use crate::math::harmonics::{ZEROTH, coefficients, harmonics};
@@ -98,29 +100,46 @@ pub fn depth(splat: &Splat, cameras: &[Camera]) -> Result<f64, Error> {
     median(depths).ok_or_else(apart)
 }
 
-/// Takes the cameras of a COLMAP model to the frame of a splat that was moved and scaled against it. Returns whether it was.
-pub fn align(splat: &Splat, folder: &Path, posed: &mut [Posed]) -> bool {
+/// Takes the cameras of a COLMAP model to the frame of a splat that was moved, scaled or turned against it. Returns where it stands.
+pub fn align(splat: &Splat, folder: &Path, posed: &mut [Posed]) -> Place {
     // A file of cameras has no points, and a model may be without: then its frame is taken for the splat's.
-    let Ok(model) = colmap::read(folder) else { return false };
-    let points: Vec<[f64; 3]> = model.points.iter().map(|point| point.position.map(f64::from)).collect();
+    let Ok(model) = colmap::read(folder) else { return Place::Own };
+    let colored = |point: &scene::Point| {
+        (DVec3::from_array(point.position.map(f64::from)), point.color.map(|v| f32::from(v) / 255.0))
+    };
+    let points: Vec<frame::Colored> = model.points.iter().map(colored).collect();
     // Its program knew the photographs that are there, which may be fewer than the model has.
     let photographs = scene::pictures(&folder.join("images")).unwrap_or_default();
     let there = |image: &&colmap::Image| photographs.contains_key(scene::stem(&image.name));
-    let cameras = [
-        model.images.iter().filter(there).map(colmap::Image::center).collect(),
-        model.images.iter().map(colmap::Image::center).collect(),
-    ];
-    let Some(frame) = frame::find(&points, &cameras, &matter(splat)) else { return false };
+    let center = |image: &colmap::Image| DVec3::from_array(image.center());
+    let cameras = [model.images.iter().filter(there).map(center).collect(), model.images.iter().map(center).collect()];
+    let cloud = &splat.cloud;
+    let opaque = opaque(splat).map(|i| (DVec3::from_array(cloud.position[i].map(f64::from)), base(cloud, i)));
+    let place = frame::find(&points, &cameras, &opaque.collect::<Vec<_>>());
+    let Place::Elsewhere(frame) = place else { return place };
     for Posed { camera, .. } in posed {
-        camera.translation = Camera::translation_to(&camera.rotation, frame.apply(camera.center()));
+        let center = frame.apply(DVec3::from_array(camera.center()));
+        // Rows are the camera's axes.
+        camera.rotation =
+            camera.rotation.map(|axis| (frame.turn * Vec3::from_array(axis).as_dvec3()).as_vec3().to_array());
+        camera.translation = Camera::translation_to(&camera.rotation, center.to_array());
     }
-    true
+    place
+}
+
+/// Numbers of opaque Gaussians.
+pub(super) fn opaque(splat: &Splat) -> impl Iterator<Item = usize> {
+    (0..splat.len()).filter(|i| splat.drawn[*i] && sigmoid(splat.cloud.logit[*i]) >= MATTER)
 }
 
 /// Centres of opaque Gaussians.
 fn matter(splat: &Splat) -> Vec<[f64; 3]> {
-    let opaque = (0..splat.len()).filter(|i| splat.drawn[*i] && sigmoid(splat.cloud.logit[*i]) >= MATTER);
-    opaque.map(|i| splat.cloud.position[i].map(f64::from)).collect()
+    opaque(splat).map(|i| splat.cloud.position[i].map(f64::from)).collect()
+}
+
+/// A Gaussian's colour from all sides, 0 to 1 in gamut.
+fn base(cloud: &Cloud, i: usize) -> [f32; 3] {
+    cloud.harmonics_of(i)[0].map(|v| (0.5 + ZEROTH * f64::from(v)) as f32)
 }
 
 fn apart() -> Error {
@@ -203,6 +222,11 @@ pub fn fits(gpu: &Gpu, count: usize) -> Result<(), Error> {
     )))
 }
 
+/// Whether the pictures in `folder` were made of this.
+pub fn are_of(folder: &Path, made_of: &str) -> bool {
+    std::fs::read_to_string(folder.join(MADE_OF)).is_ok_and(|text| text == made_of)
+}
+
 /// The pictures of a splat in `folder`, with their cameras and some of its Gaussians' centres as points; nothing is drawn
 /// where they are there already. `said` hears how many are done.
 ///
@@ -217,7 +241,7 @@ pub fn write(
     said: &mut dyn FnMut(u64) -> Result<(), Error>,
 ) -> Result<(), Error> {
     let mark = folder.join(MADE_OF);
-    if std::fs::read_to_string(&mark).is_ok_and(|text| text == made_of) {
+    if are_of(folder, made_of) {
         return Ok(());
     }
     // Only a folder that this made is made again.
@@ -270,8 +294,7 @@ fn points(cloud: &Cloud) -> String {
     let mut text = String::new();
     for (id, i) in (1u32..).zip(opaque.iter().step_by(opaque.len().div_ceil(POINTS).max(1))) {
         let [x, y, z] = cloud.position[*i];
-        let rgb = cloud.harmonics_of(*i)[0];
-        let [r, g, b] = rgb.map(|v| ((0.5 + ZEROTH * f64::from(v)).clamp(0.0, 1.0) * 255.0).round() as u8);
+        let [r, g, b] = base(cloud, *i).map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8);
         writeln!(text, "{id} {x} {y} {z} {r} {g} {b} 0").expect("a string takes everything");
     }
     text

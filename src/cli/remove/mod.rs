@@ -40,7 +40,7 @@ use work::{Job, Places};
 /// begins another one.
 ///
 /// A splat of any program (PLY of 3D Gaussian Splatting, SuperSplat's compressed PLY, SPZ, SOG, .splat, or
-/// GLB with KHR_gaussian_splatting) stands for photographs as well: it is drawn from --cameras, the object's Gaussians are taken out,
+/// GLB with KHR_gaussian_splatting) stands for photographs as well: it is drawn from its cameras, the object's Gaussians are taken out,
 /// new ones are trained in the hole, and every other Gaussian stays as it is.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
@@ -64,7 +64,8 @@ pub(super) struct Args {
     out: Option<PathBuf>,
     #[command(flatten)]
     object: ObjectArgs,
-    /// Cameras to look at a splat from: a cameras.json, or the folder of a COLMAP model [default: cameras.json beside it]
+    /// Cameras to look at a splat from: a cameras.json, an export.json, or the folder of a COLMAP model [default: the file beside it;
+    /// where there is none, from where it looks right]
     #[arg(long, value_name = "PATH")]
     cameras: Option<PathBuf>,
     /// Views of a splat at most, evenly spread over the cameras

@@ -1,7 +1,7 @@
 //! A splat in place of photographs: its own pictures are the photographs, it is the fit itself, and of its file only the
 //! object's Gaussians go and the hole's come.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::{Context as _, bail};
@@ -21,9 +21,10 @@ use crate::prepare::fit::{Fit, Ready};
 use crate::prepare::record::{self, Inputs};
 use crate::scene::Camera;
 use crate::splat::cameras::{self, Posed};
-use crate::splat::read::{self, Container, append};
+use crate::splat::frame::Place;
+use crate::splat::read::{self, Container, Splat, append};
 use crate::splat::views::{self, Seen};
-use crate::splat::{Error, fill};
+use crate::splat::{Error, chosen, fill};
 
 /// The pictures' folder within what is made.
 const VIEWS: &str = "views";
@@ -63,26 +64,36 @@ const NOTE: &str = "removed_ranges: rows of the splat that was given, added_rang
 pub fn open(args: &Args, places: &Places) -> anyhow::Result<Source> {
     let path = &args.photographs;
     let made = ["ply", "spz", "glb"].map(|extension| format!("{STEM}.{extension}")).into_iter().chain([OBJECT.into()]);
-    let given = path.canonicalize().ok();
-    if given.is_some() && made.into_iter().any(|name| places.root.join(name).canonicalize().ok() == given) {
+    let source = path.canonicalize().ok();
+    if source.is_some() && made.into_iter().any(|name| places.root.join(name).canonicalize().ok() == source) {
         bail!("{}: what is made would be written over it: choose another --out", path.display());
     }
     let splat = read::read(path)?;
-    let from = args.cameras.clone().or_else(|| cameras::beside(path)).ok_or_else(|| {
-        Error::Request(format!(
-            "{}: there is no cameras.json beside it; name one, or the folder of a COLMAP model, with --cameras",
-            path.display()
-        ))
-    })?;
-    let mut posed = cameras::read(&from)?;
-    if views::align(&splat, &from, &mut posed) {
-        eprintln!("splat: it was moved and scaled against {}, and its cameras are, too", from.display());
-    }
-    let posed = some(posed, args);
+    let folder = places.root.join(VIEWS);
+    let hash = record::hash(path)?;
+    let (posed, made_of) = match args.cameras.clone().or_else(|| cameras::beside(path)) {
+        Some(from) => {
+            let posed = given(args, &splat, &from)?;
+            let made_of: String = Inputs::default().with(hash).with(format!("{posed:?}")).finish();
+            (posed, made_of)
+        }
+        None => {
+            let made_of: String = Inputs::default().with(hash).with(format!("chosen: {}", args.views)).finish();
+            let kept =
+                if views::are_of(&folder, &made_of) { cameras::read(&folder.join("sparse/0")).ok() } else { None };
+            let posed = match kept {
+                Some(posed) => posed,
+                None => chosen(args, &splat)?,
+            };
+            eprintln!(
+                "splat: no cameras are beside it; {} views were chosen from where it looks right (--cameras names others)",
+                posed.len()
+            );
+            (posed, made_of)
+        }
+    };
     let all: Vec<Camera> = posed.iter().map(|posed| posed.camera).collect();
     let render = views::config(views::depth(&splat, &all)?);
-    let made_of = Inputs::default().with(record::hash(path)?).with(format!("{posed:?}")).finish();
-    let folder = places.root.join(VIEWS);
     let seen = Seen::by(&splat, &all, render.near);
     eprintln!(
         "splat: {} Gaussians of degree {}, of which {} views see {}",
@@ -97,10 +108,7 @@ pub fn open(args: &Args, places: &Places) -> anyhow::Result<Source> {
         let bar = indicatif::ProgressBar::new(posed.len() as u64).with_prefix("views");
         views::write(gpu, &splat, &posed, &folder, &made_of, &mut |done| {
             bar.set_position(done);
-            match crate::cli::train::ends(&Default::default()) {
-                Some(signal) => Err(crate::prepare::Error::Interrupted { signal }.into()),
-                None => Ok(()),
-            }
+            go_on()
         })?;
         bar.finish_and_clear();
         Ok(())
@@ -109,6 +117,44 @@ pub fn open(args: &Args, places: &Places) -> anyhow::Result<Source> {
     let model = Stored::Gaussians(seen.plain().cloud);
     let ready = Arc::new(Ready { fit: Fit { model, settings }, made_of });
     Ok(Source { splat, seen, ready, views: folder })
+}
+
+/// The cameras of a file or a model, in the splat's frame.
+fn given(args: &Args, splat: &Splat, from: &Path) -> anyhow::Result<Vec<Posed>> {
+    let mut posed = cameras::read(from)?;
+    match views::align(splat, from, &mut posed) {
+        Place::Own => {}
+        Place::Elsewhere(_) => {
+            eprintln!("splat: it was moved, scaled or turned against {}, and its cameras are, too", from.display());
+        }
+        Place::Unknown => eprintln!(
+            "splat: the points of {} are not where the splat is: what is drawn from its cameras may show nothing that was photographed",
+            from.display()
+        ),
+    }
+    Ok(some(posed, args))
+}
+
+/// Cameras for a splat that comes with none.
+fn chosen(args: &Args, splat: &Splat) -> anyhow::Result<Vec<Posed>> {
+    args.device.with_gpu(|gpu| {
+        super::signals::listen()?;
+        let bar = indicatif::ProgressBar::new_spinner().with_prefix("cameras");
+        let posed = chosen::cameras(gpu, splat, args.views as usize, &mut |done| {
+            bar.set_position(done);
+            go_on()
+        })?;
+        bar.finish_and_clear();
+        Ok(posed)
+    })
+}
+
+/// An error once the program is to end.
+fn go_on() -> Result<(), Error> {
+    match crate::cli::train::ends(&Default::default()) {
+        Some(signal) => Err(crate::prepare::Error::Interrupted { signal }.into()),
+        None => Ok(()),
+    }
 }
 
 /// Cameras enough, evenly spread, and those that the user names.

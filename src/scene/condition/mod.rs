@@ -23,7 +23,7 @@ mod unit;
 
 use super::{Config, Scene, exposure};
 
-pub(crate) use points::{on_object, seed_views};
+pub(crate) use points::{bare, on_object, seed_views};
 pub(crate) use sparse::samples;
 pub use unit::{footprint, normalize, typical};
 

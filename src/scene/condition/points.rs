@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use rayon::prelude::*;
 
-use crate::scene::{Camera, Point, Scene, View};
+use crate::scene::{Camera, Hole, Point, Scene, View};
 
 /// A point that falls into the mask in more than this share of the views that have it in the picture stands on the object.
 const OBJECT_SHARE: f64 = 0.9;
@@ -137,6 +137,28 @@ const EVERY: usize = 2;
 /// Relative difference in depth up to which a point is of what a hole shows.
 const ON_IT: f64 = 0.04;
 
+/// \[pixel\] whether a filled hole shows a surface that none of `points` (world coordinates) is on: no pixel around it, in squares of
+/// [`SQUARE`] pixels, has one within 4 % of its depth.
+pub(crate) fn bare(
+    hole: &Hole,
+    depth: &[f32],
+    camera: &Camera,
+    points: impl ParallelIterator<Item = [f32; 3]>,
+) -> Vec<bool> {
+    let w = camera.size[0] as usize;
+    let square = |pixel: usize| (pixel / w / SQUARE) * w.div_ceil(SQUARE) + pixel % w / SQUARE;
+    let has = |position: [f32; 3]| {
+        let position = position.map(f64::from);
+        let pixel = camera.pixel_of(position)?;
+        let apart = camera.to_camera(position)[2] / f64::from(depth[pixel]) - 1.0;
+        (apart.abs() <= ON_IT).then(|| square(pixel))
+    };
+    let seeded: BTreeSet<usize> = points.filter_map(has).collect();
+    let wanted =
+        |pixel: usize| hole.filled.as_raw()[pixel] != 0 && depth[pixel].is_finite() && !seeded.contains(&square(pixel));
+    (0..depth.len()).map(wanted).collect()
+}
+
 /// Adds points to the filled holes of views that are no references, at the depth that `prepare` has found there, to all squares of a hole
 /// that none of the scene's points is on. Where nothing is to begin with nothing is learnt: the background's black would stay.
 pub fn seed_views(scene: &mut Scene) {
@@ -146,24 +168,15 @@ pub fn seed_views(scene: &mut Scene) {
         let Some(depth) = &hole.depth else { continue };
         let camera = &scene.train[hole.view].camera;
         let w = camera.size[0] as usize;
-        let square = |pixel: usize| (pixel / w / SQUARE) * w.div_ceil(SQUARE) + pixel % w / SQUARE;
-        let has = |point: &Point| {
-            let position = point.position.map(f64::from);
-            let pixel = camera.pixel_of(position)?;
-            let apart = camera.to_camera(position)[2] / f64::from(depth[pixel]) - 1.0;
-            (apart.abs() <= ON_IT).then(|| square(pixel))
-        };
-        let seeded: BTreeSet<usize> = points.par_iter().filter_map(has).collect();
-        let wanted = |pixel: &usize| {
-            let even = (pixel / w).is_multiple_of(EVERY) && (pixel % w).is_multiple_of(EVERY);
-            even && hole.filled.as_raw()[*pixel] != 0 && depth[*pixel].is_finite() && !seeded.contains(&square(*pixel))
-        };
-        let more = (0..depth.len()).filter(wanted).filter_map(|pixel| {
+        let bare = bare(hole, depth, camera, points.par_iter().map(|point| point.position));
+        let even = |pixel: &usize| (pixel / w).is_multiple_of(EVERY) && (pixel % w).is_multiple_of(EVERY);
+        let more = (0..depth.len()).filter(|pixel| bare[*pixel] && even(pixel)).filter_map(|pixel| {
             let position = camera.lift(camera.pixel_center(pixel), f64::from(depth[pixel]))?;
             let color = hole.image.get_pixel((pixel % w) as u32, (pixel / w) as u32).0;
             Some(Point { position: position.map(|v| v as f32), color })
         });
-        points.extend(more.collect::<Vec<_>>());
+        let more: Vec<Point> = more.collect();
+        points.extend(more);
     }
     let added = points.split_off(before);
     if !added.is_empty() {
@@ -181,7 +194,7 @@ mod tests {
 
     use super::super::reference;
     use super::*;
-    use crate::scene::{Config, Hole, load, synthetic};
+    use crate::scene::{Config, load, synthetic};
 
     /// The object is a sphere of radius 0.2 or so on a stand; the room is exact, so what stands where is known.
     #[test]
