@@ -636,7 +636,8 @@ fn all_views_holes_begin_with_something() {
         ..Cloud::default()
     };
     let fit = Fit { model: Stored::Gaussians(rest.clone()), settings: Settings::default() };
-    let begun = |scene: &scene::Scene| fill::begin(&gpu, scene, &dir, &rest, &fit).expect("a fill").len();
+    let among = |rest: &Cloud, scene: &scene::Scene| fill::begin(&gpu, scene, &dir, rest, &fit).expect("a fill").len();
+    let begun = |scene: &scene::Scene| among(&rest, scene);
     scene.holes.clear();
     let alone = begun(&scene);
     assert!(alone > 100, "{alone}");
@@ -660,6 +661,14 @@ fn all_views_holes_begin_with_something() {
     assert_eq!(begun(&scene), alone + inside);
     scene.holes.push(hole(vec![f32::NAN; depth.len()]));
     assert_eq!(begun(&scene), alone + inside);
+    // Before what stands before the hole nothing begins, though it looks other than what is in the hole.
+    let near = 0.3 * depth[filled.as_raw().iter().position(|inside| *inside != 0).expect("a hole")];
+    let middle = camera.lift(camera.principal.map(f64::from), f64::from(near)).expect("ahead");
+    let mut before = rest.clone();
+    before.position = vec![middle.map(|v| v as f32)];
+    before.log_scale = vec![[near.ln(); 3]];
+    before.logit = vec![8.0];
+    assert_eq!(among(&before, &scene), 0);
 }
 
 #[test]

@@ -10,13 +10,14 @@ use rayon::prelude::*;
 use super::Error;
 use super::views::{Artist, Seen};
 use crate::gpu::Gpu;
-use crate::math::harmonics::ZEROTH;
-use crate::model::gaussians::{Cloud, logit};
+use crate::model::gaussians::Cloud;
+use crate::model::{self, init};
 use crate::prepare::fit::Fit;
 use crate::prepare::masks::{self, Votes};
 use crate::prepare::splats::Splats;
 use crate::render::view::Rendered;
-use crate::scene::{self, Camera, PriorKind, Scene, resample};
+use crate::scene::{self, Camera, Point, PriorKind, Scene, resample};
+use crate::statistics::median;
 
 /// A Gaussian with more than this share inside the masks is the object's.
 const OBJECT: f32 = 0.5;
@@ -24,11 +25,14 @@ const OBJECT: f32 = 0.5;
 const DIFFERS: f32 = 0.06;
 /// or lets this much through.
 const OPEN: f32 = 0.1;
+/// What covers so much of a pixel, and is nearer than this part of the hole's depth, stands before it.
+const BEFORE: f32 = 0.5;
+const NEARER: f64 = 0.95;
+/// A Gaussian of the fill is at most so many times as wide as most of them are: one that has no neighbours is alone.
+const WIDEST: f64 = 1.5;
 /// Pixels by which the hole is enlarged.
 const MARGIN: u32 = 1;
-/// Standard deviation of a Gaussian of the fill, in pixels of the reference picture as it was loaded.
-const WIDTH: f64 = 0.6;
-/// Opacity that it begins with.
+/// Opacity that a Gaussian of the fill begins with.
 const OPACITY: f64 = 0.7;
 
 /// Which of the seen Gaussians are the object, by the votes of all masks.
@@ -64,30 +68,31 @@ struct Shown<'a> {
 }
 
 impl Shown<'_> {
-    /// Adds a Gaussian at each pixel of the hole where `drawn`, the rest of the splat, is not what the picture shows.
-    fn begin(&self, drawn: &Rendered, cloud: &mut Cloud) {
+    /// Adds a point at each pixel of the hole where `drawn`, the rest of the splat, is not what the picture shows.
+    fn begin(&self, drawn: &Rendered, points: &mut Vec<Point>) {
         let camera = self.camera;
         for i in (0..self.depth.len()).filter(|i| self.inside[*i]) {
             let (x, y) = (i as u32 % camera.size[0], i as u32 / camera.size[0]);
-            let color = self.image.get_pixel(x, y).0.map(|v| f32::from(v) / 255.0);
-            let off = (0..3).map(|c| (color[c] - drawn.rgb[i][c]).abs()).fold(0.0, f32::max);
+            let color = self.image.get_pixel(x, y).0;
+            let off = |c: usize| (f32::from(color[c]) / 255.0 - drawn.rgb[i][c]).abs();
             let z = f64::from(self.depth[i]);
-            if (off < DIFFERS && drawn.transmittance[i] < OPEN) || !z.is_finite() || z <= 0.0 {
+            // What stands before the hole's surface and stays is none of the hole, whatever the mask says.
+            let covered = 1.0 - drawn.transmittance[i];
+            if covered > BEFORE && f64::from(drawn.depth[i] / covered) < NEARER * z {
                 continue;
             }
-            let Some(point) = camera.lift(camera.pixel_center(i), z) else { continue };
-            let width = WIDTH * z / f64::from(camera.focal[0].min(camera.focal[1]));
-            cloud.position.push(point.map(|v| v as f32));
-            cloud.log_scale.push([width.ln() as f32; 3]);
-            cloud.rotation.push([1.0, 0.0, 0.0, 0.0]);
-            cloud.logit.push(logit(OPACITY));
-            cloud.harmonics.push(color.map(|v| ((f64::from(v) - 0.5) / ZEROTH) as f32));
+            if ((0..3).all(|c| off(c) < DIFFERS) && drawn.transmittance[i] < OPEN) || !z.is_finite() || z <= 0.0 {
+                continue;
+            }
+            let Some(position) = camera.lift(camera.pixel_center(i), z) else { continue };
+            points.push(Point { position: position.map(|v| v as f32), color });
         }
     }
 }
 
 /// A Gaussian for each pixel of the reference's hole where the rest of the splat is not what the reference shows, at the
-/// reference's depth; and then of every other view's filled hole, on what no earlier one has shown.
+/// reference's depth; and then of every other view's filled hole, on what no earlier one has shown. They are discs along the surface, as
+/// wide as their neighbours are apart.
 ///
 /// # Errors
 /// A scene without a reference, or without its depth; when the device has no room, or is lost.
@@ -100,7 +105,7 @@ pub fn begin(gpu: &Gpu, scene: &Scene, root: &Path, rest: &Cloud, fit: &Fit) -> 
     let view = &scene.train[reference.view];
     let mask = view.mask.as_ref().ok_or_else(|| missing("mask of the reference view"))?;
     let mut artist = Artist::new(gpu, rest, &fit.settings.render)?;
-    let mut cloud = Cloud::default();
+    let mut points = vec![];
     let [w, h] = view.camera.size;
     let image = match reference.image.dimensions() == (w, h) {
         true => &reference.image,
@@ -112,15 +117,23 @@ pub fn begin(gpu: &Gpu, scene: &Scene, root: &Path, rest: &Cloud, fit: &Fit) -> 
         _ => prior.values.clone(),
     };
     let shown = Shown { camera: &view.camera, image, depth: &depth, inside: &inside };
-    shown.begin(&artist.draw(&view.camera)?, &mut cloud);
+    shown.begin(&artist.draw(&view.camera)?, &mut points);
     for hole in &scene.holes {
         let (camera, Some(depth)) = (&scene.train[hole.view].camera, &hole.depth) else { continue };
-        let inside = scene::bare(hole, depth, camera, cloud.position.par_iter().copied());
+        let inside = scene::bare(hole, depth, camera, points.par_iter().map(|point| point.position));
         if inside.contains(&true) {
             let shown = Shown { camera, image: &hole.image, depth, inside: &inside };
-            shown.begin(&artist.draw(camera)?, &mut cloud);
+            shown.begin(&artist.draw(camera)?, &mut points);
         }
     }
+    if points.is_empty() {
+        return Ok(Cloud::default());
+    }
+    let config = model::Config { degree: 0, opacity: OPACITY, ..model::Config::default() };
+    let mut cloud = init::gaussians(&points, &config, u32::MAX).map_err(|error| Error::Request(error.to_string()))?;
+    let usual = median(cloud.log_scale.iter().map(|scale| scale[0])).expect("there are points");
+    let most = (usual + WIDEST.ln()) as f32;
+    cloud.log_scale.iter_mut().flatten().for_each(|width| *width = width.min(most));
     Ok(cloud)
 }
 
