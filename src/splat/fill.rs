@@ -25,6 +25,8 @@ const OBJECT: f32 = 0.5;
 const DIFFERS: f32 = 0.06;
 /// or lets this much through.
 const OPEN: f32 = 0.1;
+/// The same for what other views show in their holes: elsewhere the splat has already what is behind the object, as it was seen.
+const WIDE_OPEN: f32 = 0.3;
 /// What covers so much of a pixel, and is nearer than this part of the hole's depth, stands before it.
 const BEFORE: f32 = 0.5;
 const NEARER: f64 = 0.95;
@@ -65,6 +67,8 @@ struct Shown<'a> {
     depth: &'a [f32],
     /// \[pixel\] of the hole.
     inside: &'a [bool],
+    /// Whether what is there already stays whatever it looks like: what others than the reference guess is no better.
+    open: bool,
 }
 
 impl Shown<'_> {
@@ -81,7 +85,9 @@ impl Shown<'_> {
             if covered > BEFORE && f64::from(drawn.depth[i] / covered) < NEARER * z {
                 continue;
             }
-            if ((0..3).all(|c| off(c) < DIFFERS) && drawn.transmittance[i] < OPEN) || !z.is_finite() || z <= 0.0 {
+            let is_open = drawn.transmittance[i] >= if self.open { WIDE_OPEN } else { OPEN };
+            let differs = !self.open && (0..3).any(|c| off(c) >= DIFFERS);
+            if !(is_open || differs) || !z.is_finite() || z <= 0.0 {
                 continue;
             }
             let Some(position) = camera.lift(camera.pixel_center(i), z) else { continue };
@@ -91,7 +97,7 @@ impl Shown<'_> {
 }
 
 /// A Gaussian for each pixel of the reference's hole where the rest of the splat is not what the reference shows, at the
-/// reference's depth; and then of every other view's filled hole, on what no earlier one has shown. They are discs along the surface, as
+/// reference's depth; and then of every other view's filled hole, where the splat is open and no earlier one has shown anything. They are discs along the surface, as
 /// wide as their neighbours are apart.
 ///
 /// # Errors
@@ -116,13 +122,13 @@ pub fn begin(gpu: &Gpu, scene: &Scene, root: &Path, rest: &Cloud, fit: &Fit) -> 
         PriorKind::Disparity => prior.values.iter().map(|disparity| 1.0 / disparity).collect(),
         _ => prior.values.clone(),
     };
-    let shown = Shown { camera: &view.camera, image, depth: &depth, inside: &inside };
+    let shown = Shown { camera: &view.camera, image, depth: &depth, inside: &inside, open: false };
     shown.begin(&artist.draw(&view.camera)?, &mut points);
     for hole in &scene.holes {
         let (camera, Some(depth)) = (&scene.train[hole.view].camera, &hole.depth) else { continue };
         let inside = scene::bare(hole, depth, camera, points.par_iter().map(|point| point.position));
         if inside.contains(&true) {
-            let shown = Shown { camera, image: &hole.image, depth, inside: &inside };
+            let shown = Shown { camera, image: &hole.image, depth, inside: &inside, open: true };
             shown.begin(&artist.draw(camera)?, &mut points);
         }
     }
