@@ -1,5 +1,7 @@
 //! Medians and quantiles, defined once for every count of values.
 
+use glam::DVec3;
+
 /// The middle of the values; of an even count the mean of the two in the middle. `None` of no values. A NaN counts as
 /// the largest.
 pub fn median(values: impl IntoIterator<Item = impl Into<f64>>) -> Option<f64> {
@@ -10,6 +12,12 @@ pub fn median(values: impl IntoIterator<Item = impl Into<f64>>) -> Option<f64> {
     let (below, upper, _) = values.select_nth_unstable_by(middle.min(last), f64::total_cmp);
     let lower = below.iter().copied().max_by(f64::total_cmp).filter(|_| even);
     Some(lower.map_or(*upper, |lower| 0.5 * (lower + *upper)))
+}
+
+/// The medians of positions along each axis; nothing of none.
+pub fn middle(points: &[DVec3]) -> Option<DVec3> {
+    let along = |axis: usize| median(points.iter().map(|p| p[axis]));
+    Some(DVec3::new(along(0)?, along(1)?, along(2)?))
 }
 
 /// The value at place `floor(share (n - 1))` of the n values in ascending order: always one of the values, so that a

@@ -17,7 +17,7 @@ use crate::gpu::Gpu;
 use crate::math::harmonics::ZEROTH;
 use crate::model::gaussians::Cloud;
 use crate::scene::Camera;
-use crate::statistics::{median, quantile};
+use crate::statistics::{median, middle, quantile};
 
 /// Gaussians whose neighbours are counted, at most.
 const LOOKED_AT: usize = 50_000;
@@ -91,18 +91,15 @@ impl Subject {
         let most = quantile(loose.iter().copied(), DENSEST)?;
         let mut dense: Vec<DVec3> =
             centers.iter().zip(&loose).filter(|(_, loose)| **loose <= most).map(|(at, _)| *at).collect();
-        let middle_of = |of: &[DVec3]| {
-            let along = |c: usize| median(of.iter().map(|p| p[c]));
-            Some(DVec3::new(along(0)?, along(1)?, along(2)?))
-        };
         // Of all, and then of the nearer half.
-        let first = middle_of(&dense)?;
+        let first = middle(&dense)?;
         let far = median(dense.iter().map(|p| p.distance(first)))?;
         dense.retain(|p| p.distance(first) <= far);
-        let middle = middle_of(&dense)?;
-        let near: Vec<DVec3> = centers.iter().copied().filter(|p| p.distance(middle) <= SURROUNDINGS * far).collect();
-        let around = middle_of(&near)?;
-        let subject = Self { middle, around, aim: middle, radius: far, distance: AWAY[0] * far, up: DVec3::NEG_Y };
+        let center = middle(&dense)?;
+        let near: Vec<DVec3> = centers.iter().copied().filter(|p| p.distance(center) <= SURROUNDINGS * far).collect();
+        let around = middle(&near)?;
+        let subject =
+            Self { middle: center, around, aim: center, radius: far, distance: AWAY[0] * far, up: DVec3::NEG_Y };
         (far > 0.0 && far.is_finite()).then_some(subject)
     }
 

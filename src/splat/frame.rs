@@ -11,7 +11,7 @@ use glam::{DMat3, DQuat, DVec3};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
 
-use crate::statistics::median;
+use crate::statistics::{median, middle};
 
 /// Points that are looked at, at most,
 const POINTS: usize = 1000;
@@ -64,8 +64,7 @@ impl Frame {
 
 /// The middle of positions, and their median distance from it.
 fn spread(points: &[DVec3]) -> (DVec3, f64) {
-    let along = |c: usize| median(points.iter().map(|p| p[c])).unwrap_or(f64::NAN);
-    let middle = DVec3::from_array(std::array::from_fn(along));
+    let middle = middle(points).unwrap_or(DVec3::NAN);
     (middle, median(points.iter().map(|p| p.distance(middle))).unwrap_or(f64::NAN))
 }
 

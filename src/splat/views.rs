@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
-use glam::{DVec3, Vec3};
+use glam::DVec3;
 use image::{ImageFormat, RgbImage};
 
 use super::Error;
@@ -19,7 +19,7 @@ use crate::model::stored::Stored;
 use crate::prepare::poses;
 use crate::render::Config;
 use crate::render::view::{Rendered, Renderer};
-use crate::scene::{self, Camera, colmap};
+use crate::scene::{self, Camera, colmap, up};
 use crate::statistics::median;
 
 /// Below this a Gaussian touches no pixel.
@@ -119,9 +119,7 @@ pub fn align(splat: &Splat, folder: &Path, posed: &mut [Posed]) -> Place {
     let Place::Elsewhere(frame) = place else { return place };
     for Posed { camera, .. } in posed {
         let center = frame.apply(DVec3::from_array(camera.center()));
-        // Rows are the camera's axes.
-        camera.rotation =
-            camera.rotation.map(|axis| (frame.turn * Vec3::from_array(axis).as_dvec3()).as_vec3().to_array());
+        *camera = up::turn_camera(camera, frame.turn);
         camera.translation = Camera::translation_to(&camera.rotation, center.to_array());
     }
     place

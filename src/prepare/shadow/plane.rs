@@ -4,7 +4,7 @@ use glam::DVec3;
 use rand_pcg::Pcg64;
 
 use crate::multiview::plane::{self, Plane};
-use crate::statistics::{median, quantile};
+use crate::statistics::{middle, quantile};
 
 /// Planes drawn.
 const DRAWS: usize = 4000;
@@ -47,13 +47,9 @@ impl Support {
     }
 }
 
-fn middle(points: &[DVec3]) -> DVec3 {
-    DVec3::from(std::array::from_fn(|axis| median(points.iter().map(|p| p[axis])).expect("there are points")))
-}
-
 /// The middle of places and the radius around it that nine in ten of them lie in; nothing without any.
 pub fn ball(points: &[DVec3]) -> Option<(DVec3, f64)> {
-    let middle = (!points.is_empty()).then(|| middle(points))?;
+    let middle = middle(points)?;
     Some((middle, quantile(points.iter().map(|p| (*p - middle).length()), 0.9)?))
 }
 
