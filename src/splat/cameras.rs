@@ -122,7 +122,7 @@ fn of_colmap(path: &Path) -> Result<Vec<Posed>, Error> {
     Ok(each.collect())
 }
 
-/// What [`export`](crate::export) says of a camera.
+/// A camera as [`export`](crate::export) writes it.
 #[derive(Deserialize)]
 struct Exported {
     name: String,
@@ -156,7 +156,7 @@ enum Listed {
 }
 
 /// A camera whose axis goes through the middle of its picture.
-fn pinhole(size: [u32; 2], focal: [f64; 2]) -> Camera {
+pub(super) fn pinhole(size: [u32; 2], focal: [f64; 2]) -> Camera {
     Camera {
         rotation: [[0.0; 3]; 3],
         translation: [0.0; 3],

@@ -1,7 +1,7 @@
 //! Cameras for a splat that comes with none.
 //!
-//! What was photographed most is where Gaussians lie densest, and looks right from about where the photographs were taken. There the splat
-//! covers the picture, nothing stands right before the camera, and what is drawn is fine: Gaussians are as large as the pixels were that
+//! Gaussians lie densest where most was photographed, and that looks right from about where the photographs were taken. There the splat
+//! covers the picture, nothing stands right before the camera, and drawings are fine: Gaussians are as large as the pixels were that
 //! they were trained on, so that from elsewhere they are drawn large. Directions from all around are judged by small drawings of
 //! the splat, coloured by its Gaussians' sizes.
 
@@ -10,7 +10,7 @@ use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
 
 use super::Error;
-use super::cameras::{Posed, SIDE};
+use super::cameras::{Posed, SIDE, pinhole};
 use super::read::{Splat, of_degree};
 use super::views::{Artist, config, opaque};
 use crate::gpu::Gpu;
@@ -27,9 +27,10 @@ const NEIGHBOURS: usize = 16;
 const DENSEST: f64 = 0.2;
 /// Distances of the cameras, in median distances of these from their middle.
 const AWAY: [f64; 2] = [3.6, 2.4];
-/// What they look at, on the way from there to the middle of all that is around: who stands before something looks past what is nearest.
+/// Places that the cameras look at, as shares of the way from that middle to the middle of the surroundings: a photographer before a
+/// scene looks past its nearest part.
 const PAST: [f64; 3] = [0.0, 0.5, 1.0];
-/// What is around is within so many median distances.
+/// Surroundings reach so many of these median distances.
 const SURROUNDINGS: f64 = 12.0;
 /// Field of view across, radians.
 const ACROSS: f64 = 1.05;
@@ -53,11 +54,11 @@ const APART: [f64; 2] = [0.06, 0.2];
 const LEVEL: f64 = 0.1;
 const HEAD_ON: f64 = 0.5;
 
-/// What a splat is looked at for.
+/// The densest part of a splat, and from where it is looked at.
 #[derive(Clone)]
 struct Subject {
     middle: DVec3,
-    /// The middle of what is around.
+    /// The middle of the surroundings.
     around: DVec3,
     /// The place between these that is looked at.
     aim: DVec3,
@@ -111,15 +112,14 @@ impl Subject {
         let right = if sideways.length() > 1e-3 { sideways.normalize() } else { ahead.any_orthonormal_vector() };
         let axes = DMat3::from_cols(right, ahead.cross(right), ahead);
         let rotation = [axes.x_axis, axes.y_axis, axes.z_axis].map(|axis| axis.as_vec3().to_array());
-        let focal = (0.5 * f64::from(size[0]) / (0.5 * ACROSS).tan()) as f32;
-        Camera {
-            rotation,
-            translation: Camera::translation_to(&rotation, center.to_array()),
-            focal: [focal; 2],
-            principal: size.map(|side| side as f32 / 2.0),
-            distortion: [0.0; 4],
-            size,
-        }
+        let focal = 0.5 * f64::from(size[0]) / (0.5 * ACROSS).tan();
+        let translation = Camera::translation_to(&rotation, center.to_array());
+        Camera { rotation, translation, ..pinhole(size, [focal; 2]) }
+    }
+
+    /// The camera in some direction as a view with a name.
+    fn posed(&self, number: usize, direction: DVec3) -> Posed {
+        Posed { name: format!("view_{number:03}"), camera: self.camera(direction, [SIDE, SIDE * 3 / 4]) }
     }
 
     /// Turns the cameras upright: what is level is the plane that most of what is near lies on, and `from` is above it.
@@ -241,13 +241,6 @@ pub fn cameras(
         return Err(Error::Request(what.to_owned()));
     }
     Ok(chosen.into_iter().enumerate().map(|(i, to)| subject.posed(i, to)).collect())
-}
-
-impl Subject {
-    /// The camera in some direction as a view with a name.
-    fn posed(&self, number: usize, direction: DVec3) -> Posed {
-        Posed { name: format!("view_{number:03}"), camera: self.camera(direction, [SIDE, SIDE * 3 / 4]) }
-    }
 }
 
 /// Directions of least cost (`judged`, by cost) that hang together: each is near another, and none too near. In their order around the first.

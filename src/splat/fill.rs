@@ -25,9 +25,9 @@ const OBJECT: f32 = 0.5;
 const DIFFERS: f32 = 0.06;
 /// or lets this much through.
 const OPEN: f32 = 0.1;
-/// The same for what other views show in their holes: elsewhere the splat has already what is behind the object, as it was seen.
+/// Light that is let through where other views' holes begin: elsewhere the splat has already what was seen behind the object.
 const WIDE_OPEN: f32 = 0.3;
-/// What covers so much of a pixel, and is nearer than this part of the hole's depth, stands before it.
+/// Matter that covers so much of a pixel, and is nearer than this part of the hole's depth, stands before it.
 const BEFORE: f32 = 0.5;
 const NEARER: f64 = 0.95;
 /// A Gaussian of the fill is at most so many times as wide as most of them are: one that has no neighbours is alone.
@@ -59,7 +59,7 @@ pub fn object(
     Ok(shares.object.iter().map(|share| *share > OBJECT).collect())
 }
 
-/// What one view shows in its hole.
+/// A view's hole, filled.
 struct Shown<'a> {
     camera: &'a Camera,
     image: &'a RgbImage,
@@ -97,8 +97,8 @@ impl Shown<'_> {
 }
 
 /// A Gaussian for each pixel of the reference's hole where the rest of the splat is not what the reference shows, at the
-/// reference's depth; and then of every other view's filled hole, where the splat is open and no earlier one has shown anything. They are discs along the surface, as
-/// wide as their neighbours are apart.
+/// reference's depth; and then of every other view's filled hole, where the splat is open and no earlier one has shown anything. They are
+/// discs along the surface, as wide as their neighbours are apart.
 ///
 /// # Errors
 /// A scene without a reference, or without its depth; when the device has no room, or is lost.

@@ -36,7 +36,7 @@ const OBJECT: &str = "object.ply";
 const CHANGES: &str = "changes.json";
 /// Steps of the fill's training unless asked for otherwise.
 const STEPS: u32 = 600;
-/// Share of them that look at the reference: nothing else shows the hole.
+/// Share of them that look at the reference, which was chosen because most of its hole is seen.
 const REFERENCE_SHARE: f64 = 0.5;
 /// Longer side of the pictures that the hole is begun at, pixels.
 const SIDE: u32 = 256;
