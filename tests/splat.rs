@@ -539,9 +539,13 @@ fn cameras_of_export_stand_where_they_say() {
             r#"{{"name":"{name}","center":[1,2,3],"rotation":[[0,1,0],[0,0,1],[1,0,0]],"fov":90,"size":[200,100],"roll":0{principal}}}"#
         )
     };
-    let all = [entry("a", ""), entry("b", r#","principal":[0.25,0.5]"#), entry("c", r#","principal":null"#)].join(",");
-    std::fs::write(folder.path().join("export.json"), format!(r#"{{"version":"1","cameras":[{all}]}}"#))
-        .expect("a file");
+    let write = |principals: [&str; 3]| {
+        let all: Vec<_> =
+            ["a", "b", "c"].iter().zip(principals).map(|(name, principal)| entry(name, principal)).collect();
+        let text = format!(r#"{{"version":"1","cameras":[{}]}}"#, all.join(","));
+        std::fs::write(folder.path().join("export.json"), text).expect("a file");
+    };
+    write(["", r#","principal":[0.25,0.5]"#, r#","principal":null"#]);
     let found = cameras::beside(&folder.path().join("scene.ply")).expect("it is beside the splat");
     let posed = cameras::read(&found).expect("cameras");
     for (one, column) in posed.iter().zip([400.0, 200.0, 400.0]) {
@@ -551,6 +555,9 @@ fn cameras_of_export_stand_where_they_say() {
         let [x, y] = camera.project([11.0, 2.0, 3.0]).expect("it is ahead");
         assert!((x - column).abs() < 1e-3 && (y - 200.0).abs() < 1e-3, "{x} {y}");
     }
+    write(["", r#","principal":[1e30,0.5]"#, ""]);
+    let error = cameras::read(&found).expect_err("a picture far from its axis").to_string();
+    assert!(error.contains("camera b: its principal point"), "{error}");
     std::fs::write(folder.path().join("export.json"), "{}").expect("a file");
     let error = cameras::read(&found).expect_err("no cameras").to_string();
     assert!(error.contains("neither a cameras.json"), "{error}");

@@ -53,6 +53,13 @@ async function fillStrip(removal) {
   }
 }
 
+// How much of the object is left in the views that were drawn so far.
+function leftOver() {
+  if (!state.left) return '';
+  const share = (part) => percent(Math.max(0, part));
+  return ` Of the object ${share(state.left.mean)} is left on average, at most ${share(state.left.most)}, in ${state.left.view}.`;
+}
+
 function strip() {
   const wanted = compares() ? state.removals : 0;
   if (wanted === thumbed) return;

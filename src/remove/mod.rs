@@ -168,14 +168,22 @@ pub enum Wish {
 /// A view, a version of its mask, and that.
 pub type Masked = (usize, u64, Arc<GrayImage>);
 
+/// A view without the object.
+pub struct After {
+    /// The picture.
+    pub jpeg: Vec<u8>,
+    /// How much of the object is left in it, where that can be told: 0 nothing, 1 all of it.
+    pub residue: Option<f64>,
+}
+
 /// The results of the work.
 #[derive(Default)]
 pub struct Results {
     page: Vec<Arc<Resource>>,
     files: Vec<(String, PathBuf)>,
     before: BTreeMap<usize, PathBuf>,
-    /// Those that were drawn, as JPEG.
-    after: BTreeMap<usize, Vec<u8>>,
+    /// Those that were drawn.
+    after: BTreeMap<usize, After>,
     /// The scene, and the views whose holes are filled there.
     filled: Option<(PathBuf, BTreeSet<usize>)>,
 }
@@ -185,6 +193,14 @@ impl Results {
     /// without the object.
     pub fn new(page: Vec<Resource>, files: Vec<(String, PathBuf)>, before: BTreeMap<usize, PathBuf>) -> Self {
         Self { page: page.into_iter().map(Arc::new).collect(), files, before, ..Self::default() }
+    }
+
+    /// Where most of the object is left and how much, and of how many views the mean is how much; those drawn so far.
+    fn left(&self) -> Option<[(usize, f64); 2]> {
+        let residue = |(number, after): (&usize, &After)| Some((*number, after.residue?));
+        let all: Vec<(usize, f64)> = self.after.iter().filter_map(residue).collect();
+        let most = *all.iter().max_by(|a, b| a.1.total_cmp(&b.1))?;
+        Some([most, (all.len(), all.iter().map(|(_, residue)| residue).sum::<f64>() / all.len() as f64)])
     }
 
     /// With the scene, in which these views have holes that are filled.
@@ -591,10 +607,10 @@ impl Session {
     }
 
     /// A view without the object; where it cannot be drawn, it is not asked for again.
-    pub fn drew(&self, number: usize, jpeg: Option<Vec<u8>>) {
+    pub fn drew(&self, number: usize, after: Option<After>) {
         let mut results = write(&self.results);
-        match jpeg {
-            Some(jpeg) => drop(results.after.insert(number, jpeg)),
+        match after {
+            Some(after) => drop(results.after.insert(number, after)),
             None => drop(results.before.remove(&number)),
         }
     }
@@ -602,7 +618,7 @@ impl Session {
     /// A view without the object, which is asked for unless it is there.
     fn after(&self, number: usize) -> Result<Vec<u8>, Refusal> {
         let results = read(&self.results);
-        if let Some(jpeg) = results.after.get(&number) {
+        if let Some(After { jpeg, .. }) = results.after.get(&number) {
             return Ok(jpeg.clone());
         }
         let mut state = self.lock();

@@ -535,6 +535,7 @@ $('out').onclick = () => magnify(1 / 1.4);
 $('fit').onclick = () => { zoom = 1; place(); };
 $('sort').onclick = () => { sorted = !sorted; arrange(); draw(); };
 $('next').onclick = () => {
+  if (compares()) return show(state.left.view, true);
   if (!state.next) return;
   choose(state.of);
   show(state.next, true);
@@ -668,7 +669,7 @@ function draw() {
   const kept = state.objects.filter((o) => o.marked && !ticked().includes(o)).map((o) => o.name);
   const more = kept.length ? ` What is not ticked is still there: tick ${kept.join(' or ')} to remove that as well.` : '';
   const advice = working ? 'You can leave this page open or close it: the work goes on, and this page finds it again.'
-    : compared ? 'The photograph is on the left, the scene without the object on the right: drag across the picture or use the slider. Arrow keys and the pictures below show it from elsewhere.'
+    : compared ? 'The photograph is on the left, the scene without the object on the right: drag across the picture or use the slider. Arrow keys and the pictures below show it from elsewhere.' + leftOver()
     : repaints() ? `Where a hole is filled wrong, brush over it and press Repaint: it is filled anew from what is around it, in all photographs. For a patch from elsewhere take “Take from” and drag from there onto it${touch ? '' : ', or hold Shift'}.`
     : done ? `Look around: drag turns, the wheel goes nearer, the slider shows the photograph.${more}`
     : state.problems.length ? 'Something speaks against going on. Mend what is named, or go on anyway.'
@@ -681,8 +682,9 @@ function draw() {
     : state.next ? `${percent(state.doubt)} of ${several() ? named(state.of) : 'the object'} in ${state.next} is not known from what is marked so far. Draw around it there, too.`
     : `Look through the photographs. Where an outline is wrong, ${click} on what is missing, or ${much}, or paint it.`;
   $('advice').textContent = advice;
-  $('next').hidden = working || done || !state.next || state.carrying || (state.next === current && state.of === object);
-  $('next').textContent = `Show ${several() ? `${named(state.of)} in ` : ''}${state.next}`;
+  $('next').hidden = compared ? (state.left?.view ?? current) === current
+    : working || done || !state.next || state.carrying || (state.next === current && state.of === object);
+  $('next').textContent = compared ? `Show ${state.left?.view}` : `Show ${several() ? `${named(state.of)} in ` : ''}${state.next}`;
   $('problems').hidden = working || done || !state.problems.length;
   $('problems').replaceChildren(...state.problems.map((text) => {
     const item = document.createElement('li');

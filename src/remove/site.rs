@@ -274,13 +274,16 @@ impl Session {
 
     /// The state as the page reads it. That of the views is made when it changes, not when it is asked for.
     pub(super) fn status(&self) -> String {
-        let (files, compare, filled): (Vec<_>, Vec<_>, Vec<_>) = {
+        let (files, compare, filled, left): (Vec<_>, Vec<_>, Vec<_>, _) = {
             let results = read(&self.results);
             let size = |path: &Path| std::fs::metadata(path).map_or(0, |file| file.len());
             let files = results.files.iter().map(|(name, path)| json!({ "name": name, "bytes": size(path) })).collect();
             let name = |number: &usize| self.photos[*number].name.as_str();
             let filled = results.filled.iter().flat_map(|(_, views)| views).map(name);
-            (files, results.before.keys().map(name).collect(), filled.collect())
+            let left = results.left().map(
+                |[(number, most), (of, mean)]| json!({ "most": most, "view": name(&number), "mean": mean, "of": of }),
+            );
+            (files, results.before.keys().map(name).collect(), filled.collect(), left)
         };
         let steps = read(&self.live).as_ref().map(|board| board.steps().map(u64::from));
         let (views, status) = {
@@ -304,7 +307,7 @@ impl Session {
                 "of": views.next.as_ref().map(|(.., object)| object),
                 "problems": state.problems, "error": state.error,
                 "live": steps.is_some() && state.phase == Phase::Working, "files": files,
-                "compare": compare, "removals": state.removals, "filled": filled, "painting": state.painting(),
+                "compare": compare, "removals": state.removals, "filled": filled, "left": left, "painting": state.painting(),
             });
             (views, status)
         };

@@ -452,8 +452,10 @@ fn views_without_the_object_are_drawn_when_they_are_looked_at() {
     }
     assert!(matches!(session.wish(Duration::ZERO), Wish::Draw(1)));
     let jpeg = crate::scene::jpeg(&photograph(), 90).unwrap();
-    session.drew(1, Some(jpeg.clone()));
-    assert_eq!(get(address, "/after.jpg?view=b"), (200, jpeg));
+    assert_eq!(state(address)["left"], json!(null));
+    session.drew(1, Some(After { jpeg: jpeg.clone(), residue: Some(0.25) }));
+    assert_eq!(state(address)["left"], json!({ "most": 0.25, "view": "b", "mean": 0.25, "of": 1 }));
+    assert_eq!(get(address, "/after.jpg?view=b"), (200, jpeg.clone()));
     let (status, small) = get(address, "/after.jpg?view=b&small=1");
     let [small, thumbnail] =
         [small, get(address, "/thumb.jpg?view=b").1].map(|of| image::load_from_memory(&of).unwrap());
@@ -467,6 +469,10 @@ fn views_without_the_object_are_drawn_when_they_are_looked_at() {
     // Those of another removal are others.
     session.done(before());
     assert_eq!((get(address, "/after.jpg?view=b").0, &state(address)["removals"]), (503, &json!(2)));
+    for (number, residue) in [(0, Some(0.5)), (2, Some(0.25))] {
+        session.drew(number, Some(After { jpeg: jpeg.clone(), residue }));
+    }
+    assert_eq!(state(address)["left"], json!({ "most": 0.5, "view": "a", "mean": 0.375, "of": 2 }));
     assert_eq!(post(address, "/api/marks", CLICK).0, 200);
     assert_eq!(post(address, "/api/remove", "{}").0, 200);
     assert!(matches!(session.wish(Duration::ZERO), Wish::Remove(false)));

@@ -78,6 +78,9 @@ fn sensible(camera: &Camera) -> Result<(), String> {
     if !camera.focal.iter().all(|f| f.is_finite() && *f > 0.0) {
         return Err(format!("its focal lengths are {:?}", camera.focal));
     }
+    if !camera.principal.iter().all(|p| p.abs() < 1e6) {
+        return Err(format!("its principal point is {:?}", camera.principal));
+    }
     if !camera.translation.iter().all(|t| t.is_finite() && t.abs() < 1e12) {
         return Err("it stands nowhere".into());
     }

@@ -11,6 +11,7 @@ use gscream_vk::model::{files, init};
 use gscream_vk::prepare::graph_cut::Strokes;
 use gscream_vk::prepare::lens::Pinhole;
 use gscream_vk::prepare::{Silent, poses, record};
+use gscream_vk::remove::objects::{self, Entry};
 use gscream_vk::scene::{self, PriorKind, colmap};
 use gscream_vk::splat;
 use gscream_vk::train::begin::Beginning;
@@ -183,7 +184,9 @@ fn exports() {
     Loader::of_text("splat.ply (header)", clouds.iter().take(1).map(ply::encode).collect()).run(whole);
     Loader::of_bytes("splat.ply (compressed)", vec![seeds::compressed_splat()]).run(whole);
     Loader::of_text("splat.ply (compressed, header)", vec![seeds::compressed_splat()]).run(whole);
-    Loader::of_text("cameras.json", vec![seeds::cameras_json()]).run(of_file("cameras.json", splat::cameras::read));
+    for (name, seed) in [("cameras.json", seeds::cameras_json()), ("export.json", seeds::export_json())] {
+        Loader::of_text(name, vec![seed]).run(of_file(name, splat::cameras::read));
+    }
     let versions = [spz::Version::Two, spz::Version::Three];
     let encode = |cloud| versions.map(|version| spz::encode(cloud, version).expect("it fits"));
     let packed: Vec<_> = clouds.iter().flat_map(encode).collect();
@@ -247,6 +250,21 @@ fn records() {
         told(record::Folder::open(&inner))
     };
     Loader::of_text(record::RECORD, vec![text]).run(load);
+}
+
+#[test]
+fn lists_of_objects() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let first = folder.path().join("objects");
+    let lists: [Vec<Entry>; 2] = [vec![Entry::new(1), Entry::new(2)], vec![Entry::new(3)]];
+    let of = |list: &Vec<Entry>| {
+        objects::keep(&first, list).expect("a writable folder");
+        seeds::read(first.with_extension("json"))
+    };
+    let load = |path: &Path| {
+        objects::list(&path.with_extension("")).map(|list| list.iter().map(|e| e.folder(path)).collect::<Vec<_>>())
+    };
+    Loader::of_text("objects.json", lists.iter().map(of).collect()).run(of_file("objects.json", load));
 }
 
 #[test]

@@ -253,3 +253,14 @@ pub fn cameras_json() -> Vec<u8> {
     };
     format!("[{}]", (0..3).map(entry).collect::<Vec<_>>().join(",")).into_bytes()
 }
+
+/// What `export` writes of its cameras, which a splat comes with as well.
+pub fn export_json() -> Vec<u8> {
+    let camera = |id: usize| {
+        format!(
+            r#"{{"name": "a{id}.png", "center": [{id}.5, 0.0, -2.0], "rotation": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0],
+            [0.0, 0.0, 1.0]], "fov": 60.0, "size": [64, 48], "principal": [0.5, 0.5]}}"#
+        )
+    };
+    format!("{{\"cameras\": [{}]}}", (0..3).map(camera).collect::<Vec<_>>().join(",")).into_bytes()
+}

@@ -81,6 +81,11 @@ try {
   };
   await page.waitForFunction(strip, { timeout: 60_000, polling: 200 }, 'blob:');
   await shoot('strip');
+  // How much is left of the object, and a way to where that is most.
+  await until(() => document.getElementById('advice').textContent.includes('is left on average'));
+  const told = await page.evaluate(() => document.getElementById('advice').textContent.match(/at most .* in (.*)\.$/)?.[1]);
+  if (await named() !== told) await page.click('#next');
+  must(`what is left is most in ${told}, and ${await named()} is shown`, await named() === told);
   await page.focus('input[name=look]:checked');
   await page.keyboard.press('ArrowLeft');
   await until(() => !document.getElementById('viewer').hidden && document.getElementById('split').hidden);

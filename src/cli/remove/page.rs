@@ -16,6 +16,7 @@ use crate::cli::export::{Cameras, FIGURES};
 use crate::cli::folders::Origin;
 use crate::cli::train::{self, Stop};
 use crate::cli::{shared, view};
+use crate::evaluate::hole;
 use crate::gpu::Gpu;
 use crate::model::stored::Stored;
 use crate::prepare::depth::DepthMap;
@@ -26,10 +27,10 @@ use crate::prepare::poses::Capture;
 use crate::prepare::splats::Splats;
 use crate::prepare::{self, Fitted, Request, Silent, Step};
 use crate::remove::repaint::Repainting;
-use crate::remove::{Masked, Results, Session, Wish, objects};
+use crate::remove::{After, Masked, Results, Session, Wish, objects};
 use crate::render::view::Renderer;
 use crate::scene::doctor::{Finding, Report, Severity};
-use crate::scene::{self, Camera, Scene};
+use crate::scene::{self, Scene};
 use crate::view::live::Board;
 use crate::view::server::{self, Secret};
 
@@ -126,13 +127,13 @@ fn attend(job: &Job<'_>, gpu: &Gpu, session: &Arc<Session>, capture: &Capture) -
             }
         }
     };
-    let mut after = None;
+    let mut trained = None;
     loop {
         check(job)?;
         match session.wish(PATIENCE) {
             Wish::Nothing => {}
             Wish::Draw(number) => {
-                let drawn = draw(job, gpu, session, number, &mut after);
+                let drawn = draw(job, gpu, session, number, &mut trained);
                 if let Err(error) = &drawn {
                     eprintln!("{}: {error:#}", session.photos()[number].name);
                 }
@@ -145,7 +146,7 @@ fn attend(job: &Job<'_>, gpu: &Gpu, session: &Arc<Session>, capture: &Capture) -
             }
             Wish::Carry(revision, given) => carrier.carry(session, revision, &given)?,
             Wish::Remove(despite) => {
-                after = None;
+                trained = None;
                 let result = remove(job, gpu, session, capture, despite);
                 check(job)?;
                 if let Err(error) = result {
@@ -211,30 +212,39 @@ fn before(job: &Job<'_>, session: &Session) -> anyhow::Result<BTreeMap<usize, Pa
     Ok(cameras.cameras.iter().filter_map(|pose| view(&pose.name)).collect())
 }
 
-/// The trained model on the device, and the cameras of its views.
-type After = (Renderer, BTreeMap<String, Camera>);
+/// The trained model on the device, and its scene.
+type Trained = (Renderer, Scene);
 
-/// A view without the object, as JPEG.
+/// A view without the object.
 fn draw(
     job: &Job<'_>,
     gpu: &Gpu,
     session: &Session,
     number: usize,
-    after: &mut Option<After>,
-) -> anyhow::Result<Vec<u8>> {
-    let (renderer, cameras) = match after {
-        Some(after) => after,
+    trained: &mut Option<Trained>,
+) -> anyhow::Result<After> {
+    let (renderer, scene) = match trained {
+        Some(trained) => trained,
         None => {
             let origin = Origin::find(&job.places.run)?;
             let mut settings = origin.settings(vec![])?;
             let scene = shared::load_scene_of_model(&job.places.scene, &mut settings)?;
             let renderer = Renderer::of(gpu, &Stored::load(&origin.model())?, &settings.render)?;
-            let cameras = scene.train.into_iter().map(|view| (view.name, view.camera)).collect();
-            after.insert((renderer, cameras))
+            trained.insert((renderer, scene))
         }
     };
-    let camera = cameras.get(&session.photos()[number].name).context("the scene has no such view any more")?;
-    Ok(scene::jpeg(&renderer.render(camera)?.to_rgb8(), QUALITY)?)
+    let name = &session.photos()[number].name;
+    let at = scene.train.iter().position(|view| view.name == *name).context("the scene has no such view any more")?;
+    let view = &scene.train[at];
+    let picture = renderer.render(&view.camera)?.to_rgb8();
+    let residue = match (&view.mask, scene.references.iter().find(|reference| reference.view == at)) {
+        (Some(mask), Some(filled)) => {
+            let background: Vec<_> = filled.image.pixels().map(|p| Some(p.0.map(|v| f64::from(v) / 255.0))).collect();
+            hole::residue(&picture, &view.image, &background, mask)
+        }
+        _ => None,
+    };
+    Ok(After { jpeg: scene::jpeg(&picture, QUALITY)?, residue })
 }
 
 /// The votes of an object's masks.

@@ -251,6 +251,8 @@ impl Job<'_> {
             format!("train.reference_share={REFERENCE_SHARE}"),
             "densify.enabled=false".to_owned(),
             "scene.dense=false".to_owned(),
+            // Drawn pictures have one exposure: what differs is the splat's own.
+            "scene.even_exposures=false".to_owned(),
             "model.form=gaussians".to_owned(),
             "model.attention.enabled=false".to_owned(),
             format!("model.degree={degree}"),
