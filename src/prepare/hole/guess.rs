@@ -153,7 +153,9 @@ pub fn fill(sights: &Sights, photographs: &[Photograph<'_>], of: usize, filling:
             left.retain(|i| filling.guessed[*i] && !part.contains(i));
         }
     }
-    in_picture(filling, [w, h], &thick, |i| surface(i).unwrap_or(0));
+    let depth = |i: usize| ray(i).map_or(f64::NAN, |ray| sight.depth_at(sight.grid.place(ray)));
+    let lie = Lie { surface: &|i| surface(i).unwrap_or(0), depth: &depth, planes: sight.planes.len() };
+    in_picture(filling, [w, h], &thick, &lie);
     // What is small, and a picture that is nearly all hole, which has nothing to copy.
     if filling.guessed.contains(&true) {
         smooth(filling, [w, h]);
@@ -178,6 +180,13 @@ fn nearly_one(sight: &Sight, plane: &Plane, rays: impl Iterator<Item = [f64; 2]>
     let (ones, all) = rays.fold((0u32, 0u32), |(ones, all), ray| (ones + u32::from(near(ray)), all + 1));
     all > 0 && f64::from(ones) >= NEARLY_ONE * f64::from(all)
 }
+
+/// Factor within which what lies on no plane is as far away as a part of a hole, and beyond which two pixels beside each other are on
+/// things before and behind each other.
+const AS_FAR: f64 = 1.25;
+const EDGE: f64 = 1.1;
+/// Shares of a part between which most of its depths are.
+const MOST: [f64; 2] = [0.1, 0.9];
 
 /// Smallest part of a hole that has a texture, as a part of the picture.
 const LEAST_PART: f64 = 5e-4;
@@ -363,29 +372,65 @@ fn borders(filling: &mut Filling, size: [usize; 2], wanted: &[bool], half: f64) 
     }
 }
 
-/// Fills the parts that are left and `wanted` in the picture itself, each from the same surface where enough of that is seen, else from any.
-fn in_picture(filling: &mut Filling, size: [usize; 2], wanted: &[bool], surface: impl Fn(usize) -> u8 + Sync) {
-    for same in [true, false] {
-        let left: Vec<usize> = (0..wanted.len()).filter(|i| wanted[*i] && filling.guessed[*i]).collect();
-        let mut labels: Vec<u8> = left.iter().map(|i| if same { surface(*i) } else { 0 }).collect();
-        labels.sort_unstable();
-        labels.dedup();
-        for label in labels {
-            let of: Vec<usize> = left.iter().copied().filter(|i| !same || surface(*i) == label).collect();
-            for part in parts(&of, size) {
-                let mut wanted = vec![false; filling.guessed.len()];
-                part.iter().for_each(|i| wanted[*i] = true);
-                let source = |i: usize| !filling.guessed[i] && (!same || surface(i) == label);
-                let (cells, mut texture) = around(&part, size, |i| filling.rgb[i], |i| wanted[i], source);
-                if (!same || is_shown(&texture)) && texture::fill(&mut texture) {
-                    for (cell, i) in cells.iter().enumerate().filter(|(cell, i)| wanted[**i] && !texture.hole[*cell]) {
-                        filling.rgb[*i] = texture.rgb[cell];
-                        filling.guessed[*i] = false;
-                    }
+/// Where what a view shows lies.
+struct Lie<'a> {
+    /// The surface of a pixel.
+    surface: &'a (dyn Fn(usize) -> u8 + Sync),
+    /// Depth z of a pixel; NaN where it is not known.
+    depth: &'a (dyn Fn(usize) -> f64 + Sync),
+    /// Number of planes among the surfaces; the next one is of what lies on none.
+    planes: usize,
+}
+
+/// Fills the parts that are left and `wanted` in the picture itself: each from the same surface where enough of that is seen, else from what
+/// is as far away, else from any. What lies on no plane is one surface where it is as far away.
+fn in_picture(filling: &mut Filling, size @ [w, h]: [usize; 2], wanted: &[bool], lie: &Lie<'_>) {
+    let depths: Vec<f64> = (0..w * h).into_par_iter().map(lie.depth).collect();
+    let labels: Vec<u8> = (0..w * h).into_par_iter().map(lie.surface).collect();
+    for of in [Source::Same, Source::Near, Source::Any] {
+        let mut left: Vec<bool> = (0..wanted.len()).map(|i| wanted[i] && filling.guessed[i]).collect();
+        let one = |a: usize, b: usize| {
+            let far = depths[a].max(depths[b]) / depths[a].min(depths[b]) > EDGE;
+            of == Source::Any || !far && (of == Source::Near || labels[a] == labels[b])
+        };
+        let parts: Vec<Vec<usize>> =
+            (0..w * h).map(|first| planes::connected_if(first, &mut left, size, one)).collect();
+        for part in parts.into_iter().filter(|part| part.len() as f64 >= LEAST_PART * (w * h) as f64) {
+            let depth = |share: f64| quantile(part.iter().map(|i| depths[*i]).filter(|z| z.is_finite()), share);
+            let range = MOST.map(depth);
+            let near = |i: usize| match range {
+                [Some(from), Some(to)] => (from / AS_FAR..=to * AS_FAR).contains(&depths[i]),
+                _ => true,
+            };
+            let label = labels[part[0]];
+            let source = |i: usize| match of {
+                _ if filling.guessed[i] => false,
+                Source::Same => labels[i] == label && (usize::from(label) < lie.planes || near(i)),
+                Source::Near => near(i),
+                Source::Any => true,
+            };
+            let mut wanted = vec![false; filling.guessed.len()];
+            part.iter().for_each(|i| wanted[*i] = true);
+            let (cells, mut texture) = around(&part, size, |i| filling.rgb[i], |i| wanted[i], source);
+            if (of == Source::Any || is_shown(&texture)) && texture::fill(&mut texture) {
+                for (cell, i) in cells.iter().enumerate().filter(|(cell, i)| wanted[**i] && !texture.hole[*cell]) {
+                    filling.rgb[*i] = texture.rgb[cell];
+                    filling.guessed[*i] = false;
                 }
             }
         }
     }
+}
+
+/// What a part of a hole is made of.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Source {
+    /// The same surface.
+    Same,
+    /// What is as far away.
+    Near,
+    /// Anything around it.
+    Any,
 }
 
 /// The pixels of the surroundings of some, and their texture: each one's colour, whether it is to be filled, and whether it may be copied.
@@ -450,12 +495,35 @@ mod tests {
                 doubtful: vec![false; w * h],
                 behind: vec![],
             };
-            in_picture(&mut filling, size, &wanted, of);
+            in_picture(&mut filling, size, &wanted, &Lie { surface: &of, depth: &|_| f64::NAN, planes: 2 });
             let filled = (0..w * h).filter(|i| hole(*i) && !filling.guessed[*i]).map(|i| filling.rgb[i][0]);
             let (sum, count) = filled.fold((0.0, 0), |(sum, n), v| (sum + v, n + 1));
             assert!(count > 900, "{count}");
             assert_eq!(sum / count as f32 > 0.6, bright, "{}", sum / count as f32);
         }
+    }
+
+    /// The top of a table that hides what it stands before, none of them a plane: it is not made of the wall behind.
+    #[test]
+    fn what_is_near_is_made_of_what_is_near() {
+        let size @ [w, h] = [64, 64];
+        let inside = |i: usize, rows: std::ops::Range<usize>| (16..48).contains(&(i % w)) && rows.contains(&(i / w));
+        let table = |i: usize| inside(i, 24..h);
+        let noise = |i: usize| ((i * 2_654_435_761) % 1000) as f32 / 20_000.0;
+        let wanted: Vec<bool> = (0..w * h).map(|i| inside(i, 8..44)).collect();
+        let mut filling = Filling {
+            rgb: (0..w * h).map(|i| [if table(i) { 0.3 } else { 0.9 } + noise(i); 3]).collect(),
+            guessed: wanted.clone(),
+            seen: vec![false; w * h],
+            doubtful: vec![false; w * h],
+            behind: vec![],
+        };
+        (0..w * h).filter(|i| wanted[*i]).for_each(|i| filling.rgb[i] = [0.0; 3]);
+        let depth = |i: usize| if table(i) { 2.0 - 0.01 * (i / w) as f64 } else { 5.0 };
+        in_picture(&mut filling, size, &wanted, &Lie { surface: &|_| 0, depth: &depth, planes: 0 });
+        let is_its = |i: &usize| (filling.rgb[*i][0] > 0.6) != table(*i) && !filling.guessed[*i];
+        let right = (0..w * h).filter(|i| wanted[*i]).filter(is_its).count();
+        assert_eq!(right, 32 * 36);
     }
 
     /// Around a hole lies what the object's depth has bled into: what a photograph shows there is of the surface that goes on there.
