@@ -48,7 +48,7 @@ const BORDER: f64 = 0.5;
 const POINTS: usize = 300;
 /// Common planes that are looked for, and least part of the points that makes one.
 const PLANES: usize = 6;
-const LEAST: f64 = 0.06;
+pub(super) const LEAST: f64 = 0.06;
 /// Triples of points that are tried for each.
 const TRIES: usize = 1500;
 /// A point lies on a plane if it is off by at most this part of its camera's distance from the plane.
@@ -61,8 +61,8 @@ const COMMON: f64 = 0.5;
 /// A plane `normal . x = offset` of world points.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Common {
-    normal: DVec3,
-    offset: f64,
+    pub(super) normal: DVec3,
+    pub(super) offset: f64,
 }
 
 /// The planes around a view's hole, what they are covered with, the sites that lie on one, and their depth there.
@@ -76,8 +76,8 @@ struct Flat {
 /// A point that a camera at `eye` sees.
 #[derive(Clone, Copy)]
 pub(super) struct Measured {
-    point: DVec3,
-    eye: DVec3,
+    pub(super) point: DVec3,
+    pub(super) eye: DVec3,
 }
 
 impl Common {
@@ -214,7 +214,10 @@ impl Sights {
 
     /// Flattens views with at least this parallax; others get the surfaces of one material around the holes.
     fn flatten_from(&mut self, parallax: f64, seed: u64) {
-        let (common, points) = (self.common(seed), self.points());
+        let (mut common, points) = (self.common(seed), self.points());
+        let object = self.object();
+        let top = self.top(&common, &object);
+        common.extend(top);
         let of = |view: usize| self.flat(view, &common, &points, parallax, seed + view as u64);
         let flat: Vec<Flat> = (0..self.0.len()).into_par_iter().map(of).collect();
         let untold = flat.iter().any(|flat| flat.planes.is_empty());
@@ -227,7 +230,7 @@ impl Sights {
             (sight.around, sight.cover) = (planes, cover);
             sites.into_iter().for_each(|(site, depth)| sight.depth[site] = depth);
         }
-        self.stand();
+        self.stand(top, &object);
     }
 
     /// Planes around a view's hole, and the sites on them; nothing where the view's neighbours are too near to tell.

@@ -6,7 +6,7 @@
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
-use super::flat::Common;
+use super::flat::{Common, LEAST, Measured};
 use super::surface::{Sight, Sights};
 use crate::prepare::planes::{self, Plane};
 use crate::statistics::{median, quantile};
@@ -30,6 +30,14 @@ const POINTS: usize = 20_000;
 /// Sine of the angle up to which planes of two views are one, and least part of the views that have one.
 const TILTED: f64 = 0.1;
 const AGREE: f64 = 0.2;
+/// Share of the object that is lower than its head, and higher than its foot.
+const HIGHEST: f64 = 0.97;
+/// Width of what is beside the foot, as a part of the foot's own half, and heights there that are tried for a top.
+const BESIDE: f64 = 0.4;
+const OFFSETS: usize = 200;
+/// Least share of the points around all holes that lie on a top, and how many may be seen through it below the object, as a part of these.
+const TOP: f64 = 0.005;
+const LOOKED_THROUGH: f64 = 0.1;
 /// Points farther than this many times the median from the middle of all are strays of the matching.
 const STRAY: f64 = 3.0;
 
@@ -100,15 +108,32 @@ impl Support {
 
     fn within(&self, corners: &[DVec2], ray: [f64; 2]) -> Option<f64> {
         let z = 1.0 / planes::on(&self.plane, ray);
-        let point = DVec3::new(ray[0], ray[1], 1.0) * z;
-        let at = DVec2::new(point.dot(self.axes[0]), point.dot(self.axes[1]));
-        let n = corners.len();
-        let inside = (0..n).all(|i| {
-            let (from, to) = (corners[i], corners[(i + 1) % n]);
-            (to - from).perp_dot(at - from) >= 0.0
-        });
-        (z > 0.0 && z.is_finite() && inside && n >= 3).then_some(z)
+        let at = self.place(DVec3::new(ray[0], ray[1], 1.0) * z);
+        (z > 0.0 && z.is_finite() && inside(corners, at)).then_some(z)
     }
+
+    /// Where a point in the camera's coordinates falls, along the axes.
+    fn place(&self, point: DVec3) -> DVec2 {
+        DVec2::new(point.dot(self.axes[0]), point.dot(self.axes[1]))
+    }
+
+    /// Whether the object stands at a place along the axes.
+    fn is_on_foot(&self, at: DVec2) -> bool {
+        inside(&self.foot, at)
+    }
+
+    /// Whether a place along the axes is where the object stands, or near it.
+    fn is_beside(&self, at: DVec2) -> bool {
+        let middle = self.foot.iter().sum::<DVec2>() / self.foot.len().max(1) as f64;
+        self.is_on_foot(middle + (at - middle) / (1.0 + BESIDE))
+    }
+}
+
+/// Whether a place is within the corners of a convex polygon, counterclockwise.
+fn inside(corners: &[DVec2], at: DVec2) -> bool {
+    let n = corners.len();
+    let left = |i: usize| (corners[(i + 1) % n] - corners[i]).perp_dot(at - corners[i]) >= 0.0;
+    n >= 3 && (0..n).all(left)
 }
 
 /// The corners of the least convex polygon around points, counterclockwise (Andrew 1979).
@@ -134,41 +159,109 @@ fn hull(mut points: Vec<DVec2>) -> Vec<DVec2> {
     corners
 }
 
+/// The plane as a view sees it, if the object, of these world points, stands on it.
+fn carries(plane: &Common, sight: &Sight, object: &[DVec3]) -> Option<Support> {
+    let camera = sight.grid.camera;
+    let object: Vec<DVec3> = object.iter().map(|p| camera.to_camera(p.to_array()).into()).collect();
+    Support::new(plane.seen_by(sight)?, &object)
+}
+
 impl Sights {
-    /// Finds where the object stands on the plane that most views have it stand on, by what all measure of it: a table that nobody sees below the object
-    /// does not let the floor be seen that others see past the table.
-    pub(super) fn stand(&mut self) {
-        let trusted = || self.0.iter().filter(|sight| sight.grid.trusted);
-        let object: Vec<DVec3> = trusted()
-            .flat_map(|sight| sight.of_object().map(|site| sight.point(site, sight.grid.depth[site])))
-            .collect();
-        let object: Vec<DVec3> = object.iter().copied().step_by(object.len().div_ceil(POINTS).max(1)).collect();
-        let on = |plane: Plane, sight: &Sight| {
-            let camera = sight.grid.camera;
-            Support::new(plane, &object.iter().map(|p| camera.to_camera(p.to_array()).into()).collect::<Vec<_>>())
+    /// Views that can be believed.
+    fn trusted(&self) -> impl Iterator<Item = &Sight> {
+        self.0.iter().filter(|sight| sight.grid.trusted)
+    }
+
+    /// Points of the object in all views.
+    pub(super) fn object(&self) -> Vec<DVec3> {
+        let of = |sight: &Sight| -> Vec<DVec3> {
+            sight.of_object().map(|site| sight.point(site, sight.grid.depth[site])).collect()
         };
+        let all: Vec<DVec3> = self.trusted().flat_map(of).collect();
+        all.iter().copied().step_by(all.len().div_ceil(POINTS).max(1)).collect()
+    }
+
+    /// The top of what the object stands on, where that is too small to be found among the planes around: it is parallel to one of
+    /// these `common` ones, as high as the object ends, shown beside the object's foot, and nobody looks through it below the object.
+    /// Nothing where the object stands on a common plane.
+    pub(super) fn top(&self, common: &[Common], object: &[DVec3]) -> Option<Common> {
+        let sight = self.trusted().next()?;
+        let around = self.around_holes(true);
+        let around: Vec<Measured> = around.into_iter().map(|(view, site)| self.measured(view, site)).collect();
+        // How many points are on it, and whether it is one of the common planes.
+        let one = |plane: &Common| -> Option<(usize, bool, Common)> {
+            let middle = median(object.iter().map(|p| plane.normal.dot(*p)))?;
+            let way = if middle > plane.offset { 1.0 } else { -1.0 };
+            let (normal, parallel) = (plane.normal * way, plane.offset * way);
+            let heights = || object.iter().map(|p| normal.dot(*p));
+            let [foot, head] = [quantile(heights(), 1.0 - HIGHEST)?, quantile(heights(), HIGHEST)?];
+            let at = |offset: f64| {
+                let plane = Common { normal, offset };
+                Some((plane, carries(&plane, sight, object)?))
+            };
+            let (_, support) = at(foot)?;
+            let camera = sight.grid.camera;
+            let dropped = |point: DVec3| support.place(camera.to_camera(point.to_array()).into());
+            let near = |at: &&Measured| {
+                (normal.dot(at.point) - foot).abs() <= FOOT * (head - foot) && support.is_beside(dropped(at.point))
+            };
+            let beside: Vec<&Measured> = around.iter().filter(near).collect();
+            // As high as most of them are.
+            let count = |offset: f64| beside.iter().filter(|at| Common { normal, offset }.has(at)).count();
+            let every = beside.len().div_ceil(OFFSETS).max(1);
+            let heights = beside.iter().step_by(every).map(|at| normal.dot(at.point));
+            let (on, offset) = heights.map(|offset| (count(offset), offset)).max_by_key(|(on, _)| *on)?;
+            let (plane, support) = at(offset)?;
+            let through = |at: &&Measured| {
+                let [eye, there] = [at.eye, at.point].map(|p| normal.dot(p) - offset);
+                let goes_through = eye > 0.0 && there < 0.0 && !plane.has(at);
+                goes_through && support.is_on_foot(dropped(at.eye + (at.point - at.eye) * (eye / (eye - there))))
+            };
+            let through = around.iter().filter(through).count();
+            let known = (offset - parallel).abs() <= ON_IT * (head - foot);
+            log::debug!(
+                "support: of {} points {on} are on a top, {through} seen through it; known: {known}",
+                around.len()
+            );
+            let share = on as f64 / around.len() as f64;
+            let is = share >= TOP && (known || share < LEAST) && (through as f64) < LOOKED_THROUGH * on as f64;
+            is.then_some((on, known, plane))
+        };
+        let found: Vec<(usize, bool, Common)> = common.iter().filter_map(one).collect();
+        let best = found.iter().max_by_key(|(on, ..)| *on)?;
+        (!found.iter().any(|(_, known, _)| *known)).then_some(best.2)
+    }
+
+    /// Finds where the object stands, of which these are points: on this top, or on the plane that most views have it stand on. A table that
+    /// nobody sees below the object does not let the floor be seen that others see past the table.
+    pub(super) fn stand(&mut self, top: Option<Common>, object: &[DVec3]) {
+        if let Some(plane) = top.or_else(|| self.agreed(object)) {
+            let stands = |sight: &Sight| -> Vec<f64> {
+                let support = carries(&plane, sight, object);
+                let at = |site: usize| support.as_ref().filter(|_| sight.hole[site])?.below(sight.ray(site));
+                (0..sight.hole.len()).map(|site| at(site).unwrap_or(f64::NAN)).collect()
+            };
+            let stands: Vec<Vec<f64>> = self.0.par_iter().map(stands).collect();
+            self.0.iter_mut().zip(stands).for_each(|(sight, stands)| sight.stands = stands);
+        }
+    }
+
+    /// The plane that most views have the object stand on, of which these are points.
+    fn agreed(&self, object: &[DVec3]) -> Option<Common> {
         // What one view alone takes for a plane may pass before the object.
-        let views: Vec<&Sight> = trusted().collect();
+        let views: Vec<&Sight> = self.trusted().collect();
         let of = |sight: &&Sight| -> Vec<(Common, f64)> {
-            let supports = sight.supports(&sight.around).into_iter().filter_map(|support| on(support.plane, sight));
-            supports.map(|support| (Common::of(&support.plane, sight), support.tall)).collect()
+            let planes = sight.supports(&sight.around).into_iter().map(|support| Common::of(&support.plane, sight));
+            planes.filter_map(|plane| Some((plane, carries(&plane, sight, object)?.tall))).collect()
         };
         let found: Vec<(Common, f64)> = views.par_iter().map(of).collect::<Vec<_>>().concat();
         let middle = object.iter().sum::<DVec3>() / object.len().max(1) as f64;
         let agree =
             |(a, tall): &(Common, f64)| found.iter().filter(|(b, _)| a.is(b, middle, TILTED, ON_IT * tall)).count();
         let agree: Vec<usize> = found.iter().map(agree).collect();
-        let Some(best) = (0..found.len()).max_by_key(|i| (agree[*i], std::cmp::Reverse(*i))) else { return };
-        if agree[best] < 2 || (agree[best] as f64) < AGREE * views.len() as f64 {
-            return;
-        }
-        let stands = |sight: &Sight| -> Vec<f64> {
-            let support = found[best].0.seen_by(sight).and_then(|plane| on(plane, sight));
-            let at = |site: usize| support.as_ref().filter(|_| sight.hole[site])?.below(sight.ray(site));
-            (0..sight.hole.len()).map(|site| at(site).unwrap_or(f64::NAN)).collect()
-        };
-        let stands: Vec<Vec<f64>> = self.0.par_iter().map(stands).collect();
-        self.0.iter_mut().zip(stands).for_each(|(sight, stands)| sight.stands = stands);
+        let best = (0..found.len()).max_by_key(|i| (agree[*i], std::cmp::Reverse(*i)))?;
+        let enough = agree[best] >= 2 && agree[best] as f64 >= AGREE * views.len() as f64;
+        enough.then(|| found[best].0)
     }
 }
 
@@ -255,9 +348,9 @@ mod tests {
 
     const SIZE: [u32; 2] = [120, 90];
 
-    /// One of eight cameras around a box of one unit on a table that is little larger, over a floor, y downwards: the camera, the mask,
-    /// the depth of what each pixel shows, and of what it would show without the box.
-    fn table(turn: usize) -> (Camera, GrayImage, DepthGrid, Vec<f64>) {
+    /// One of eight cameras around a box of one unit on a table of this half width, over a floor, y downwards: the camera, the mask, the
+    /// depth of what each pixel shows, and of what it would show without the box.
+    fn table(turn: usize, half: f64) -> (Camera, GrayImage, DepthGrid, Vec<f64>) {
         let (sin, cos) = (std::f64::consts::TAU * turn as f64 / 8.0).sin_cos();
         let eye = DVec3::new(5.0 * sin, -3.0, -5.0 * cos);
         let ahead = (DVec3::new(0.0, -0.2, 0.0) - eye).normalize();
@@ -279,7 +372,7 @@ mod tests {
         };
         let shown = |pixel: usize| {
             let way = DVec3::from(camera.lift(camera.pixel_center(pixel), 1.0).expect("a ray")) - eye;
-            let slab = [DVec3::new(-0.8, 0.0, -0.8), DVec3::new(0.8, 0.05, 0.8)];
+            let slab = [DVec3::new(-half, 0.0, -half), DVec3::new(half, 0.05, half)];
             let behind = met(way, slab).min(if way.y > 0.0 { (1.5 - eye.y) / way.y } else { 50.0 });
             (met(way, [DVec3::new(-0.5, -0.8, -0.5), DVec3::new(0.5, 0.0, 0.5)]), behind)
         };
@@ -296,7 +389,7 @@ mod tests {
     /// Nobody sees the table under the object, and past its edge everybody sees the floor, which lies behind the table in every view.
     #[test]
     fn the_floor_does_not_show_through_the_table() {
-        let views: Vec<_> = (0..8).map(table).collect();
+        let views: Vec<_> = (0..8).map(|turn| table(turn, 0.8)).collect();
         let cameras: Vec<Camera> = views.iter().map(|view| view.0).collect();
         let masks: Vec<GrayImage> = views.iter().map(|view| view.1.clone()).collect();
         let mut sights = Sights::new(views.iter().map(|view| view.2.clone()).collect(), &cameras, &masks, &masks);
@@ -310,7 +403,8 @@ mod tests {
             carried.filter(|((z, _), behind)| *z > 1.1 * **behind).count()
         };
         assert!(through(&sights) > 100, "{}", through(&sights));
-        sights.stand();
+        let object = sights.object();
+        sights.stand(None, &object);
         assert!(through(&sights) < 20, "{}", through(&sights));
         for of in [0, 3] {
             sights.solve(of, 1);
@@ -323,6 +417,22 @@ mod tests {
             assert!(under.len() > 100 && right(&under) == under.len(), "{} of {}", right(&under), under.len());
             assert!(right(&holes) * 20 > holes.len() * 19, "{} of {}", right(&holes), holes.len());
         }
+    }
+
+    /// A table's top that hardly shows around the box is found over the floor, and not where it is known already.
+    #[test]
+    fn the_top_is_where_the_object_ends() {
+        let views: Vec<_> = (0..8).map(|turn| table(turn, 0.58)).collect();
+        let cameras: Vec<Camera> = views.iter().map(|view| view.0).collect();
+        let masks: Vec<GrayImage> = views.iter().map(|view| view.1.clone()).collect();
+        let sights = Sights::new(views.into_iter().map(|view| view.2).collect(), &cameras, &masks, &masks);
+        let object = sights.object();
+        let plane = |y: f64| Common { normal: DVec3::Y, offset: y };
+        let top = sights.top(&[plane(1.5)], &object).expect("the box stands on something");
+        assert!(top.normal.y.abs() > 0.999 && (top.offset * top.normal.y).abs() < 0.03, "{top:?}");
+        assert!(sights.top(&[plane(1.5), plane(0.0)], &object).is_none(), "it is known");
+        let lifted: Vec<DVec3> = object.iter().map(|point| *point - DVec3::Y).collect();
+        assert!(sights.top(&[plane(1.5)], &lifted).is_none(), "it stands on air");
     }
 
     #[test]
