@@ -183,13 +183,13 @@ impl Sights {
 
     /// The top of what the object stands on, where that is too small to be found among the planes around: it is parallel to one of
     /// these `common` ones, as high as the object ends, shown beside the object's foot, and nobody looks through it below the object.
-    /// Nothing where the object stands on a common plane.
-    pub(super) fn top(&self, common: &[Common], object: &[DVec3]) -> Option<Common> {
+    /// The points that are shown of it are told as well. Nothing where the object stands on a common plane.
+    pub(super) fn top(&self, common: &[Common], object: &[DVec3]) -> Option<(Common, Vec<DVec3>)> {
         let sight = self.trusted().next()?;
         let around = self.around_holes(true);
         let around: Vec<Measured> = around.into_iter().map(|(view, site)| self.measured(view, site)).collect();
-        // How many points are on it, and whether it is one of the common planes.
-        let one = |plane: &Common| -> Option<(usize, bool, Common)> {
+        // Whether it is one of the common planes, it, and the points on it.
+        let one = |plane: &Common| -> Option<(bool, Common, Vec<DVec3>)> {
             let middle = median(object.iter().map(|p| plane.normal.dot(*p)))?;
             let way = if middle > plane.offset { 1.0 } else { -1.0 };
             let (normal, parallel) = (plane.normal * way, plane.offset * way);
@@ -225,19 +225,24 @@ impl Sights {
             );
             let share = on as f64 / around.len() as f64;
             let is = share >= TOP && (known || share < LEAST) && (through as f64) < LOOKED_THROUGH * on as f64;
-            is.then_some((on, known, plane))
+            let shown = || beside.iter().filter(|at| plane.has(at)).map(|at| at.point).collect();
+            is.then(|| (known, plane, shown()))
         };
-        let found: Vec<(usize, bool, Common)> = common.iter().filter_map(one).collect();
-        let best = found.iter().max_by_key(|(on, ..)| *on)?;
-        (!found.iter().any(|(_, known, _)| *known)).then_some(best.2)
+        let found: Vec<(bool, Common, Vec<DVec3>)> = common.iter().filter_map(one).collect();
+        if found.iter().any(|(known, ..)| *known) {
+            return None;
+        }
+        found.into_iter().max_by_key(|(.., shown)| shown.len()).map(|(_, plane, shown)| (plane, shown))
     }
 
-    /// Finds where the object stands, of which these are points: on this top, or on the plane that most views have it stand on. A table that
-    /// nobody sees below the object does not let the floor be seen that others see past the table.
-    pub(super) fn stand(&mut self, top: Option<Common>, object: &[DVec3]) {
-        if let Some(plane) = top.or_else(|| self.agreed(object)) {
+    /// Finds where the object stands, of which these are points: on this top, as far as that is shown, or on the plane that most views have
+    /// it stand on. A table that nobody sees below the object does not let the floor be seen that others see past the table.
+    pub(super) fn stand(&mut self, top: Option<(Common, Vec<DVec3>)>, object: &[DVec3]) {
+        let stood = || self.agreed(object).map(|plane| (plane, vec![]));
+        if let Some((plane, mut shown)) = top.or_else(stood) {
+            shown.extend(object);
             let stands = |sight: &Sight| -> Vec<f64> {
-                let support = carries(&plane, sight, object);
+                let support = carries(&plane, sight, &shown);
                 let at = |site: usize| support.as_ref().filter(|_| sight.hole[site])?.below(sight.ray(site));
                 (0..sight.hole.len()).map(|site| at(site).unwrap_or(f64::NAN)).collect()
             };
@@ -428,7 +433,8 @@ mod tests {
         let sights = Sights::new(views.into_iter().map(|view| view.2).collect(), &cameras, &masks, &masks);
         let object = sights.object();
         let plane = |y: f64| Common { normal: DVec3::Y, offset: y };
-        let top = sights.top(&[plane(1.5)], &object).expect("the box stands on something");
+        let (top, shown) = sights.top(&[plane(1.5)], &object).expect("the box stands on something");
+        assert!(shown.iter().all(|point| point.x.abs().max(point.z.abs()) < 0.6), "it is no larger than it is");
         assert!(top.normal.y.abs() > 0.999 && (top.offset * top.normal.y).abs() < 0.03, "{top:?}");
         assert!(sights.top(&[plane(1.5), plane(0.0)], &object).is_none(), "it is known");
         let lifted: Vec<DVec3> = object.iter().map(|point| *point - DVec3::Y).collect();
