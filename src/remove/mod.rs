@@ -172,8 +172,20 @@ pub type Masked = (usize, u64, Arc<GrayImage>);
 pub struct After {
     /// The picture.
     pub jpeg: Vec<u8>,
-    /// How much of the object is left in it, where that can be told: 0 nothing, 1 all of it.
+    /// The share of the object that is left in it, 0 to 1; nothing where that cannot be told.
     pub residue: Option<f64>,
+}
+
+/// The share of the object that is left in some views, 0 to 1.
+struct Left {
+    /// The view with most of it.
+    view: usize,
+    /// The share that is left there.
+    most: f64,
+    /// The mean over all of them.
+    mean: f64,
+    /// Their number.
+    of: usize,
 }
 
 /// The results of the work.
@@ -195,12 +207,13 @@ impl Results {
         Self { page: page.into_iter().map(Arc::new).collect(), files, before, ..Self::default() }
     }
 
-    /// Where most of the object is left and how much, and of how many views the mean is how much; those drawn so far.
-    fn left(&self) -> Option<[(usize, f64); 2]> {
+    /// The share of the object that is left in the views drawn so far.
+    fn left(&self) -> Option<Left> {
         let residue = |(number, after): (&usize, &After)| Some((*number, after.residue?));
         let all: Vec<(usize, f64)> = self.after.iter().filter_map(residue).collect();
-        let most = *all.iter().max_by(|a, b| a.1.total_cmp(&b.1))?;
-        Some([most, (all.len(), all.iter().map(|(_, residue)| residue).sum::<f64>() / all.len() as f64)])
+        let (view, most) = *all.iter().max_by(|a, b| a.1.total_cmp(&b.1))?;
+        let mean = all.iter().map(|(_, residue)| residue).sum::<f64>() / all.len() as f64;
+        Some(Left { view, most, mean, of: all.len() })
     }
 
     /// With the scene, in which these views have holes that are filled.

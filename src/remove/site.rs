@@ -10,7 +10,7 @@ use serde::Deserialize;
 use serde_json::json;
 
 use super::list::Change;
-use super::{Origin, Own, Phase, Photo, Refused, Session, Shown, State, THIN, View, read};
+use super::{Left, Origin, Own, Phase, Photo, Refused, Session, Shown, State, THIN, View, read};
 use crate::prepare::click::{Mark, working};
 use crate::scene::{self, resample};
 use crate::view::server::{Answer, Body, Refusal, Resource, Site};
@@ -281,7 +281,7 @@ impl Session {
             let name = |number: &usize| self.photos[*number].name.as_str();
             let filled = results.filled.iter().flat_map(|(_, views)| views).map(name);
             let left = results.left().map(
-                |[(number, most), (of, mean)]| json!({ "most": most, "view": name(&number), "mean": mean, "of": of }),
+                |Left { view, most, mean, of }| json!({ "most": most, "view": name(&view), "mean": mean, "of": of }),
             );
             (files, results.before.keys().map(name).collect(), filled.collect(), left)
         };

@@ -372,7 +372,7 @@ fn borders(filling: &mut Filling, size: [usize; 2], wanted: &[bool], half: f64) 
     }
 }
 
-/// Where what a view shows lies.
+/// The places of a view's pixels in space.
 struct Lie<'a> {
     /// The surface of a pixel.
     surface: &'a (dyn Fn(usize) -> u8 + Sync),
@@ -422,14 +422,14 @@ fn in_picture(filling: &mut Filling, size @ [w, h]: [usize; 2], wanted: &[bool],
     }
 }
 
-/// What a part of a hole is made of.
+/// The pixels that a part of a hole is made of.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Source {
-    /// The same surface.
+    /// Those of the same surface.
     Same,
-    /// What is as far away.
+    /// Those that are as far away.
     Near,
-    /// Anything around it.
+    /// All around it.
     Any,
 }
 
