@@ -194,7 +194,7 @@ pub struct Results {
     page: Vec<Arc<Resource>>,
     files: Vec<(String, PathBuf)>,
     before: BTreeMap<usize, PathBuf>,
-    /// Those that were drawn.
+    /// The views without the object that were drawn.
     after: BTreeMap<usize, After>,
     /// The scene, and the views whose holes are filled there.
     filled: Option<(PathBuf, BTreeSet<usize>)>,

@@ -425,11 +425,11 @@ fn in_picture(filling: &mut Filling, size @ [w, h]: [usize; 2], wanted: &[bool],
 /// The pixels that a part of a hole is made of.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Source {
-    /// Those of the same surface.
+    /// The pixels of the same surface.
     Same,
-    /// Those that are as far away.
+    /// The pixels that are as far away.
     Near,
-    /// All around it.
+    /// All pixels around it.
     Any,
 }
 
