@@ -35,6 +35,14 @@ const HIGHEST: f64 = 0.97;
 /// Width of what is beside the foot, as a part of the foot's own half, and heights there that are tried for a top.
 const BESIDE: f64 = 0.4;
 const OFFSETS: usize = 200;
+/// Share of what is beside the foot that lies on a top which shows, and a quantile of its height where it is the sides of one that does not.
+const FLAT: f64 = 0.5;
+const SIDES: f64 = 0.9;
+/// How many times as far out one half of its sides may be as the other, the lower and the upper one: a slope has no top.
+const SHEER: f64 = 1.1;
+/// Directions in which the rim of a top is looked for, and the share of the points on its sides that are within it.
+const DIRECTIONS: usize = 48;
+const RIM: f64 = 0.98;
 /// Least share of the points around all holes that lie on a top, and how many may be seen through it below the object, as a part of these.
 const TOP: f64 = 0.005;
 const LOOKED_THROUGH: f64 = 0.1;
@@ -122,10 +130,13 @@ impl Support {
         inside(&self.foot, at)
     }
 
-    /// Whether a place along the axes is where the object stands, or near it.
-    fn is_beside(&self, at: DVec2) -> bool {
-        let middle = self.foot.iter().sum::<DVec2>() / self.foot.len().max(1) as f64;
-        self.is_on_foot(middle + (at - middle) / (1.0 + BESIDE))
+    /// By how much the foot, grown about its middle, reaches a place along the axes: at most 1 where the object stands. Infinite without a foot.
+    fn reach(&self, at: DVec2) -> f64 {
+        let n = self.foot.len();
+        let middle = self.foot.iter().sum::<DVec2>() / n.max(1) as f64;
+        let off = |i: usize, at: DVec2| (self.foot[(i + 1) % n] - self.foot[i]).perp_dot(at - middle);
+        let sides = (0..n).map(|i| off(i, at) / off(i, self.foot[i]));
+        sides.reduce(f64::max).filter(|_| n >= 3).unwrap_or(f64::INFINITY)
     }
 }
 
@@ -159,6 +170,29 @@ fn hull(mut points: Vec<DVec2>) -> Vec<DVec2> {
     corners
 }
 
+/// The top of something of which hardly more than the sides below it shows: how high it is along this normal, and where its rim is. Of the
+/// points with what [`Support::reach`] says of them none is far above the object's foot. They are spread evenly over sheer sides; of a
+/// slope nothing is told.
+fn end_of_sides(normal: DVec3, foot: f64, points: &[(DVec3, f64)]) -> Option<(f64, Vec<DVec3>)> {
+    let height = |share: f64| quantile(points.iter().map(|(point, _)| normal.dot(*point)), share);
+    let [middle, high] = [height(0.5)?, height(SIDES)?];
+    let reach = |above: bool| {
+        median(points.iter().filter(|(point, _)| (normal.dot(*point) > middle) == above).map(|(_, reach)| *reach))
+    };
+    let offset = foot.min(middle + (high - middle) * 0.5 / (SIDES - 0.5));
+    let mut rim: Vec<DVec3> = points.iter().map(|(point, _)| *point + normal * (offset - normal.dot(*point))).collect();
+    let (across, down) = normal.any_orthonormal_pair();
+    let all = rim.clone();
+    for k in 0..DIRECTIONS {
+        let (sin, cos) = (std::f64::consts::TAU * k as f64 / DIRECTIONS as f64).sin_cos();
+        let way = across * cos + down * sin;
+        let farthest = quantile(all.iter().map(|point| way.dot(*point)), RIM)?;
+        rim.retain(|point| way.dot(*point) <= farthest);
+    }
+    let [lower, upper] = [reach(false)?, reach(true)?];
+    (lower.max(upper) <= SHEER * lower.min(upper)).then_some((offset, rim))
+}
+
 /// The plane as a view sees it, if the object, of these world points, stands on it.
 fn carries(plane: &Common, sight: &Sight, object: &[DVec3]) -> Option<Support> {
     let camera = sight.grid.camera;
@@ -182,8 +216,8 @@ impl Sights {
     }
 
     /// The top of what the object stands on, where that is too small to be found among the planes around: it is parallel to one of
-    /// these `common` ones, as high as the object ends, shown beside the object's foot, and nobody looks through it below the object.
-    /// The points that are shown of it are told as well. Nothing where the object stands on a common plane.
+    /// these `common` ones, as high as the object ends, shown beside the object's foot, itself or the sides below it, and nobody looks
+    /// through it below the object. The points that are shown of it are told as well. Nothing where the object stands on a common plane.
     pub(super) fn top(&self, common: &[Common], object: &[DVec3]) -> Option<(Common, Vec<DVec3>)> {
         let sight = self.trusted().next()?;
         let around = self.around_holes(true);
@@ -203,14 +237,25 @@ impl Sights {
             let camera = sight.grid.camera;
             let dropped = |point: DVec3| support.place(camera.to_camera(point.to_array()).into());
             let near = |at: &&Measured| {
-                (normal.dot(at.point) - foot).abs() <= FOOT * (head - foot) && support.is_beside(dropped(at.point))
+                let above = (normal.dot(at.point) - foot) / (head - foot);
+                (-FOOT..=ON_IT).contains(&above) && support.reach(dropped(at.point)) <= 1.0 + BESIDE
             };
             let beside: Vec<&Measured> = around.iter().filter(near).collect();
+            let heights: Vec<f64> = beside.iter().map(|at| normal.dot(at.point)).collect();
+            let on = |offset: f64| {
+                let plane = Common { normal, offset };
+                beside.iter().filter(move |at| plane.has(at)).map(|at| at.point)
+            };
             // As high as most of them are.
-            let count = |offset: f64| beside.iter().filter(|at| Common { normal, offset }.has(at)).count();
-            let every = beside.len().div_ceil(OFFSETS).max(1);
-            let heights = beside.iter().step_by(every).map(|at| normal.dot(at.point));
-            let (on, offset) = heights.map(|offset| (count(offset), offset)).max_by_key(|(on, _)| *on)?;
+            let every = heights.len().div_ceil(OFFSETS).max(1);
+            let tried = heights.iter().copied().step_by(every).map(|offset| (on(offset).count(), offset));
+            let flat = tried.max_by_key(|(on, _)| *on).filter(|(on, _)| *on as f64 >= FLAT * beside.len() as f64);
+            let sides = || {
+                let points: Vec<(DVec3, f64)> =
+                    beside.iter().map(|at| (at.point, support.reach(dropped(at.point)))).collect();
+                end_of_sides(normal, foot, &points)
+            };
+            let (offset, shown) = flat.map(|(_, offset)| (offset, on(offset).collect())).or_else(sides)?;
             let (plane, support) = at(offset)?;
             let through = |at: &&Measured| {
                 let [eye, there] = [at.eye, at.point].map(|p| normal.dot(p) - offset);
@@ -220,13 +265,13 @@ impl Sights {
             let through = around.iter().filter(through).count();
             let known = (offset - parallel).abs() <= ON_IT * (head - foot);
             log::debug!(
-                "support: of {} points {on} are on a top, {through} seen through it; known: {known}",
-                around.len()
+                "support: of {} points {} tell of a top, {through} seen through it; known: {known}",
+                around.len(),
+                shown.len()
             );
-            let share = on as f64 / around.len() as f64;
-            let is = share >= TOP && (known || share < LEAST) && (through as f64) < LOOKED_THROUGH * on as f64;
-            let shown = || beside.iter().filter(|at| plane.has(at)).map(|at| at.point).collect();
-            is.then(|| (known, plane, shown()))
+            let share = |count: usize| count as f64 / around.len() as f64;
+            let shows = share(shown.len()) >= TOP && (through as f64) < LOOKED_THROUGH * shown.len() as f64;
+            (shows && (known || share(on(offset).count()) < LEAST)).then_some((known, plane, shown))
         };
         let found: Vec<(bool, Common, Vec<DVec3>)> = common.iter().filter_map(one).collect();
         if found.iter().any(|(known, ..)| *known) {
@@ -238,6 +283,9 @@ impl Sights {
     /// Finds where the object stands, of which these are points: on this top, as far as that is shown, or on the plane that most views have
     /// it stand on. A table that nobody sees below the object does not let the floor be seen that others see past the table.
     pub(super) fn stand(&mut self, top: Option<(Common, Vec<DVec3>)>, object: &[DVec3]) {
+        for sight in &mut self.0 {
+            sight.top = top.as_ref().and_then(|(plane, _)| plane.seen_by(sight));
+        }
         let stood = || self.agreed(object).map(|plane| (plane, vec![]));
         if let Some((plane, mut shown)) = top.or_else(stood) {
             shown.extend(object);
@@ -353,9 +401,9 @@ mod tests {
 
     const SIZE: [u32; 2] = [120, 90];
 
-    /// One of eight cameras around a box of one unit on a table of this half width, over a floor, y downwards: the camera, the mask, the
-    /// depth of what each pixel shows, and of what it would show without the box.
-    fn table(turn: usize, half: f64) -> (Camera, GrayImage, DepthGrid, Vec<f64>) {
+    /// One of eight cameras around a box of one unit on a table of this half width and thickness, over a floor, y downwards: the camera, the
+    /// mask, the depth of what each pixel shows, and of what it would show without the box.
+    fn table(turn: usize, half: f64, thick: f64) -> (Camera, GrayImage, DepthGrid, Vec<f64>) {
         let (sin, cos) = (std::f64::consts::TAU * turn as f64 / 8.0).sin_cos();
         let eye = DVec3::new(5.0 * sin, -3.0, -5.0 * cos);
         let ahead = (DVec3::new(0.0, -0.2, 0.0) - eye).normalize();
@@ -377,7 +425,7 @@ mod tests {
         };
         let shown = |pixel: usize| {
             let way = DVec3::from(camera.lift(camera.pixel_center(pixel), 1.0).expect("a ray")) - eye;
-            let slab = [DVec3::new(-half, 0.0, -half), DVec3::new(half, 0.05, half)];
+            let slab = [DVec3::new(-half, 0.0, -half), DVec3::new(half, thick, half)];
             let behind = met(way, slab).min(if way.y > 0.0 { (1.5 - eye.y) / way.y } else { 50.0 });
             (met(way, [DVec3::new(-0.5, -0.8, -0.5), DVec3::new(0.5, 0.0, 0.5)]), behind)
         };
@@ -394,7 +442,7 @@ mod tests {
     /// Nobody sees the table under the object, and past its edge everybody sees the floor, which lies behind the table in every view.
     #[test]
     fn the_floor_does_not_show_through_the_table() {
-        let views: Vec<_> = (0..8).map(|turn| table(turn, 0.8)).collect();
+        let views: Vec<_> = (0..8).map(|turn| table(turn, 0.8, 0.05)).collect();
         let cameras: Vec<Camera> = views.iter().map(|view| view.0).collect();
         let masks: Vec<GrayImage> = views.iter().map(|view| view.1.clone()).collect();
         let mut sights = Sights::new(views.iter().map(|view| view.2.clone()).collect(), &cameras, &masks, &masks);
@@ -427,18 +475,21 @@ mod tests {
     /// A table's top that hardly shows around the box is found over the floor, and not where it is known already.
     #[test]
     fn the_top_is_where_the_object_ends() {
-        let views: Vec<_> = (0..8).map(|turn| table(turn, 0.58)).collect();
-        let cameras: Vec<Camera> = views.iter().map(|view| view.0).collect();
-        let masks: Vec<GrayImage> = views.iter().map(|view| view.1.clone()).collect();
-        let sights = Sights::new(views.into_iter().map(|view| view.2).collect(), &cameras, &masks, &masks);
-        let object = sights.object();
         let plane = |y: f64| Common { normal: DVec3::Y, offset: y };
-        let (top, shown) = sights.top(&[plane(1.5)], &object).expect("the box stands on something");
-        assert!(shown.iter().all(|point| point.x.abs().max(point.z.abs()) < 0.6), "it is no larger than it is");
-        assert!(top.normal.y.abs() > 0.999 && (top.offset * top.normal.y).abs() < 0.03, "{top:?}");
-        assert!(sights.top(&[plane(1.5), plane(0.0)], &object).is_none(), "it is known");
-        let lifted: Vec<DVec3> = object.iter().map(|point| *point - DVec3::Y).collect();
-        assert!(sights.top(&[plane(1.5)], &lifted).is_none(), "it stands on air");
+        // Of the block hardly more than the sides is seen.
+        for (half, thick) in [(0.58, 0.05), (0.53, 1.5)] {
+            let views: Vec<_> = (0..8).map(|turn| table(turn, half, thick)).collect();
+            let cameras: Vec<Camera> = views.iter().map(|view| view.0).collect();
+            let masks: Vec<GrayImage> = views.iter().map(|view| view.1.clone()).collect();
+            let sights = Sights::new(views.into_iter().map(|view| view.2).collect(), &cameras, &masks, &masks);
+            let object = sights.object();
+            let (top, shown) = sights.top(&[plane(1.5)], &object).expect("the box stands on something");
+            assert!(shown.iter().all(|p| p.x.abs().max(p.z.abs()) < half + 0.02), "it is no larger than it is");
+            assert!(top.normal.y.abs() > 0.999 && (top.offset * top.normal.y).abs() < 0.04, "{half}: {top:?}");
+            assert!(sights.top(&[plane(1.5), plane(0.0)], &object).is_none(), "it is known");
+            let lifted: Vec<DVec3> = object.iter().map(|point| *point - DVec3::Y).collect();
+            assert!(sights.top(&[plane(1.5)], &lifted).is_none(), "it stands on air");
+        }
     }
 
     #[test]

@@ -65,6 +65,8 @@ pub struct Sight {
     pub planes: Vec<planes::Plane>,
     /// `[site of the hole]` depth z of the plane that the object stands on where it does, NaN elsewhere: nothing behind that shows.
     pub(super) stands: Vec<f64>,
+    /// The plane of a top that hardly shows around the object: it is there where `stands` is known, and ends there.
+    pub(super) top: Option<planes::Plane>,
     /// Planes around the hole that were found before it is solved; none where the views are too near each
     /// other to tell.
     pub(super) around: Vec<planes::Plane>,
@@ -153,6 +155,7 @@ impl Sight {
             surface: vec![0; sites],
             planes: vec![],
             stands: vec![f64::NAN; sites],
+            top: None,
             around: vec![],
             cover: Cover::default(),
             covered: vec![],
@@ -523,7 +526,8 @@ impl Sights {
             let impossible = |plane: &planes::Plane| {
                 let z = 1.0 / planes::on(plane, own.ray(site));
                 let before = z < NEARER / f64::from(disparity[site]);
-                before || z > (1.0 + APART) * own.stands[site] || self.is_refuted(of, own.point(site, z))
+                let beyond = own.top == Some(*plane) && own.stands[site].is_nan();
+                before || beyond || z > (1.0 + APART) * own.stands[site] || self.is_refuted(of, own.point(site, z))
             };
             let cost = |label: usize| {
                 if planes.get(label).is_some_and(impossible) {
@@ -578,7 +582,11 @@ impl Sights {
             (true, true) => planes::around(&known, &rays, &open, seed),
         };
         let supports = own.supports(&planes);
-        let barred = |plane: usize, site: usize| own.cuts.iter().any(|cut| cut.bars(plane, own.middle(site)));
+        let top = planes.iter().position(|plane| own.top == Some(*plane));
+        let barred = |plane: usize, site: usize| {
+            let beyond = top == Some(plane) && own.hole[site] && own.stands[site].is_nan();
+            beyond || own.cuts.iter().any(|cut| cut.bars(plane, own.middle(site)))
+        };
         // What has ended hides nothing.
         let under = |site: &usize| {
             let ended = |k: usize| barred(k, *site);
@@ -612,8 +620,12 @@ impl Sights {
         };
         // Within its ends a surface is there, but where others look through it.
         for (cell, costs) in costs.iter_mut().enumerate().filter(|(cell, _)| own.hole[sites[*cell]]) {
-            let its = own.cuts.iter().find_map(|cut| cut.has(own.middle(sites[cell])));
-            let stands = |plane: &usize| against(cell, planes::on(&planes[*plane], own.ray(sites[cell]))) < 1.0;
+            let site = sites[cell];
+            // What stands on it may stand before it.
+            let before = 1.0 / f64::from(known[cell]) < (1.0 - APART) * own.stands[site];
+            let on_top = || top.filter(|_| own.stands[site].is_finite() && !before);
+            let its = own.cuts.iter().find_map(|cut| cut.has(own.middle(site))).or_else(on_top);
+            let stands = |plane: &usize| against(cell, planes::on(&planes[*plane], own.ray(site))) < 1.0;
             if let Some(own) = its.filter(stands) {
                 *costs = Some((0..=planes.len()).map(|k| if k == own { 0.0 } else { planes::IMPOSSIBLE }).collect());
             }
