@@ -81,7 +81,7 @@ pub const METHOD: &str = "one surface with smooth ends, nothing where others loo
      them go on up to there, grain is kept, floors end at their walls, planes have their materials, which have grain, what is bare of the object refutes nothing, the reference has no shadow, no \
      small piece hangs in a hole, what is guessed is noted, nothing shows through what the object stands on, what is doubtful \
      is not guessed, noise makes no planes and refutes nothing, nothing large is made of a surface of which little is seen, what all have right beside the \
-     object is guessed, what stands behind the object is none of it, no thing apart is copied, what is seen keeps its hue, joints go on to walls right behind, what is near is made of what is near, tops that hardly show are found where the object ends, or the sides below them do, and end at their rims, and of many views some are \
+     object is guessed, what stands behind the object is none of it, no thing apart is copied, what is seen keeps its hue, joints go on to walls right behind, what is near is made of what is near, tops that hardly show are found where the object ends, or the sides below them do, and end at their rims, over which no depth bleeds, and of many views some are \
      filled";
 /// Where each pixel of the reference is from, below the scene's folder.
 pub const PROVENANCE: &str = "prepare/provenance.png";

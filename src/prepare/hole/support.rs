@@ -43,6 +43,10 @@ const SHEER: f64 = 1.1;
 /// Directions in which the rim of a top is looked for, and the share of the points on its sides that are within it.
 const DIRECTIONS: usize = 48;
 const RIM: f64 = 0.98;
+/// Part of the way from a top's middle to its rim from which on depth that is little higher is the rim's.
+const WITHIN_RIM: f64 = 0.8;
+/// Part of what depth bleeds by that is the noise of the rim's own.
+const ON_RIM: f64 = 0.1;
 /// Least share of the points around all holes that lie on a top, and how many may be seen through it below the object, as a part of these.
 const TOP: f64 = 0.005;
 const LOOKED_THROUGH: f64 = 0.1;
@@ -50,6 +54,7 @@ const LOOKED_THROUGH: f64 = 0.1;
 const STRAY: f64 = 3.0;
 
 /// A plane that an object stands on, in a camera's coordinates.
+#[derive(Clone)]
 pub struct Support {
     plane: Plane,
     axes: [DVec3; 2],
@@ -123,6 +128,15 @@ impl Support {
     /// Where a point in the camera's coordinates falls, along the axes.
     fn place(&self, point: DVec3) -> DVec2 {
         DVec2::new(point.dot(self.axes[0]), point.dot(self.axes[1]))
+    }
+
+    /// Whether a point, at a depth z along a ray, is over its rim by no more than this length at z = 1: depth bleeds over the end of a top.
+    pub fn bleeds(&self, ray: [f64; 2], z: f64, length: f64) -> bool {
+        let point = DVec3::new(ray[0], ray[1], 1.0) * z;
+        let p = DVec3::from(self.plane);
+        let above = (1.0 - p.dot(point)) / p.length();
+        (ON_RIM * length * z..=length * z).contains(&above)
+            && (WITHIN_RIM..=1.0 + BESIDE).contains(&self.reach(self.place(point)))
     }
 
     /// Whether the object stands at a place along the axes.
@@ -283,19 +297,23 @@ impl Sights {
     /// Finds where the object stands, of which these are points: on this top, as far as that is shown, or on the plane that most views have
     /// it stand on. A table that nobody sees below the object does not let the floor be seen that others see past the table.
     pub(super) fn stand(&mut self, top: Option<(Common, Vec<DVec3>)>, object: &[DVec3]) {
-        for sight in &mut self.0 {
-            sight.top = top.as_ref().and_then(|(plane, _)| plane.seen_by(sight));
-        }
+        let shows = top.is_some();
         let stood = || self.agreed(object).map(|plane| (plane, vec![]));
-        if let Some((plane, mut shown)) = top.or_else(stood) {
-            shown.extend(object);
-            let stands = |sight: &Sight| -> Vec<f64> {
-                let support = carries(&plane, sight, &shown);
-                let at = |site: usize| support.as_ref().filter(|_| sight.hole[site])?.below(sight.ray(site));
-                (0..sight.hole.len()).map(|site| at(site).unwrap_or(f64::NAN)).collect()
+        if let Some((plane, shown)) = top.or_else(stood) {
+            let of = |sight: &Sight| {
+                let mut support = carries(&plane, sight, object)?;
+                if shows {
+                    let places = shown.iter().map(|p| support.place(sight.grid.camera.to_camera(p.to_array()).into()));
+                    support.foot = hull(places.collect());
+                }
+                Some(support)
             };
-            let stands: Vec<Vec<f64>> = self.0.par_iter().map(stands).collect();
-            self.0.iter_mut().zip(stands).for_each(|(sight, stands)| sight.stands = stands);
+            self.0.par_iter_mut().for_each(|sight| {
+                let support = of(sight);
+                let at = |site: usize| support.as_ref().filter(|_| sight.hole[site])?.below(sight.ray(site));
+                sight.stands = (0..sight.hole.len()).map(|site| at(site).unwrap_or(f64::NAN)).collect();
+                sight.top = support.filter(|_| shows);
+            });
         }
     }
 
@@ -389,6 +407,18 @@ mod tests {
             assert_eq!(z_under.is_some(), is_under, "{x} {z}");
             assert!(z_under.is_none_or(|found| (found - z).abs() < 1e-9));
         }
+    }
+
+    /// Little above the rim is the rim's depth; much above it, above its middle, or on it is what is measured there.
+    #[test]
+    fn depth_bleeds_over_the_rim() {
+        let mut support = Support::new(FLOOR, &cube(0.0)).expect("it stands on the floor");
+        let rim = [(0.0, 4.0), (1.0, 4.0), (1.0, 5.0), (0.0, 5.0)];
+        support.foot = hull(rim.map(|(x, z)| support.place(DVec3::new(x, 1.5, z))).to_vec());
+        let bleeds = |x: f64, above: f64, z: f64| support.bleeds([x / z, (1.5 - above) / z], z, 0.05);
+        assert!(bleeds(0.5, 0.1, 4.97) && bleeds(0.5, 0.1, 5.05) && bleeds(1.1, 0.1, 4.5));
+        assert!(!bleeds(0.5, 0.4, 5.0) && !bleeds(0.5, 0.1, 4.5) && !bleeds(0.5, 0.01, 4.97) && !bleeds(0.5, 0.1, 5.5));
+        assert!(!bleeds(0.5, -0.1, 5.05));
     }
 
     /// What hangs in the air does not stand on the floor, nor does what goes through it.

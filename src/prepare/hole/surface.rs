@@ -12,6 +12,7 @@ use rayon::prelude::*;
 use super::corner::Cut;
 use super::covered::{Cover, Covered};
 use super::flat;
+use super::support::Support;
 use super::votes::{Claim, ENOUGH, Votes};
 use super::window::Window;
 use crate::multiview::DepthGrid;
@@ -65,8 +66,8 @@ pub struct Sight {
     pub planes: Vec<planes::Plane>,
     /// `[site of the hole]` depth z of the plane that the object stands on where it does, NaN elsewhere: nothing behind that shows.
     pub(super) stands: Vec<f64>,
-    /// The plane of a top that hardly shows around the object: it is there where `stands` is known, and ends there.
-    pub(super) top: Option<planes::Plane>,
+    /// A top that hardly shows around the object: it is there where `stands` is known, and ends there.
+    pub(super) top: Option<Support>,
     /// Planes around the hole that were found before it is solved; none where the views are too near each
     /// other to tell.
     pub(super) around: Vec<planes::Plane>,
@@ -330,6 +331,11 @@ impl Sight {
         (0..self.hole.len()).map(|site| low[0] <= high[0] && inside(place(site))).collect()
     }
 
+    /// Whether a plane is that of the top that hardly shows around the object.
+    fn is_top(&self, plane: &planes::Plane) -> bool {
+        self.top.as_ref().is_some_and(|top| top.is(plane))
+    }
+
     /// The world point on a site's ray at a depth z.
     pub fn point(&self, site: usize, depth: f64) -> DVec3 {
         let [column, row] = [site as u32 % self.grid.columns, site as u32 / self.grid.columns].map(f64::from);
@@ -440,6 +446,8 @@ impl Sights {
         let own = &self.0[of];
         let claims = self.claims(of);
         let planes: Vec<Vec<planes::Plane>> = self.0.iter().map(|sight| sight.planes_for(own)).collect();
+        let camera = own.grid.camera;
+        let bleeding = super::BLEEDING * f64::from(camera.size[0].max(camera.size[1])) / f64::from(camera.focal[0]);
         // A claim is of a point somewhere in the site: its plane tells the depth in the site's middle.
         let in_middle = |site: usize, claim: &Claim| {
             let plane = planes[claim.view].get(usize::from(claim.surface));
@@ -452,6 +460,8 @@ impl Sights {
             }
             let mut near: Vec<Claim> = own.around(site).flat_map(|site| claims[site].iter().copied()).collect();
             // Of solved views the first tells: each later one would carry the surface a little nearer.
+            let bled = |z: f64| own.top.as_ref().is_some_and(|top| top.bleeds(own.ray(site), z, bleeding));
+            near.retain(|claim| !bled(claim.depth));
             let solved = near.iter().filter(|claim| !claim.photographed);
             let first = solved.map(|claim| self.0[claim.view].rank).min();
             near.retain(|claim| claim.photographed || Some(self.0[claim.view].rank) == first);
@@ -526,7 +536,7 @@ impl Sights {
             let impossible = |plane: &planes::Plane| {
                 let z = 1.0 / planes::on(plane, own.ray(site));
                 let before = z < NEARER / f64::from(disparity[site]);
-                let beyond = own.top == Some(*plane) && own.stands[site].is_nan();
+                let beyond = own.is_top(plane) && own.stands[site].is_nan();
                 before || beyond || z > (1.0 + APART) * own.stands[site] || self.is_refuted(of, own.point(site, z))
             };
             let cost = |label: usize| {
@@ -582,7 +592,7 @@ impl Sights {
             (true, true) => planes::around(&known, &rays, &open, seed),
         };
         let supports = own.supports(&planes);
-        let top = planes.iter().position(|plane| own.top == Some(*plane));
+        let top = planes.iter().position(|plane| own.is_top(plane));
         let barred = |plane: usize, site: usize| {
             let beyond = top == Some(plane) && own.hole[site] && own.stands[site].is_nan();
             beyond || own.cuts.iter().any(|cut| cut.bars(plane, own.middle(site)))
