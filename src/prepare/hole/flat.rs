@@ -217,7 +217,7 @@ impl Sights {
         let (mut common, points) = (self.common(seed), self.points());
         let object = self.object();
         let top = self.top(&common, &object);
-        common.extend(top.iter().map(|(plane, _)| *plane));
+        common.extend(top.iter().map(|top| top.plane));
         let of = |view: usize| self.flat(view, &common, &points, parallax, seed + view as u64);
         let flat: Vec<Flat> = (0..self.0.len()).into_par_iter().map(of).collect();
         let untold = flat.iter().any(|flat| flat.planes.is_empty());

@@ -154,6 +154,15 @@ impl Support {
     }
 }
 
+/// The top of what an object stands on, of which little shows around it.
+pub(super) struct Top {
+    pub plane: Common,
+    /// Points on it that are shown, or its rim.
+    shown: Vec<DVec3>,
+    /// Whether it is known to end where the points do.
+    has_rim: bool,
+}
+
 /// Whether a place is within the corners of a convex polygon, counterclockwise.
 fn inside(corners: &[DVec2], at: DVec2) -> bool {
     let n = corners.len();
@@ -231,13 +240,13 @@ impl Sights {
 
     /// The top of what the object stands on, where that is too small to be found among the planes around: it is parallel to one of
     /// these `common` ones, as high as the object ends, shown beside the object's foot, itself or the sides below it, and nobody looks
-    /// through it below the object. The points that are shown of it are told as well. Nothing where the object stands on a common plane.
-    pub(super) fn top(&self, common: &[Common], object: &[DVec3]) -> Option<(Common, Vec<DVec3>)> {
+    /// through it below the object. Nothing where the object stands on a common plane.
+    pub(super) fn top(&self, common: &[Common], object: &[DVec3]) -> Option<Top> {
         let sight = self.trusted().next()?;
         let around = self.around_holes(true);
         let around: Vec<Measured> = around.into_iter().map(|(view, site)| self.measured(view, site)).collect();
-        // Whether it is one of the common planes, it, and the points on it.
-        let one = |plane: &Common| -> Option<(bool, Common, Vec<DVec3>)> {
+        // It, and whether it is one of the common planes.
+        let one = |plane: &Common| -> Option<(Top, bool)> {
             let middle = median(object.iter().map(|p| plane.normal.dot(*p)))?;
             let way = if middle > plane.offset { 1.0 } else { -1.0 };
             let (normal, parallel) = (plane.normal * way, plane.offset * way);
@@ -269,6 +278,7 @@ impl Sights {
                     beside.iter().map(|at| (at.point, support.reach(dropped(at.point)))).collect();
                 end_of_sides(normal, foot, &points)
             };
+            let has_rim = flat.is_none();
             let (offset, shown) = flat.map(|(_, offset)| (offset, on(offset).collect())).or_else(sides)?;
             let (plane, support) = at(offset)?;
             let through = |at: &&Measured| {
@@ -285,24 +295,27 @@ impl Sights {
             );
             let share = |count: usize| count as f64 / around.len() as f64;
             let shows = share(shown.len()) >= TOP && (through as f64) < LOOKED_THROUGH * shown.len() as f64;
-            (shows && (known || share(on(offset).count()) < LEAST)).then_some((known, plane, shown))
+            let is = shows && (known || share(on(offset).count()) < LEAST);
+            is.then_some((Top { plane, shown, has_rim }, known))
         };
-        let found: Vec<(bool, Common, Vec<DVec3>)> = common.iter().filter_map(one).collect();
-        if found.iter().any(|(known, ..)| *known) {
+        let found: Vec<(Top, bool)> = common.iter().filter_map(one).collect();
+        if found.iter().any(|(_, known)| *known) {
             return None;
         }
-        found.into_iter().max_by_key(|(.., shown)| shown.len()).map(|(_, plane, shown)| (plane, shown))
+        found.into_iter().map(|(top, _)| top).max_by_key(|top| top.shown.len())
     }
 
     /// Finds where the object stands, of which these are points: on this top, as far as that is shown, or on the plane that most views have
     /// it stand on. A table that nobody sees below the object does not let the floor be seen that others see past the table.
-    pub(super) fn stand(&mut self, top: Option<(Common, Vec<DVec3>)>, object: &[DVec3]) {
-        let shows = top.is_some();
-        let stood = || self.agreed(object).map(|plane| (plane, vec![]));
-        if let Some((plane, shown)) = top.or_else(stood) {
+    pub(super) fn stand(&mut self, top: Option<Top>, object: &[DVec3]) {
+        let stood = || self.agreed(object).map(|plane| Top { plane, shown: vec![], has_rim: false });
+        if let Some(Top { plane, mut shown, has_rim }) = top.or_else(stood) {
+            if !has_rim {
+                shown.extend(object);
+            }
             let of = |sight: &Sight| {
-                let mut support = carries(&plane, sight, object)?;
-                if shows {
+                let mut support = carries(&plane, sight, if has_rim { object } else { &shown })?;
+                if has_rim {
                     let places = shown.iter().map(|p| support.place(sight.grid.camera.to_camera(p.to_array()).into()));
                     support.foot = hull(places.collect());
                 }
@@ -312,7 +325,7 @@ impl Sights {
                 let support = of(sight);
                 let at = |site: usize| support.as_ref().filter(|_| sight.hole[site])?.below(sight.ray(site));
                 sight.stands = (0..sight.hole.len()).map(|site| at(site).unwrap_or(f64::NAN)).collect();
-                sight.top = support.filter(|_| shows);
+                sight.top = support.filter(|_| has_rim);
             });
         }
     }
@@ -431,9 +444,9 @@ mod tests {
 
     const SIZE: [u32; 2] = [120, 90];
 
-    /// One of eight cameras around a box of one unit on a table of this half width and thickness, over a floor, y downwards: the camera, the
-    /// mask, the depth of what each pixel shows, and of what it would show without the box.
-    fn table(turn: usize, half: f64, thick: f64) -> (Camera, GrayImage, DepthGrid, Vec<f64>) {
+    /// One of eight cameras around a box of one unit on a table of this half width, over a floor, y downwards: the camera, the mask, the
+    /// depth of what each pixel shows, and of what it would show without the box.
+    fn table(turn: usize, half: f64) -> (Camera, GrayImage, DepthGrid, Vec<f64>) {
         let (sin, cos) = (std::f64::consts::TAU * turn as f64 / 8.0).sin_cos();
         let eye = DVec3::new(5.0 * sin, -3.0, -5.0 * cos);
         let ahead = (DVec3::new(0.0, -0.2, 0.0) - eye).normalize();
@@ -455,7 +468,7 @@ mod tests {
         };
         let shown = |pixel: usize| {
             let way = DVec3::from(camera.lift(camera.pixel_center(pixel), 1.0).expect("a ray")) - eye;
-            let slab = [DVec3::new(-half, 0.0, -half), DVec3::new(half, thick, half)];
+            let slab = [DVec3::new(-half, 0.0, -half), DVec3::new(half, 0.05, half)];
             let behind = met(way, slab).min(if way.y > 0.0 { (1.5 - eye.y) / way.y } else { 50.0 });
             (met(way, [DVec3::new(-0.5, -0.8, -0.5), DVec3::new(0.5, 0.0, 0.5)]), behind)
         };
@@ -472,7 +485,7 @@ mod tests {
     /// Nobody sees the table under the object, and past its edge everybody sees the floor, which lies behind the table in every view.
     #[test]
     fn the_floor_does_not_show_through_the_table() {
-        let views: Vec<_> = (0..8).map(|turn| table(turn, 0.8, 0.05)).collect();
+        let views: Vec<_> = (0..8).map(|turn| table(turn, 0.8)).collect();
         let cameras: Vec<Camera> = views.iter().map(|view| view.0).collect();
         let masks: Vec<GrayImage> = views.iter().map(|view| view.1.clone()).collect();
         let mut sights = Sights::new(views.iter().map(|view| view.2.clone()).collect(), &cameras, &masks, &masks);
@@ -506,20 +519,39 @@ mod tests {
     #[test]
     fn the_top_is_where_the_object_ends() {
         let plane = |y: f64| Common { normal: DVec3::Y, offset: y };
-        // Of the block hardly more than the sides is seen.
-        for (half, thick) in [(0.58, 0.05), (0.53, 1.5)] {
-            let views: Vec<_> = (0..8).map(|turn| table(turn, half, thick)).collect();
-            let cameras: Vec<Camera> = views.iter().map(|view| view.0).collect();
-            let masks: Vec<GrayImage> = views.iter().map(|view| view.1.clone()).collect();
-            let sights = Sights::new(views.into_iter().map(|view| view.2).collect(), &cameras, &masks, &masks);
-            let object = sights.object();
-            let (top, shown) = sights.top(&[plane(1.5)], &object).expect("the box stands on something");
-            assert!(shown.iter().all(|p| p.x.abs().max(p.z.abs()) < half + 0.02), "it is no larger than it is");
-            assert!(top.normal.y.abs() > 0.999 && (top.offset * top.normal.y).abs() < 0.04, "{half}: {top:?}");
-            assert!(sights.top(&[plane(1.5), plane(0.0)], &object).is_none(), "it is known");
-            let lifted: Vec<DVec3> = object.iter().map(|point| *point - DVec3::Y).collect();
-            assert!(sights.top(&[plane(1.5)], &lifted).is_none(), "it stands on air");
-        }
+        let views: Vec<_> = (0..8).map(|turn| table(turn, 0.58)).collect();
+        let cameras: Vec<Camera> = views.iter().map(|view| view.0).collect();
+        let masks: Vec<GrayImage> = views.iter().map(|view| view.1.clone()).collect();
+        let sights = Sights::new(views.into_iter().map(|view| view.2).collect(), &cameras, &masks, &masks);
+        let object = sights.object();
+        let found = sights.top(&[plane(1.5)], &object).expect("the box stands on something");
+        let (top, shown) = (found.plane, found.shown);
+        assert!(!found.has_rim, "the top itself is seen");
+        assert!(shown.iter().all(|point| point.x.abs().max(point.z.abs()) < 0.6), "it is no larger than it is");
+        assert!(top.normal.y.abs() > 0.999 && (top.offset * top.normal.y).abs() < 0.03, "{top:?}");
+        assert!(sights.top(&[plane(1.5), plane(0.0)], &object).is_none(), "it is known");
+        let lifted: Vec<DVec3> = object.iter().map(|point| *point - DVec3::Y).collect();
+        assert!(sights.top(&[plane(1.5)], &lifted).is_none(), "it stands on air");
+    }
+
+    /// Of a block of half a unit to each side the sides alone are seen, up to a height of 0.6, and a stray beside it: as high it is, and as
+    /// wide. A hill has no top.
+    #[test]
+    fn sheer_sides_end_with_the_top() {
+        let block = |slope: f64| -> Vec<(DVec3, f64)> {
+            let places = (0..400).map(|i| (f64::from(i % 20) / 20.0, f64::from(i / 20) / 20.0, i % 4));
+            let of = |(along, below, side): (f64, f64, i32)| {
+                let (out, along, low) = (0.5 + slope * 0.2 * below, along - 0.5, 0.6 - 0.2 * below);
+                let (sin, cos) = (0.25 * std::f64::consts::TAU * f64::from(side)).sin_cos();
+                (DVec3::new(cos * out - sin * along, low, sin * out + cos * along), out / 0.45)
+            };
+            places.map(of).chain([(DVec3::new(0.62, 0.55, 0.0), 1.38)]).collect()
+        };
+        let (height, rim) = end_of_sides(DVec3::Y, 0.63, &block(0.0)).expect("it has a top");
+        assert!((height - 0.6).abs() < 0.015, "{height}");
+        let wide = rim.iter().fold(0.0, |wide: f64, p| wide.max(p.x.abs()).max(p.z.abs()));
+        assert!((0.49..0.51).contains(&wide) && rim.iter().all(|p| (p.y - height).abs() < 1e-9), "{wide}");
+        assert!(end_of_sides(DVec3::Y, 0.63, &block(1.0)).is_none());
     }
 
     #[test]
