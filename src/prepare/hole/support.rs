@@ -144,7 +144,8 @@ impl Support {
         inside(&self.foot, at)
     }
 
-    /// By how much the foot, grown about its middle, reaches a place along the axes: at most 1 where the object stands. Infinite without a foot.
+    /// Factor by which the foot grows about its middle until it reaches a place along the axes: at most 1 where the object stands, infinite without
+    /// a foot.
     fn reach(&self, at: DVec2) -> f64 {
         let n = self.foot.len();
         let middle = self.foot.iter().sum::<DVec2>() / n.max(1) as f64;
@@ -193,9 +194,9 @@ fn hull(mut points: Vec<DVec2>) -> Vec<DVec2> {
     corners
 }
 
-/// The top of something of which hardly more than the sides below it shows: how high it is along this normal, and where its rim is. Of the
-/// points with what [`Support::reach`] says of them none is far above the object's foot. They are spread evenly over sheer sides; of a
-/// slope nothing is told.
+/// The top of something of which hardly more than the sides below it shows: how high it is along this normal, and where its rim is. The points,
+/// each with its [`Support::reach`], are nowhere far above the object's foot. They are spread evenly over sheer sides; nothing is told of a
+/// slope.
 fn end_of_sides(normal: DVec3, foot: f64, points: &[(DVec3, f64)]) -> Option<(f64, Vec<DVec3>)> {
     let height = |share: f64| quantile(points.iter().map(|(point, _)| normal.dot(*point)), share);
     let [middle, high] = [height(0.5)?, height(SIDES)?];
@@ -245,7 +246,7 @@ impl Sights {
         let sight = self.trusted().next()?;
         let around = self.around_holes(true);
         let around: Vec<Measured> = around.into_iter().map(|(view, site)| self.measured(view, site)).collect();
-        // It, and whether it is one of the common planes.
+        // The top, and whether it is one of the common planes.
         let one = |plane: &Common| -> Option<(Top, bool)> {
             let middle = median(object.iter().map(|p| plane.normal.dot(*p)))?;
             let way = if middle > plane.offset { 1.0 } else { -1.0 };
@@ -422,7 +423,7 @@ mod tests {
         }
     }
 
-    /// Little above the rim is the rim's depth; much above it, above its middle, or on it is what is measured there.
+    /// Depth little above the rim is the rim's; what is measured much above it, above its middle, or on it is there.
     #[test]
     fn depth_bleeds_over_the_rim() {
         let mut support = Support::new(FLOOR, &cube(0.0)).expect("it stands on the floor");
@@ -534,8 +535,8 @@ mod tests {
         assert!(sights.top(&[plane(1.5)], &lifted).is_none(), "it stands on air");
     }
 
-    /// Of a block of half a unit to each side the sides alone are seen, up to a height of 0.6, and a stray beside it: as high it is, and as
-    /// wide. A hill has no top.
+    /// A block of half a unit to each side is as high, 0.6, and as wide as its sides, which alone are seen, and not as a stray beside it. A hill
+    /// has no top.
     #[test]
     fn sheer_sides_end_with_the_top() {
         let block = |slope: f64| -> Vec<(DVec3, f64)> {
