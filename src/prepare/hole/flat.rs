@@ -173,13 +173,16 @@ pub(super) fn largest(mut points: Vec<Measured>, least: usize, rng: &mut Pcg64) 
     found
 }
 
+/// The largest planes of what is measured around the holes of all views.
+fn common(around: &[Measured], seed: u64) -> Vec<Common> {
+    let least = (LEAST * around.len() as f64).ceil() as usize;
+    largest(around.to_vec(), least, &mut Pcg64::new(seed.into(), 43))
+}
+
 impl Sights {
-    /// The largest planes of what all views together show around their holes.
-    fn common(&self, seed: u64) -> Vec<Common> {
-        let points: Vec<Measured> =
-            self.around_holes(true).into_iter().map(|(view, site)| self.measured(view, site)).collect();
-        let least = (LEAST * points.len() as f64).ceil() as usize;
-        largest(points, least, &mut Pcg64::new(seed.into(), 43))
+    /// Points that all views together show around their holes, some of each.
+    pub(super) fn measured_around(&self) -> Vec<Measured> {
+        self.around_holes(true).into_iter().map(|(view, site)| self.measured(view, site)).collect()
     }
 
     /// Views and sites, some of each, whose depth is known around their holes, confirmed by others or not.
@@ -214,9 +217,10 @@ impl Sights {
 
     /// Flattens views with at least this parallax; others get the surfaces of one material around the holes.
     fn flatten_from(&mut self, parallax: f64, seed: u64) {
-        let (mut common, points) = (self.common(seed), self.points());
+        let (around, points) = (self.measured_around(), self.points());
+        let mut common = common(&around, seed);
         let object = self.object();
-        let top = self.top(&common, &object);
+        let top = self.top(&common, &around, &object);
         common.extend(top.iter().map(|top| top.plane));
         let of = |view: usize| self.flat(view, &common, &points, parallax, seed + view as u64);
         let flat: Vec<Flat> = (0..self.0.len()).into_par_iter().map(of).collect();
@@ -555,7 +559,7 @@ mod tests {
     #[test]
     fn the_common_plane_is_that_of_most_points() {
         let (sights, _) = patched(|_, _| 90, true);
-        let plane = sights.common(1)[0];
+        let plane = common(&sights.measured_around(), 1)[0];
         let normal = plane.normal * plane.normal.z.signum();
         assert!(normal.distance(DVec3::Z) < 1e-3, "{normal}");
         assert!((plane.offset.abs() - 4.0).abs() < 1e-3, "{}", plane.offset);

@@ -241,11 +241,9 @@ impl Sights {
 
     /// The top of what the object stands on, where that is too small to be found among the planes around: it is parallel to one of
     /// these `common` ones, as high as the object ends, shown beside the object's foot, itself or the sides below it, and nobody looks
-    /// through it below the object. Nothing where the object stands on a common plane.
-    pub(super) fn top(&self, common: &[Common], object: &[DVec3]) -> Option<Top> {
+    /// through it below the object, by what is measured `around` all holes. Nothing where the object stands on a common plane.
+    pub(super) fn top(&self, common: &[Common], around: &[Measured], object: &[DVec3]) -> Option<Top> {
         let sight = self.trusted().next()?;
-        let around = self.around_holes(true);
-        let around: Vec<Measured> = around.into_iter().map(|(view, site)| self.measured(view, site)).collect();
         // The top, and whether it is one of the common planes.
         let one = |plane: &Common| -> Option<(Top, bool)> {
             let middle = median(object.iter().map(|p| plane.normal.dot(*p)))?;
@@ -524,15 +522,15 @@ mod tests {
         let cameras: Vec<Camera> = views.iter().map(|view| view.0).collect();
         let masks: Vec<GrayImage> = views.iter().map(|view| view.1.clone()).collect();
         let sights = Sights::new(views.into_iter().map(|view| view.2).collect(), &cameras, &masks, &masks);
-        let object = sights.object();
-        let found = sights.top(&[plane(1.5)], &object).expect("the box stands on something");
+        let (around, object) = (sights.measured_around(), sights.object());
+        let found = sights.top(&[plane(1.5)], &around, &object).expect("the box stands on something");
         let (top, shown) = (found.plane, found.shown);
         assert!(!found.has_rim, "the top itself is seen");
         assert!(shown.iter().all(|point| point.x.abs().max(point.z.abs()) < 0.6), "it is no larger than it is");
         assert!(top.normal.y.abs() > 0.999 && (top.offset * top.normal.y).abs() < 0.03, "{top:?}");
-        assert!(sights.top(&[plane(1.5), plane(0.0)], &object).is_none(), "it is known");
+        assert!(sights.top(&[plane(1.5), plane(0.0)], &around, &object).is_none(), "it is known");
         let lifted: Vec<DVec3> = object.iter().map(|point| *point - DVec3::Y).collect();
-        assert!(sights.top(&[plane(1.5)], &lifted).is_none(), "it stands on air");
+        assert!(sights.top(&[plane(1.5)], &around, &lifted).is_none(), "it stands on air");
     }
 
     /// A block of half a unit to each side is as high, 0.6, and as wide as its sides, which alone are seen, and not as a stray beside it. A hill
