@@ -196,7 +196,7 @@ impl Matched {
     /// Points that the photographs add to those of the sparse model, none of views whose cameras are wrong.
     pub fn points(&self, scene: &Scene) -> Vec<Point> {
         let pictures: Vec<Picture> = scene.train.par_iter().map(|view| Picture::new(view, 1)).collect();
-        let wrong = agree::wrong(&agree::shares(&pictures, &self.neighbors, &self.confirmed));
+        let wrong = agree::wrong(&pictures, &self.neighbors, &self.confirmed);
         let known = |(surface, wrong): (&fuse::Surface, bool)| match wrong {
             true => vec![f64::NAN; surface.len()],
             false => surface.clone(),
@@ -212,7 +212,7 @@ impl Matched {
 
     fn grids(&self, views: &[View]) -> Vec<DepthGrid> {
         let pictures: Vec<Picture> = views.par_iter().map(|view| Picture::new(view, 1)).collect();
-        let wrong = agree::wrong(&agree::shares(&pictures, &self.neighbors, &self.confirmed));
+        let wrong = agree::wrong(&pictures, &self.neighbors, &self.confirmed);
         let filled = fill::fill(&pictures, &self.surfaces);
         let all = pictures.into_par_iter().zip(&self.surfaces).zip(filled).zip(wrong);
         let grids = all.map(|(((picture, surface), filled), wrong)| {

@@ -126,7 +126,7 @@ pub fn look(gpu: &Gpu, scene: &Scene, reduction: u32) -> Result<Stereo, Error> {
     let neighbors = neighbors::choose(&pictures, train, &scene.points);
     let maps = depth::estimate(gpu, &pictures, &neighbors.of, &scene.points)?;
     let surfaces = fuse::confirm(&pictures, &neighbors.of, &maps);
-    let wrong = agree::wrong(&agree::shares(&pictures, &neighbors, &surfaces));
+    let wrong = agree::wrong(&pictures, &neighbors, &surfaces);
     let wrong: Vec<String> = (views.iter().zip(wrong).enumerate())
         .filter(|(at, (_, wrong))| *wrong && scene.reference_of(*at).is_none())
         .map(|(_, (view, _))| view.name.clone())
@@ -171,7 +171,7 @@ mod tests {
     use crate::gpu::testing;
     use crate::scene::{Config, load, synthetic};
 
-    fn built_in(options: &synthetic::Options) -> Scene {
+    pub fn built_in(options: &synthetic::Options) -> Scene {
         let folder = tempfile::tempdir().expect("a folder");
         let dir = folder.path().join("scene");
         synthetic::write(&dir, options).expect("a scene");
