@@ -60,7 +60,8 @@ fn a_run_learns_and_is_the_same_again() {
     let (first, last) = (mean(&watch.steps[..6]), mean(&watch.steps[84..]));
     assert!(last < 0.7 * first, "{first} to {last}");
     let rounds = watch.lines.iter().filter(|line| line.contains("faded Gaussians are halves of others"));
-    assert_eq!(rounds.count(), 5, "{:?}", watch.lines);
+    // Of five rounds two change something, and the others say nothing.
+    assert_eq!(rounds.count(), 2, "{:?}", watch.lines);
     assert_eq!(watch.steps[89].anchors, 330, "as many as there may be");
     assert!(watch.steps.iter().all(|p| p.visible == p.anchors && p.gaussians > 0));
     // Again, and with room for too few pairs at first.

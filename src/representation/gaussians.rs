@@ -74,7 +74,9 @@ impl Representation for Static {
         let before = self.count;
         let moved = split::run(gpu, self, config, round)?;
         let (step, now, new) = (round.step, self.count, self.count - before);
-        Ok(format!("step {step}: {moved} faded Gaussians are halves of others, {new} new: {before} -> {now}"))
+        let text =
+            || format!("step {step}: {moved} faded Gaussians are halves of others, {new} new: {before} -> {now}");
+        Ok(if moved == 0 && new == 0 { String::new() } else { text() })
     }
 
     fn swell(&mut self, rows: u32) {

@@ -103,7 +103,7 @@ pub trait Representation: Send + Sync {
         gradients: GaussianGradients<'_>,
     );
 
-    /// A round of growth, by what the steps since the last one have counted; says what changed.
+    /// A round of growth, by what the steps since the last one have counted; says what changed, if anything has.
     ///
     /// # Errors
     /// When the device has no room.

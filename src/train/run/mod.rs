@@ -497,7 +497,10 @@ impl<'a> Run<'a> {
                     session.vain.step(self.scene, &self.settings, counters[Counter::Drawn as usize], photometric).err();
             }
             if self.step.changes_anchors(step) {
-                watch.say(&self.step.change_anchors(step)?);
+                let text = self.step.change_anchors(step)?;
+                if !text.is_empty() {
+                    watch.say(&text);
+                }
             }
             let mut state = None;
             if session.careful || self.checkpoints(step) || self.saves(step) {

@@ -12,7 +12,7 @@ impl Step {
     }
 
     /// Grows and prunes anchors, or moves and adds plain Gaussians, behind this step, with nothing in flight; says what
-    /// changed.
+    /// changed, if anything has.
     ///
     /// # Errors
     /// When the device has no room.
