@@ -250,8 +250,10 @@ impl<'a> Carrier<'a> {
             (outline::of(picture, moved.as_ref().unwrap_or(&carried.object), size), moved.is_some())
         };
         let mut carried = carry(&shares, splats)?;
-        let thin: Vec<(f64, usize)> =
-            others.iter().zip(&carried).filter_map(|(at, carried)| Some((carried.thinness()?, *at))).collect();
+        // A mask in a view whose camera is wrong would help no other.
+        let helps = |at: &usize| !wrong.contains(scene.train[*at].name.as_str());
+        let thin = others.iter().zip(&carried).filter(|(at, _)| helps(at));
+        let thin: Vec<(f64, usize)> = thin.filter_map(|(at, carried)| Some((carried.thinness()?, *at))).collect();
         // What the first views miss of the object's other sides the masks of more views have between them.
         let every = others.len().div_ceil(outline::VOTERS).max(1);
         for _ in 0..outline::ROUNDS {
