@@ -1,12 +1,26 @@
 //! Parts of a graph that hang together.
 
+use std::collections::BTreeMap;
+
 /// The root of the tree that a node is in; `parents` names each node's parent, and a root itself.
-pub fn root(parents: &mut [usize], mut at: usize) -> usize {
+fn root(parents: &mut [usize], mut at: usize) -> usize {
     while parents[at] != at {
         parents[at] = parents[parents[at]];
         at = parents[at];
     }
     at
+}
+
+/// The parts of a graph of so many nodes that `links` hold together, by the least node of each; their nodes in order.
+pub fn parts(nodes: usize, links: impl Iterator<Item = (usize, usize)>) -> Vec<Vec<usize>> {
+    let mut parents: Vec<usize> = (0..nodes).collect();
+    for (one, other) in links {
+        let (one, other) = (root(&mut parents, one), root(&mut parents, other));
+        parents[one.max(other)] = one.min(other);
+    }
+    let mut parts: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+    (0..nodes).for_each(|node| parts.entry(root(&mut parents, node)).or_default().push(node));
+    parts.into_values().collect()
 }
 
 /// `[node]` number of its segment, by the least node of each, and how many there are: Felzenszwalb and Huttenlocher 2004.

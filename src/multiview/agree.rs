@@ -8,10 +8,10 @@
 
 use rayon::prelude::*;
 
-use super::fuse::Surface;
+use super::fuse::{SAME, Surface};
 use super::neighbors::Neighbors;
 use super::picture::Picture;
-use crate::segments::root;
+use crate::segments::parts;
 use crate::statistics::quantile;
 
 /// Grey levels between the darkest and the lightest pixel around a site that has texture.
@@ -32,8 +32,6 @@ const PART: f64 = 0.25;
 const WORKS: f64 = 0.2;
 /// Sites of a view whose depth is compared with that of each other view.
 const COMPARED: usize = 300;
-/// Depths of two views within this share are of one surface.
-const SAME: f64 = 0.04;
 /// Two views hang together where they compare at so many sites and agree at half of these.
 const FEWEST_COMPARED: u32 = 15;
 /// Views that hang together are in a wrong place where they are at most this part of all, and, with those that hang together most, agree
@@ -82,17 +80,12 @@ fn apart(compared: &[Vec<Compared>]) -> Vec<usize> {
     let both = |one: usize, other: usize| -> Compared {
         std::array::from_fn(|k| compared[one][other][k] + compared[other][one][k])
     };
-    let mut parents: Vec<usize> = (0..n).collect();
-    for (one, other) in (0..n).flat_map(|one| (0..one).map(move |other| (one, other))) {
-        let [all, agree, _] = both(one, other);
-        if all >= FEWEST_COMPARED && 2 * agree >= all {
-            let (one, other) = (root(&mut parents, one), root(&mut parents, other));
-            parents[one.max(other)] = one.min(other);
-        }
-    }
-    let roots: Vec<usize> = (0..n).map(|at| root(&mut parents, at)).collect();
-    let part = |of: usize| (0..n).filter(|at| roots[*at] == of).collect::<Vec<_>>();
-    let parts: Vec<Vec<usize>> = (0..n).filter(|at| roots[*at] == *at).map(part).collect();
+    let is_link = |(one, other): &(usize, usize)| {
+        let [all, agree, _] = both(*one, *other);
+        all >= FEWEST_COMPARED && 2 * agree >= all
+    };
+    let pairs = (0..n).flat_map(|one| (0..one).map(move |other| (one, other)));
+    let parts = parts(n, pairs.filter(is_link));
     let Some(main) = parts.iter().max_by_key(|part| part.len()).filter(|part| 2 * part.len() > n) else {
         return vec![];
     };

@@ -15,7 +15,7 @@ const SHARE: f64 = 0.02;
 /// Views that must agree with a view, or all of fewer.
 const AGREEING: usize = 2;
 /// Depths within this share are of one surface, when a point is asked whether a view sees it.
-const SAME: f64 = 0.04;
+pub(super) const SAME: f64 = 0.04;
 /// A point nearer than what a view sees there by more than this share would hide it.
 const BEFORE: f64 = 0.08;
 

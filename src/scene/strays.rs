@@ -10,7 +10,7 @@ use super::bounds::Bounds;
 use super::colmap::{Image, Model, Tracks};
 use super::note::{Note, Notes};
 use super::{Point, Poses, layout};
-use crate::segments::root;
+use crate::segments::parts;
 use crate::statistics::median;
 
 /// Two photographs hang together by this many points at least, the least that COLMAP takes for a match ...
@@ -63,23 +63,16 @@ fn linked(images: &[Image], points: &[Point], tracks: &Tracks) -> Linked {
     }
     let usual = median(seen.iter().copied().filter(|seen| *seen > 0)).unwrap_or(0.0);
     let least = LINK.min(LINK_SHARE * usual).max(1.0);
-    let mut parents: Vec<usize> = (0..images.len()).collect();
-    for ((one, other), count) in shared {
-        if f64::from(count) >= least {
-            let (one, other) = (root(&mut parents, one), root(&mut parents, other));
-            parents[one.max(other)] = one.min(other);
-        }
-    }
-    let mut parts: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
-    (0..images.len()).for_each(|at| parts.entry(root(&mut parents, at)).or_default().push(at));
-    let Some(main) = parts.values().max_by_key(|part| part.len()) else { return found };
+    let links = shared.into_iter().filter(|(_, count)| f64::from(*count) >= least).map(|(pair, _)| pair);
+    let parts = parts(images.len(), links);
+    let Some(main) = parts.iter().max_by_key(|part| part.len()) else { return found };
     // A model that is nothing but pieces has no rest to compare with.
     if 2 * main.len() <= images.len() {
         return found;
     }
     let support = |part: &[usize]| median(part.iter().map(|at| seen[*at])).unwrap_or(0.0);
     let needed = SUPPORTED * support(main);
-    for part in parts.values() {
+    for part in &parts {
         if support(part) < needed {
             part.iter().for_each(|at| found.loose[*at] = true);
         } else {
