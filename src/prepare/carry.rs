@@ -9,6 +9,7 @@ use std::path::PathBuf;
 use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 
+use super::click::Cues;
 use super::depth::DepthMap;
 use super::fit::Fit;
 use super::misplaced::{self, Looks};
@@ -17,10 +18,14 @@ use super::record::{Batch, Inputs};
 use super::splats::Splats;
 use super::{Error, Preparation, Step, Watch, abridged, hole, masks, outline, picture_size, poses};
 use crate::multiview::DepthGrid;
+use crate::scene::doctor::iou;
 use crate::scene::{self, Camera, Scene, View};
 
 /// A view shows a side of the object that no masked view shows if more than this part of the object there is unseen.
 const THIN: f64 = 0.3;
+/// Times that what was drawn is cut at most, and the overlap of two masks (intersection over union) from which on it stays.
+const CUTS: usize = 4;
+const SAME: f64 = 0.98;
 
 /// What an object is carried with.
 struct Carrier<'a> {
@@ -148,13 +153,23 @@ impl<'a> Carrier<'a> {
         watch.turn(self.units)
     }
 
-    /// Masks that were cut by colours alone, cut again by where in space pixels are.
-    fn placed(&self, splats: &mut Splats, given: &BTreeMap<String, Given>) -> Result<BTreeMap<String, Given>, Error> {
+    /// Masks that were cut by colours alone, cut again by where in space pixels are, and by the votes of other views if there are any.
+    fn placed(
+        &self,
+        splats: &mut Splats,
+        given: &BTreeMap<String, Given>,
+        votes: Option<&masks::Votes>,
+    ) -> Result<BTreeMap<String, Given>, Error> {
         let mut all = given.clone();
+        let shares = votes.map(|votes| votes.count(self.fit.positions(), &self.colors));
         for (view, grid) in self.scene.train.iter().zip(&self.grids) {
             let Some(given) = all.get_mut(&view.name).filter(|given| !given.drawn.is_empty()) else { continue };
-            let depths = [DepthMap::of(splats, &view.camera)?, DepthMap::measured(grid, &view.camera)];
-            *given = given.placed(&self.files[&view.name], depths.each_ref())?;
+            let [fit, measured] = [DepthMap::of(splats, &view.camera)?, DepthMap::measured(grid, &view.camera)];
+            let carried = shares.as_ref().map(|shares| shares.carry(splats, &view.camera)).transpose()?;
+            let parts = carried.map(|carried| carried.believed());
+            let carried = parts.as_ref().map(|parts| (parts.as_slice(), view.camera.size));
+            let cues = Cues { depth: Some(&fit), measured: Some(&measured), carried, ..Cues::default() };
+            *given = given.placed(&self.files[&view.name], &cues)?;
         }
         Ok(all)
     }
@@ -201,34 +216,10 @@ impl<'a> Carrier<'a> {
     ) -> Result<Carried, Error> {
         let scene = self.scene;
         let wrong = misplaced::wrong(scene, &self.grids);
-        let mut given = self.placed(splats, given)?;
-        let (voters, misplaced) = misplaced::voters(scene, &wrong, &given)?;
-        let vote = |splats: &mut Splats, given: &BTreeMap<String, Given>, masks: &mut masks::Votes, view: &View| {
-            masks.add(splats, &view.camera, &masks::parts(&given[&view.name].mask, view.camera.size))
-        };
-        let mut votes = masks::Votes::new(splats);
-        for view in &voters {
-            vote(splats, &given, &mut votes, view)?;
-            self.turn(watch)?;
-        }
-        // Masks that were not cut are believed: they may be of things behind one another.
-        let positions = self.fit.positions();
-        let all_cut = given.values().all(|given| given.cut);
-        let behind = if all_cut { votes.behind(positions) } else { vec![false; positions.len()] };
-        let lost = Self::clear_behind(splats, &mut given, &voters, &behind)?;
-        if !lost.is_empty() {
-            votes = masks::Votes::new(splats);
-            for view in &voters {
-                vote(splats, &given, &mut votes, view)?;
-            }
-        }
-        let given = &given;
-        votes.deny(&behind);
-        let mut shares = votes.count(self.fit.positions(), &self.colors);
+        let drawn = given;
         let others: Vec<usize> =
-            (0..scene.train.len()).filter(|at| !given.contains_key(&scene.train[*at].name)).collect();
-        let beside = if others.is_empty() { vec![] } else { self.beside(given) };
-        let carry = |shares: &masks::Shares, splats: &mut Splats| -> Result<Vec<masks::Carried>, Error> {
+            (0..scene.train.len()).filter(|at| !drawn.contains_key(&scene.train[*at].name)).collect();
+        let carry = |shares: &masks::Shares, beside: &[Vec<bool>], splats: &mut Splats| {
             let carried = others.iter().map(|at| {
                 let mut carried = shares.carry(splats, &scene.train[*at].camera)?;
                 for (part, _) in carried.object.iter_mut().zip(&beside[*at]).filter(|(_, beside)| **beside) {
@@ -236,48 +227,78 @@ impl<'a> Carrier<'a> {
                 }
                 Ok(carried)
             });
-            carried.collect()
+            carried.collect::<Result<Vec<masks::Carried>, Error>>()
         };
-        let at = |name: &String| scene.train.iter().position(|view| view.name == *name);
-        let learnt = given.iter().filter_map(|(name, given)| Some((&self.pictures[at(name)?], &given.mask)));
-        let looks = Looks::of(learnt);
         // A view's mask, and whether it was moved.
-        let refine = |carried: &masks::Carried, at: usize| -> (GrayImage, bool) {
+        let refine = |looks: &Option<Looks>, carried: &masks::Carried, at: usize| -> (GrayImage, bool) {
             let (size, picture) = (scene.train[at].camera.size, &self.pictures[at]);
             let rough = masks::threshold(&carried.object, size, size, masks::OBJECT);
             let shift = looks.as_ref().and_then(|looks| looks.shift(picture, &rough));
             let moved = shift.map(|shift| misplaced::moved(&carried.object, size, shift));
             (outline::of(picture, moved.as_ref().unwrap_or(&carried.object), size), moved.is_some())
         };
-        let mut carried = carry(&shares, splats)?;
-        // A mask in a view whose camera is wrong would help no other.
-        let helps = |at: &usize| !wrong.contains(scene.train[*at].name.as_str());
-        let thin = others.iter().zip(&carried).filter(|(at, _)| helps(at));
-        let thin: Vec<(f64, usize)> = thin.filter_map(|(at, carried)| Some((carried.thinness()?, *at))).collect();
-        // What the first views miss of the object's other sides the masks of more views have between them.
-        let every = others.len().div_ceil(outline::VOTERS).max(1);
-        for _ in 0..outline::ROUNDS {
-            let some = (0..others.len()).into_par_iter().step_by(every);
-            let outlines: Vec<_> = some.map(|i| (&scene.train[others[i]], refine(&carried[i], others[i]))).collect();
-            let own = voters.iter().map(|view| (*view, &given[&view.name].mask));
-            let found = outlines.iter().filter(|(view, (_, moved))| !moved && !wrong.contains(view.name.as_str()));
-            let found = found.map(|(view, (mask, _))| (*view, mask));
+        let positions = self.fit.positions();
+        let mut given = self.placed(splats, drawn, None)?;
+        let (voters, misplaced) = misplaced::voters(scene, &wrong, &given)?;
+        self.units += voters.len() as u64;
+        watch.turn(self.units)?;
+        let mut cuts = 1;
+        let (lost, thin, carried, looks) = loop {
+            let own = |splats: &mut Splats, given: &BTreeMap<String, Given>, votes: &mut masks::Votes| {
+                voters.iter().try_for_each(|view| {
+                    votes.add(splats, &view.camera, &masks::parts(&given[&view.name].mask, view.camera.size))
+                })
+            };
             let mut votes = masks::Votes::new(splats);
-            for (view, mask) in own.chain(found) {
+            own(splats, &given, &mut votes)?;
+            // Masks that were not cut are believed: they may be of things behind one another.
+            let all_cut = given.values().all(|given| given.cut);
+            let behind = if all_cut { votes.behind(positions) } else { vec![false; positions.len()] };
+            let lost = Self::clear_behind(splats, &mut given, &voters, &behind)?;
+            if !lost.is_empty() {
+                votes = masks::Votes::new(splats);
+                own(splats, &given, &mut votes)?;
+            }
+            votes.deny(&behind);
+            let beside = if others.is_empty() { vec![] } else { self.beside(&given) };
+            let at = |name: &String| scene.train.iter().position(|view| view.name == *name);
+            let learnt = given.iter().filter_map(|(name, given)| Some((&self.pictures[at(name)?], &given.mask)));
+            let looks = Looks::of(learnt);
+            let carried = carry(&votes.count(positions, &self.colors), &beside, splats)?;
+            // A mask in a view whose camera is wrong would help no other.
+            let helps = |at: &usize| !wrong.contains(scene.train[*at].name.as_str());
+            let thin = others.iter().zip(&carried).filter(|(at, _)| helps(at));
+            let thin: Vec<(f64, usize)> = thin.filter_map(|(at, carried)| Some((carried.thinness()?, *at))).collect();
+            // What the first views miss of the object's other sides the masks of more views have between them.
+            let some = (0..others.len()).into_par_iter().step_by(others.len().div_ceil(outline::VOTERS).max(1));
+            let outlines = some.map(|i| (&scene.train[others[i]], refine(&looks, &carried[i], others[i])));
+            let outlines: Vec<(&View, (GrayImage, bool))> = outlines.collect();
+            let found = outlines.iter().filter(|(view, (_, moved))| !moved && !wrong.contains(view.name.as_str()));
+            let mut votes = masks::Votes::new(splats);
+            for (view, (mask, _)) in found {
                 votes.add(splats, &view.camera, &masks::parts(mask, view.camera.size))?;
                 watch.go_on()?;
             }
             votes.deny(&behind);
-            shares = votes.count(self.fit.positions(), &self.colors);
-            carried = carry(&shares, splats)?;
-        }
+            if cuts < CUTS && !others.is_empty() {
+                cuts += 1;
+                let again = self.placed(splats, drawn, Some(&votes))?;
+                if again.iter().any(|(name, again)| iou(&again.mask, &given[name].mask) < SAME) {
+                    given = again;
+                    continue;
+                }
+            }
+            own(splats, &given, &mut votes)?;
+            votes.deny(&behind);
+            break (lost, thin, carry(&votes.count(positions, &self.colors), &beside, splats)?, looks);
+        };
         let mut outlines: Vec<(GrayImage, bool)> =
-            others.par_iter().zip(&carried).map(|(at, carried)| refine(carried, *at)).collect();
-        self.clear(given, &others, &mut outlines);
+            others.par_iter().zip(&carried).map(|(at, carried)| refine(&looks, carried, *at)).collect();
+        self.clear(&given, &others, &mut outlines);
         let moved = others.iter().zip(&outlines).filter(|(_, (_, moved))| *moved).map(|(at, _)| *at);
         let moved: Vec<usize> = moved.collect();
         let names: Vec<&str> = voters.iter().map(|view| view.name.as_str()).collect();
-        let masks = self.large(given, &names, outlines, watch)?;
+        let masks = self.large(&given, &names, outlines, watch)?;
         let shown = masks.iter().filter(|(mask, _)| mask.as_raw().iter().any(|v| *v != 0)).count();
         let lost = (!lost.is_empty()).then(|| {
             let names = abridged(&lost);

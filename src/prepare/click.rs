@@ -121,6 +121,8 @@ const BESIDE_PART: f64 = 0.25;
 const REACH: f64 = 6.0;
 /// The weight of being nearer to it than to what says otherwise, in nats.
 const AGAIN: f64 = 8.0;
+/// The weight of what other views' masks say of a pixel, in nats.
+const VOTES: f64 = 6.0;
 /// Nearer than this is certain.
 const SURE: f64 = 0.6;
 /// The weight of leaving the rest as it is, in nats.
@@ -371,6 +373,8 @@ struct Pixels {
     amid: Vec<f64>,
     /// By how much where it lies off planes that go on outside a box speaks for the object, in nats; below zero on one.
     raised: Vec<f64>,
+    /// By how much other views' masks speak for the object, in nats.
+    carried: Vec<f64>,
 }
 
 impl Pixels {
@@ -422,7 +426,14 @@ impl Pixels {
                 Some(([x * depth, y * depth, depth], depth.ln()))
             })
             .collect::<Vec<_>>();
+        let voted = |i: usize| {
+            let Some((parts, from)) = cues.carried else { return 0.0 };
+            let place = std::array::from_fn(|k| at(i)[k] * f64::from(from[k]));
+            let [part] = resample::bilinear(from, place, |pixel| [f64::from(parts[pixel])]);
+            VOTES * (2.0 * part - 1.0)
+        };
         let mut pixels = Self {
+            carried: (0..count).map(voted).collect(),
             size: to.map(|n| n as usize),
             colors: small.pixels().map(|p| p.0.map(f64::from)).collect(),
             places,
@@ -738,12 +749,15 @@ fn cut(
             (Some(before), ..) => before[i],
             (None, Some(within), _) => within[i],
             (None, None, Some(enclosed)) => enclosed[i] > 0.0,
-            _ if boxed => !pixels.outside[i] && pixels.amid[i] >= 0.0 && pixels.raised[i] >= 0.0,
+            _ if boxed => {
+                let [amid, raised] = [&pixels.amid, &pixels.raised].map(|of| of[i] + pixels.carried[i]);
+                !pixels.outside[i] && amid >= 0.0 && raised >= 0.0
+            }
             _ => near.as_ref().is_some_and(|near| near[i] > NEARER),
         })
         .collect();
     let says = |of: &Option<Vec<f64>>, i: usize| of.as_ref().map_or(0.0, |of| of[i]);
-    let beside = |i: usize| NEAR * says(&near, i) + ENCLOSED * says(&enclosed, i) + pixels.amid[i];
+    let beside = |i: usize| NEAR * says(&near, i) + ENCLOSED * says(&enclosed, i) + pixels.amid[i] + pixels.carried[i];
     let object = solve(&pixels, object, ROUNDS[pass], beside, |_| true)?;
     whole(picture, window, small, joined(object, &pixels, boxed))
 }

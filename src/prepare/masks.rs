@@ -143,19 +143,10 @@ impl Votes {
         let place = |a: usize| -> [f32; 6] {
             std::array::from_fn(|i| if i < 3 { positions[a][i] / (REACH * spacing) } else { colors[a][i - 3] / COLOR })
         };
-        let tree: ImmutableKdTree<f32, 6> =
-            ImmutableKdTree::new_from_slice(&seen.iter().map(|a| place(*a)).collect::<Vec<_>>());
-        let around = |a: usize| -> f32 {
-            let Some(count) = std::num::NonZero::new(NEIGHBOURS.min(seen.len())) else { return 0.0 };
-            let near = tree.nearest_n::<SquaredEuclidean>(&place(a), count);
-            let votes = near.iter().map(|n| of_anchors[seen[n.item as usize]]);
-            votes.map(|[inside, all]| inside / all).sum::<f32>() / count.get() as f32
-        };
         let is_seen = |a: usize| of_anchors[a][1] > SEEN;
-        let part = |a: usize| if is_seen(a) { of_anchors[a][0] / of_anchors[a][1] } else { around(a) };
-        let mut priors: Vec<f32> = (0..positions.len()).into_par_iter().map(part).collect();
+        let part = |a: usize| of_anchors[a][0] / of_anchors[a][1];
         let inside = |a: usize| if is_seen(a) { of_anchors[a][0] } else { 0.0 };
-        let (object, other): (Vec<usize>, Vec<usize>) = seen.iter().partition(|a| priors[**a] > OBJECT);
+        let (object, other): (Vec<usize>, Vec<usize>) = seen.iter().partition(|a| part(**a) > OBJECT);
         let at = |of: &[usize], values: &[[f32; 3]]| {
             ImmutableKdTree::<f32, 3>::new_from_slice(&of.iter().map(|a| values[*a]).collect::<Vec<_>>())
         };
@@ -170,9 +161,22 @@ impl Votes {
         let ball = plane::ball(&points(&object));
         let extent = ball.map_or(0.0, |(_, radius)| 2.0 * radius as f32);
         // Where all was seen nobody asks.
-        let asked = ball.filter(|_| (0..positions.len()).any(|a| !is_seen(a) && priors[a] > 0.0));
+        let asked = ball.filter(|_| seen.len() < positions.len());
         let support = asked.and_then(|ball| self.support(&points(&object), points(&other).into_iter(), ball));
         let underfoot = |a: usize| support.as_ref().is_some_and(|(s, height)| s.local(point(positions[a])).z < *height);
+        // Of what rises from the plane that says nothing which lies on it.
+        let risen: Vec<usize> = seen.iter().copied().filter(|a| !underfoot(*a)).collect();
+        let tree =
+            |of: &[usize]| ImmutableKdTree::<f32, 6>::new_from_slice(&of.iter().map(|a| place(*a)).collect::<Vec<_>>());
+        let trees = [(tree(&seen), &seen), (tree(&risen), &risen)];
+        let around = |a: usize| -> f32 {
+            let (tree, of) = &trees[usize::from(!underfoot(a))];
+            let Some(count) = std::num::NonZero::new(NEIGHBOURS.min(of.len())) else { return 0.0 };
+            let near = tree.nearest_n::<SquaredEuclidean>(&place(a), count);
+            near.iter().map(|n| part(of[n.item as usize])).sum::<f32>() / count.get() as f32
+        };
+        let prior = |a: usize| if is_seen(a) { part(a) } else { around(a) };
+        let mut priors: Vec<f32> = (0..positions.len()).into_par_iter().map(prior).collect();
         let framed = |a: usize| self.cameras.iter().any(|c| c.within(positions[a].map(f64::from)).is_some());
         let possible = |a: usize| {
             let near = || distance(&places, &positions[a], 1) <= BEYOND * extent;
@@ -362,6 +366,11 @@ impl Shares {
 }
 
 impl Carried {
+    /// `[pixel]` the object's part, as far as the masked views know: a half where they do not.
+    pub fn believed(&self) -> Vec<f32> {
+        self.object.iter().zip(&self.evidence).map(|(object, evidence)| 0.5 + evidence * (object - 0.5)).collect()
+    }
+
     /// Which part of the object's pixels the masked views have not seen; nothing where the object is out of view.
     pub fn thinness(&self) -> Option<f64> {
         let object = || self.object.iter().zip(&self.evidence).filter(|(object, _)| **object > 0.5);
@@ -613,6 +622,31 @@ mod tests {
         let taken = (0..all.len()).filter(|a| shares.object[*a] > OBJECT && !all[*a].2).count();
         assert_eq!(taken, 0, "of 80");
         assert!((0..256).all(|a| shares.object[a] > OBJECT));
+    }
+
+    /// A dark box on a cloth. Its far side, which no masked view has seen, is of the cloth's colour, but rises from it: it is the object.
+    #[test]
+    fn what_rises_from_the_cloth_is_the_object() {
+        let (dark, cloth) = ([0.2, 0.2, 0.25], [0.3, 0.2, 0.3]);
+        let grid = |n: [i32; 3], from: [f32; 3], color: [f32; 3], seen: bool| {
+            let at = move |i: i32| [i % n[0], i / n[0] % n[1], i / n[0] / n[1]];
+            let point = move |i: i32| -> [f32; 3] { std::array::from_fn(|k| from[k] + 0.05 * at(i)[k] as f32) };
+            (0..n.iter().product()).map(move |i| (point(i), color, seen))
+        };
+        let object = grid([8, 8, 4], [-0.2, 0.0, 2.0], dark, true);
+        let top = grid([40, 1, 10], [-1.0, 0.4, 1.6], cloth, true);
+        let unseen =
+            grid([8, 8, 1], [-0.2, 0.0, 2.2], cloth, false).chain(grid([8, 1, 1], [-0.2, 0.4, 2.2], cloth, false));
+        let all: Vec<_> = object.chain(top).chain(unseen).collect();
+        let positions: Vec<[f32; 3]> = all.iter().map(|of| of.0).collect();
+        let colors: Vec<[f32; 3]> = all.iter().map(|of| of.1).collect();
+        let votes = |kind: bool| -> Vec<f32> {
+            all.iter().map(|of| if of.2 && (kind || of.1 == dark) { 10.0 } else { 0.0 }).collect()
+        };
+        let shares =
+            Votes { inside: votes(false), all: votes(true), cameras: vec![camera()] }.count(&positions, &colors);
+        let taken: Vec<usize> = (656..all.len()).filter(|a| shares.object[*a] > OBJECT).collect();
+        assert_eq!(taken, (656..720).collect::<Vec<_>>(), "its side, and not its foot");
     }
 
     /// A piece behind the object, seen through its gaps, is none of it. One beside it may be of it, and one that has as much of the mask.

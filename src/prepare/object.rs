@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 use image::{GrayImage, RgbImage};
 
 use super::click::{self, Cues, Mark};
-use super::depth::DepthMap;
 use super::poses::Capture;
 use super::record::{self, Folder};
 use super::{Error, graph_cut, masks, picture_size};
@@ -162,6 +161,9 @@ impl Drawn {
             Self::Box(bounds) => click::from_box(picture, *bounds, cues)?,
             Self::Marks(marks) => {
                 let size = [picture.width(), picture.height()];
+                // Clicks mean what is there, whatever others show.
+                let outlined = marks.iter().all(|mark| mark.bounds().is_some());
+                let cues = &Cues { carried: cues.carried.filter(|_| outlined), ..*cues };
                 let mask = click::mask(&resample::photograph(picture, click::working(size)), marks, cues);
                 let own = [mask.width(), mask.height()];
                 masks::threshold(&masks::parts(&mask, own), own, size, 0.5)
@@ -177,15 +179,14 @@ impl Given {
         Self { mask, from, drawn: vec![], cut: false }
     }
 
-    /// The mask cut again from what was drawn in its photograph, by places in space as well; the same where nothing was drawn
+    /// The mask cut again from what was drawn in its photograph, by what is known besides its colours; the same where nothing was drawn
     /// or nothing would be left.
     ///
     /// # Errors
     /// A photograph that cannot be read.
-    pub fn placed(&self, photograph: &Path, [fit, measured]: [&DepthMap; 2]) -> Result<Self, Error> {
+    pub fn placed(&self, photograph: &Path, cues: &Cues<'_>) -> Result<Self, Error> {
         let picture = scene::photograph(photograph, 1)?;
-        let cues = Cues { depth: Some(fit), measured: Some(measured), ..Cues::default() };
-        let cuts = self.drawn.iter().map(|drawn| drawn.cut(&picture, &cues));
+        let cuts = self.drawn.iter().map(|drawn| drawn.cut(&picture, cues));
         let cuts: Option<Vec<GrayImage>> = cuts.collect();
         let Some(mask) = cuts.and_then(|cuts| cuts.into_iter().reduce(joined)) else { return Ok(self.clone()) };
         Ok(Self { mask, from: format!("{}, by places in space", self.from), ..self.clone() })

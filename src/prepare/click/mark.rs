@@ -99,7 +99,7 @@ impl Mark {
     }
 
     /// x0, y0, x1, y1 of a box or a lasso; nothing for other marks.
-    pub(super) fn bounds(&self) -> Option<[f64; 4]> {
+    pub fn bounds(&self) -> Option<[f64; 4]> {
         match self {
             Self::Box { bounds } => Some(*bounds),
             Self::Lasso { points } => {
