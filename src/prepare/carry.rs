@@ -164,7 +164,7 @@ impl<'a> Carrier<'a> {
         let shares = votes.map(|votes| votes.count(self.fit.positions(), &self.colors));
         for (view, grid) in self.scene.train.iter().zip(&self.grids) {
             let Some(given) = all.get_mut(&view.name).filter(|given| !given.drawn.is_empty()) else { continue };
-            let [fit, measured] = [DepthMap::of(splats, &view.camera)?, DepthMap::measured(grid, &view.camera)];
+            let [fit, measured] = [DepthMap::of(splats, &view.camera)?, DepthMap::confirmed(grid, &view.camera)];
             let carried = shares.as_ref().map(|shares| shares.carry(splats, &view.camera)).transpose()?;
             let parts = carried.map(|carried| carried.believed());
             let carried = parts.as_ref().map(|parts| (parts.as_slice(), view.camera.size));

@@ -55,6 +55,12 @@ impl DepthMap {
         Self { camera: *camera, depth: depth.collect() }
     }
 
+    /// Of it what other views confirm: the rest may be the depth of planes that were drawn out beyond what is on them.
+    pub fn confirmed(grid: &DepthGrid, camera: &Camera) -> Self {
+        let known = grid.depth.iter().zip(&grid.confirmed).map(|(z, confirmed)| if *confirmed { *z } else { f64::NAN });
+        Self::measured(&DepthGrid { depth: known.collect(), ..grid.clone() }, camera)
+    }
+
     /// The same, where nothing is known far behind all that is: a fit shows nothing where little was seen, which is not the object.
     pub fn far(&self) -> Self {
         let most = self.depth.iter().copied().filter(|z| z.is_finite()).fold(0.0, f32::max);
@@ -266,7 +272,7 @@ mod tests {
         DepthMap { camera, depth: vec![depth; 20 * 16] }
     }
 
-    /// Every pixel has the depth of the site it falls into; of a camera that is wrong nothing is known.
+    /// Every pixel has the depth of the site it falls into, if need be where others confirm that; of a camera that is wrong nothing is known.
     #[test]
     fn measured_depth_is_that_of_the_site() {
         let camera = map(0.0, 4.0).camera;
@@ -278,6 +284,10 @@ mod tests {
         // A picture twice as large shows the same.
         let large = DepthMap::measured(&grid, &camera.scaled([40, 32]));
         assert_eq!((large.depth.len(), large.depth[11 * 40 + 15]), (1280, 24.0));
+        grid.confirmed[11] = false;
+        let confirmed = DepthMap::confirmed(&grid, &camera).depth;
+        assert_eq!((confirmed[41], confirmed[44]), (11.0, 13.0));
+        assert!([42, 43, 62, 63].iter().all(|pixel| confirmed[*pixel].is_nan()));
         grid.trusted = false;
         assert!(DepthMap::measured(&grid, &camera).depth.iter().all(|z| z.is_nan()));
     }

@@ -279,7 +279,7 @@ impl Carrier {
         for (i, ((view, grid), number)) in scene.train.iter().zip(&grids).zip(&numbers).enumerate() {
             check(job)?;
             if let Some(number) = number {
-                let depths = [DepthMap::of(&mut splats, &view.camera)?, DepthMap::measured(grid, &view.camera)];
+                let depths = [DepthMap::of(&mut splats, &view.camera)?, DepthMap::confirmed(grid, &view.camera)];
                 session.knows(*number, depths);
             }
             session.at(i as u64 + 1);

@@ -174,7 +174,7 @@ fn measure(request: &Request, truth: &Path, every: usize) -> Found {
         let picture = small(&files[&view.name]);
         let own = truth(&view.name, [picture.width(), picture.height()]);
         let depth = DepthMap::of(&mut splats, &view.camera).expect("a depth");
-        let measured = DepthMap::measured(&grids[i], &view.camera);
+        let measured = DepthMap::confirmed(&grids[i], &view.camera);
         let with = Cues { depth: Some(&depth), ..Cues::default() };
         let by_measure = Cues { measured: Some(&measured), ..with };
         for (sums, cues, what) in [
