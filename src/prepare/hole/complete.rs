@@ -115,7 +115,8 @@ pub fn astray(grids: &[DepthGrid], cameras: &[Camera], masks: &[GrayImage]) -> V
 }
 
 /// Adds to the masks (as large as the pictures of these cameras) where points of the object fall that most other masks cover:
-/// a mask that stops short of the object is completed by what all views know of it. Returns the views whose masks grew.
+/// a mask that stops short of the object is completed by what all views know of it. Where a camera is wrong nobody knows where the object
+/// is in its picture. Returns the views whose masks grew.
 pub fn complete(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage]) -> Vec<usize> {
     let inside = inside(grids, cameras, masks);
     let Object(points) = Object::new(grids, &inside);
@@ -134,7 +135,8 @@ pub fn complete(grids: &[DepthGrid], cameras: &[Camera], masks: &mut [GrayImage]
                 let shows = !inside[site] && !hides(grid, *point);
                 count[site] = [count[site][0] + 1, count[site][1] + u32::from(shows && looks(site, *color))];
             }
-            let object = |site: usize| count[site][1] >= FEWEST_POINTS && 2 * count[site][1] >= count[site][0];
+            let object =
+                |site: usize| grid.trusted && count[site][1] >= FEWEST_POINTS && 2 * count[site][1] >= count[site][0];
             beside(grid, inside, object)
         })
         .collect();
@@ -210,12 +212,17 @@ mod tests {
             // The object's middle is at x = 24 - 40 * 0.3 / 2.
             pixel.0 = if x < 18 { [0] } else { pixel.0 };
         }
+        let mut short = masks.clone();
         assert_eq!(complete(&grids, &cameras, &mut masks), [3]);
         let left = whole[3].pixels().zip(masks[3].pixels()).filter(|(whole, now)| whole.0[0] != 0 && now.0[0] == 0);
         let missing = whole[3].pixels().filter(|p| p.0[0] != 0).count() / 2;
         // Its rim is left, where no point of the object is deep enough in the others' masks.
         assert!(left.count() * 2 < missing, "of {missing}");
         assert!(masks.iter().zip(&whole).enumerate().all(|(view, (now, whole))| view == 3 || now == whole));
+        // Not that of a wrong camera.
+        let mut wrong = grids.clone();
+        wrong[3].trusted = false;
+        assert!(complete(&wrong, &cameras, &mut short).is_empty());
     }
 
     /// The wall beside the object is in one mask, which is far too wide, and behind the object in three others, so that most masks cover it:
