@@ -47,21 +47,26 @@ impl DepthMap {
 
     /// The measured depth of a view with this camera; nothing is known of one whose camera is wrong.
     pub fn measured(grid: &DepthGrid, camera: &Camera) -> Self {
+        Self::of_sites(grid, camera, |_| true)
+    }
+
+    /// The measured depth that other views confirm: the rest may be that of planes which were drawn out beyond what is on them.
+    pub fn confirmed(grid: &DepthGrid, camera: &Camera) -> Self {
+        Self::of_sites(grid, camera, |site| grid.confirmed[site])
+    }
+
+    /// The depth of the sites of which this `counts`, of a camera that is right.
+    fn of_sites(grid: &DepthGrid, camera: &Camera, counts: impl Fn(usize) -> bool) -> Self {
         let one = |pixel: usize| -> Option<f32> {
             let [x, y] = grid.place(camera.unproject(camera.pixel_center(pixel)).filter(|_| grid.trusted)?);
-            Some(grid.depth[grid.site(x.floor() as i64, y.floor() as i64)?] as f32)
+            let site = grid.site(x.floor() as i64, y.floor() as i64)?;
+            counts(site).then(|| grid.depth[site] as f32)
         };
         let depth = (0..(camera.size[0] * camera.size[1]) as usize).map(|pixel| one(pixel).unwrap_or(f32::NAN));
         Self { camera: *camera, depth: depth.collect() }
     }
 
-    /// Of it what other views confirm: the rest may be the depth of planes that were drawn out beyond what is on them.
-    pub fn confirmed(grid: &DepthGrid, camera: &Camera) -> Self {
-        let known = grid.depth.iter().zip(&grid.confirmed).map(|(z, confirmed)| if *confirmed { *z } else { f64::NAN });
-        Self::measured(&DepthGrid { depth: known.collect(), ..grid.clone() }, camera)
-    }
-
-    /// The same, where nothing is known far behind all that is: a fit shows nothing where little was seen, which is not the object.
+    /// This depth, and where nothing is known one far behind all that is: a fit shows nothing where little was seen, which is not the object.
     pub fn far(&self) -> Self {
         let most = self.depth.iter().copied().filter(|z| z.is_finite()).fold(0.0, f32::max);
         let depth = self.depth.iter().map(|z| if z.is_finite() { *z } else { FAR * most }).collect();
@@ -272,7 +277,7 @@ mod tests {
         DepthMap { camera, depth: vec![depth; 20 * 16] }
     }
 
-    /// Every pixel has the depth of the site it falls into, if need be where others confirm that; of a camera that is wrong nothing is known.
+    /// Every pixel has the depth of the site it falls into, and of confirmed depth that of confirmed sites; of a wrong camera nothing is known.
     #[test]
     fn measured_depth_is_that_of_the_site() {
         let camera = map(0.0, 4.0).camera;

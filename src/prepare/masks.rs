@@ -568,29 +568,43 @@ mod tests {
         assert!(shares.object[..14].iter().all(|share| *share > 0.9), "{:?}", &shares.object[..30]);
     }
 
+    /// Place and colour of an anchor, and whether the masked view has seen it.
+    type Anchor = ([f32; 3], [f32; 3], bool);
+
+    /// The colour of an object.
+    const DARK: [f32; 3] = [0.2, 0.2, 0.25];
+
+    /// A block of so many anchors along each axis.
+    fn grid(n: [i32; 3], from: [f32; 3], color: [f32; 3], seen: bool) -> impl Iterator<Item = Anchor> {
+        (0..n.iter().product()).map(move |i| {
+            let at = [i % n[0], i / n[0] % n[1], i / n[0] / n[1]];
+            (std::array::from_fn(|k| from[k] + 0.05 * at[k] as f32), color, seen)
+        })
+    }
+
+    /// `[anchor]` whether it is the object, by one view whose mask has all of [`DARK`] that it has seen.
+    fn objects(all: &[Anchor]) -> Vec<bool> {
+        let votes = |kind: bool| -> Vec<f32> {
+            all.iter().map(|of| if of.2 && (kind || of.1 == DARK) { 10.0 } else { 0.0 }).collect()
+        };
+        let votes = Votes { inside: votes(false), all: votes(true), cameras: vec![camera()] };
+        let [positions, colors] =
+            [|of: &Anchor| of.0, |of: &Anchor| of.1].map(|of| all.iter().map(of).collect::<Vec<_>>());
+        votes.count(&positions, &colors).object.into_iter().map(|share| share > OBJECT).collect()
+    }
+
     /// A dark box on a grey floor, in its shadow behind it a piece of the floor as dark as the box that no masked view has seen: it is
     /// the floor. At half of the box's height it would be the object; below the floor nothing is.
     #[test]
     fn what_it_stands_on_is_none_of_the_object() {
-        let (dark, grey) = ([0.2, 0.2, 0.25], [0.6; 3]);
-        let grid = |n: [i32; 3], from: [f32; 3]| {
-            let at = move |i: i32| [i % n[0], i / n[0] % n[1], i / n[0] / n[1]];
-            (0..n.iter().product()).map(move |i| std::array::from_fn(|k| from[k] + 0.05 * at(i)[k] as f32))
-        };
+        let grey = [0.6; 3];
         let behind = |height: f32| {
-            let object = grid([8, 8, 4], [-0.2, 0.0, 2.0]).map(|at: [f32; 3]| (at, dark, true));
-            let floor = grid([40, 1, 10], [-1.0, 0.4, 1.5]).map(|at| (at, grey, true));
-            let shadow = grid([8, 1, 6], [-0.2, 0.4 - height, 2.2]).map(|at| (at, dark, false));
+            let object = grid([8, 8, 4], [-0.2, 0.0, 2.0], DARK, true);
+            let floor = grid([40, 1, 10], [-1.0, 0.4, 1.5], grey, true);
+            let shadow = grid([8, 1, 6], [-0.2, 0.4 - height, 2.2], DARK, false);
             let all: Vec<_> = object.chain(floor).chain(shadow).collect();
-            let positions: Vec<[f32; 3]> = all.iter().map(|of| of.0).collect();
-            let colors: Vec<[f32; 3]> = all.iter().map(|of| of.1).collect();
-            let votes = |kind: bool| -> Vec<f32> {
-                all.iter().map(|of| if of.2 && (kind || of.1 == dark) { 10.0 } else { 0.0 }).collect()
-            };
-            let votes = Votes { inside: votes(false), all: votes(true), cameras: vec![camera()] };
-            let shares = votes.count(&positions, &colors);
-            let object = (0..all.len()).filter(|a| shares.object[*a] > OBJECT);
-            object.fold([0; 2], |[seen, not], a| if all[a].2 { [seen + 1, not] } else { [seen, not + 1] })
+            let found = objects(&all).into_iter().zip(&all).filter(|(object, _)| *object);
+            found.fold([0; 2], |[seen, not], (_, of)| if of.2 { [seen + 1, not] } else { [seen, not + 1] })
         };
         assert_eq!([behind(0.0), behind(0.2), behind(-0.1)], [[256, 0], [256, 48], [256, 0]]);
     }
@@ -599,12 +613,7 @@ mod tests {
     /// the far side, is dark: it is none of the object, neither on the table nor below its edge.
     #[test]
     fn the_cloth_of_a_small_table_is_none_of_the_object() {
-        let (dark, grey) = ([0.2, 0.2, 0.25], [0.6; 3]);
-        let grid = |n: [i32; 3], from: [f32; 3], color: [f32; 3], seen: bool| {
-            let at = move |i: i32| [i % n[0], i / n[0] % n[1], i / n[0] / n[1]];
-            let point = move |i: i32| -> [f32; 3] { std::array::from_fn(|k| from[k] + 0.05 * at(i)[k] as f32) };
-            (0..n.iter().product()).map(move |i| (point(i), color, seen))
-        };
+        let (dark, grey) = (DARK, [0.6; 3]);
         let object = grid([8, 8, 4], [-0.2, 0.0, 2.0], dark, true);
         let top = grid([16, 1, 6], [-0.4, 0.4, 1.9], grey, true);
         let front = grid([16, 3, 2], [-0.4, 0.45, 1.8], grey, true);
@@ -612,40 +621,23 @@ mod tests {
         let unseen =
             grid([8, 1, 4], [-0.2, 0.4, 2.2], dark, false).chain(grid([8, 6, 1], [-0.2, 0.45, 2.35], dark, false));
         let all: Vec<_> = object.chain(top).chain(front).chain(sides).chain(unseen).collect();
-        let positions: Vec<[f32; 3]> = all.iter().map(|of| of.0).collect();
-        let colors: Vec<[f32; 3]> = all.iter().map(|of| of.1).collect();
-        let votes = |kind: bool| -> Vec<f32> {
-            all.iter().map(|of| if of.2 && (kind || of.1 == dark) { 10.0 } else { 0.0 }).collect()
-        };
-        let shares =
-            Votes { inside: votes(false), all: votes(true), cameras: vec![camera()] }.count(&positions, &colors);
-        let taken = (0..all.len()).filter(|a| shares.object[*a] > OBJECT && !all[*a].2).count();
+        let object = objects(&all);
+        let taken = (0..all.len()).filter(|a| object[*a] && !all[*a].2).count();
         assert_eq!(taken, 0, "of 80");
-        assert!((0..256).all(|a| shares.object[a] > OBJECT));
+        assert!((0..256).all(|a| object[a]));
     }
 
     /// A dark box on a cloth. Its far side, which no masked view has seen, is of the cloth's colour, but rises from it: it is the object.
     #[test]
     fn what_rises_from_the_cloth_is_the_object() {
-        let (dark, cloth) = ([0.2, 0.2, 0.25], [0.3, 0.2, 0.3]);
-        let grid = |n: [i32; 3], from: [f32; 3], color: [f32; 3], seen: bool| {
-            let at = move |i: i32| [i % n[0], i / n[0] % n[1], i / n[0] / n[1]];
-            let point = move |i: i32| -> [f32; 3] { std::array::from_fn(|k| from[k] + 0.05 * at(i)[k] as f32) };
-            (0..n.iter().product()).map(move |i| (point(i), color, seen))
-        };
+        let (dark, cloth) = (DARK, [0.3, 0.2, 0.3]);
         let object = grid([8, 8, 4], [-0.2, 0.0, 2.0], dark, true);
         let top = grid([40, 1, 10], [-1.0, 0.4, 1.6], cloth, true);
         let unseen =
             grid([8, 8, 1], [-0.2, 0.0, 2.2], cloth, false).chain(grid([8, 1, 1], [-0.2, 0.4, 2.2], cloth, false));
         let all: Vec<_> = object.chain(top).chain(unseen).collect();
-        let positions: Vec<[f32; 3]> = all.iter().map(|of| of.0).collect();
-        let colors: Vec<[f32; 3]> = all.iter().map(|of| of.1).collect();
-        let votes = |kind: bool| -> Vec<f32> {
-            all.iter().map(|of| if of.2 && (kind || of.1 == dark) { 10.0 } else { 0.0 }).collect()
-        };
-        let shares =
-            Votes { inside: votes(false), all: votes(true), cameras: vec![camera()] }.count(&positions, &colors);
-        let taken: Vec<usize> = (656..all.len()).filter(|a| shares.object[*a] > OBJECT).collect();
+        let object = objects(&all);
+        let taken: Vec<usize> = (656..all.len()).filter(|a| object[*a]).collect();
         assert_eq!(taken, (656..720).collect::<Vec<_>>(), "its side, and not its foot");
     }
 

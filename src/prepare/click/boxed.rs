@@ -181,7 +181,8 @@ mod tests {
         assert!(fogged <= alone + 50, "{fogged}, {alone} by colours alone");
     }
 
-    /// The same book, where nothing is measured: the masks of other views leave it out, and fill a hole in the vase. Half votes say nothing.
+    /// Votes of other views leave a book beside a vase out of its box, and fill a hole in the vase, where nothing is measured. Half votes say
+    /// nothing.
     #[test]
     fn other_views_say_what_is_in_a_box() {
         let vase = |x: f64, y: f64| (x - 80.0).powi(2) + (y - 70.0).powi(2) < 30.0 * 30.0;
