@@ -3,7 +3,7 @@
 //! A mask says of every pixel whether it is of its object, so that each object's masks vote by themselves: who marks one object
 //! in one photograph and another one in the next does not say that the first is not there.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use image::{GrayImage, RgbImage};
@@ -51,6 +51,37 @@ struct Carried {
     shown: usize,
     /// What was found out.
     notes: Vec<String>,
+}
+
+/// The views of a scene by what they say of an object.
+struct Views<'a> {
+    /// Those whose given masks vote.
+    voters: Vec<&'a View>,
+    /// Indices of those without a given mask.
+    others: Vec<usize>,
+    /// Names of those whose cameras are wrong.
+    wrong: BTreeSet<&'a str>,
+}
+
+impl Views<'_> {
+    /// Whether a mask of this view says something of the other views.
+    fn helps(&self, scene: &Scene, at: usize) -> bool {
+        !self.wrong.contains(scene.train[at].name.as_str())
+    }
+}
+
+/// An object as its given masks alone show it.
+struct First<'a> {
+    /// `[anchor]` whether it is behind the object and apart from it.
+    behind: Vec<bool>,
+    /// Names of the views whose masks lost what is behind.
+    lost: Vec<&'a str>,
+    /// `[view][pixel]` whether what is there is none of the object.
+    beside: Vec<Vec<bool>>,
+    /// Colours of the object and of what is around it.
+    looks: Option<Looks>,
+    /// `[other view]` the object.
+    carried: Vec<masks::Carried>,
 }
 
 impl Preparation<'_> {
@@ -206,81 +237,116 @@ impl<'a> Carrier<'a> {
         hole::ground::beside(&self.grids, &cameras, &views.iter().map(mask).collect::<Vec<_>>())
     }
 
+    /// Lets the given masks vote.
+    fn vote(
+        splats: &mut Splats,
+        views: &Views,
+        given: &BTreeMap<String, Given>,
+        votes: &mut masks::Votes,
+    ) -> Result<(), Error> {
+        for view in &views.voters {
+            votes.add(splats, &view.camera, &masks::parts(&given[&view.name].mask, view.camera.size))?;
+        }
+        Ok(())
+    }
+
+    /// `[other view]` the object by these votes, without what is beside it.
+    fn carried(
+        &self,
+        splats: &mut Splats,
+        views: &Views,
+        votes: &masks::Votes,
+        beside: &[Vec<bool>],
+    ) -> Result<Vec<masks::Carried>, Error> {
+        let shares = votes.count(self.fit.positions(), &self.colors);
+        let carried = views.others.iter().map(|at| {
+            let mut carried = shares.carry(splats, &self.scene.train[*at].camera)?;
+            for (part, _) in carried.object.iter_mut().zip(&beside[*at]).filter(|(_, beside)| **beside) {
+                *part = 0.0;
+            }
+            Ok(carried)
+        });
+        carried.collect()
+    }
+
+    /// A view's mask by its photograph, and whether it was moved.
+    fn refine(&self, looks: Option<&Looks>, carried: &masks::Carried, at: usize) -> (GrayImage, bool) {
+        let (size, picture) = (self.scene.train[at].camera.size, &self.pictures[at]);
+        let rough = masks::threshold(&carried.object, size, size, masks::OBJECT);
+        let shift = looks.and_then(|looks| looks.shift(picture, &rough));
+        let moved = shift.map(|shift| misplaced::moved(&carried.object, size, shift));
+        (outline::of(picture, moved.as_ref().unwrap_or(&carried.object), size), moved.is_some())
+    }
+
+    /// The object as the given masks alone show it. They lose what is behind it.
+    fn first(
+        &self,
+        splats: &mut Splats,
+        views: &Views<'a>,
+        given: &mut BTreeMap<String, Given>,
+    ) -> Result<First<'a>, Error> {
+        let mut votes = masks::Votes::new(splats);
+        Self::vote(splats, views, given, &mut votes)?;
+        // Masks that were not cut are believed: they may be of things behind one another.
+        let all_cut = given.values().all(|given| given.cut);
+        let positions = self.fit.positions();
+        let behind = if all_cut { votes.behind(positions) } else { vec![false; positions.len()] };
+        let lost = Self::clear_behind(splats, given, &views.voters, &behind)?;
+        if !lost.is_empty() {
+            votes = masks::Votes::new(splats);
+            Self::vote(splats, views, given, &mut votes)?;
+        }
+        votes.deny(&behind);
+        let beside = if views.others.is_empty() { vec![] } else { self.beside(given) };
+        let at = |name: &String| self.scene.train.iter().position(|view| view.name == *name);
+        let looks = Looks::of(given.iter().filter_map(|(name, given)| Some((&self.pictures[at(name)?], &given.mask))));
+        let carried = self.carried(splats, views, &votes, &beside)?;
+        Ok(First { behind, lost, beside, looks, carried })
+    }
+
+    /// Votes of the outlines of two dozen other views: what the first ones miss of the object's other sides these have between them.
+    fn seen_by_others(
+        &self,
+        splats: &mut Splats,
+        views: &Views,
+        first: &First,
+        watch: &mut dyn Watch,
+    ) -> Result<masks::Votes, Error> {
+        let others = &views.others;
+        let some = (0..others.len()).into_par_iter().step_by(others.len().div_ceil(outline::VOTERS).max(1));
+        let outlines: Vec<(usize, (GrayImage, bool))> =
+            some.map(|i| (others[i], self.refine(first.looks.as_ref(), &first.carried[i], others[i]))).collect();
+        let mut votes = masks::Votes::new(splats);
+        for (at, (mask, _)) in outlines.iter().filter(|(at, (_, moved))| !moved && views.helps(self.scene, *at)) {
+            let camera = &self.scene.train[*at].camera;
+            votes.add(splats, camera, &masks::parts(mask, camera.size))?;
+            watch.go_on()?;
+        }
+        votes.deny(&first.behind);
+        Ok(votes)
+    }
+
     /// An object to all views, of which it is said how one more is masked by the name of the object, where there are several.
     fn carry(
         &mut self,
         splats: &mut Splats,
-        given: &BTreeMap<String, Given>,
+        drawn: &BTreeMap<String, Given>,
         object: Option<&str>,
         watch: &mut dyn Watch,
     ) -> Result<Carried, Error> {
         let scene = self.scene;
         let wrong = misplaced::wrong(scene, &self.grids);
-        let drawn = given;
-        let others: Vec<usize> =
-            (0..scene.train.len()).filter(|at| !drawn.contains_key(&scene.train[*at].name)).collect();
-        let carry = |shares: &masks::Shares, beside: &[Vec<bool>], splats: &mut Splats| {
-            let carried = others.iter().map(|at| {
-                let mut carried = shares.carry(splats, &scene.train[*at].camera)?;
-                for (part, _) in carried.object.iter_mut().zip(&beside[*at]).filter(|(_, beside)| **beside) {
-                    *part = 0.0;
-                }
-                Ok(carried)
-            });
-            carried.collect::<Result<Vec<masks::Carried>, Error>>()
-        };
-        // A view's mask, and whether it was moved.
-        let refine = |looks: &Option<Looks>, carried: &masks::Carried, at: usize| -> (GrayImage, bool) {
-            let (size, picture) = (scene.train[at].camera.size, &self.pictures[at]);
-            let rough = masks::threshold(&carried.object, size, size, masks::OBJECT);
-            let shift = looks.as_ref().and_then(|looks| looks.shift(picture, &rough));
-            let moved = shift.map(|shift| misplaced::moved(&carried.object, size, shift));
-            (outline::of(picture, moved.as_ref().unwrap_or(&carried.object), size), moved.is_some())
-        };
-        let positions = self.fit.positions();
         let mut given = self.placed(splats, drawn, None)?;
         let (voters, misplaced) = misplaced::voters(scene, &wrong, &given)?;
-        self.units += voters.len() as u64;
+        let others = (0..scene.train.len()).filter(|at| !drawn.contains_key(&scene.train[*at].name)).collect();
+        let views = Views { voters, others, wrong };
+        self.units += views.voters.len() as u64;
         watch.turn(self.units)?;
         let mut cuts = 1;
-        let (lost, thin, carried, looks) = loop {
-            let own = |splats: &mut Splats, given: &BTreeMap<String, Given>, votes: &mut masks::Votes| {
-                voters.iter().try_for_each(|view| {
-                    votes.add(splats, &view.camera, &masks::parts(&given[&view.name].mask, view.camera.size))
-                })
-            };
-            let mut votes = masks::Votes::new(splats);
-            own(splats, &given, &mut votes)?;
-            // Masks that were not cut are believed: they may be of things behind one another.
-            let all_cut = given.values().all(|given| given.cut);
-            let behind = if all_cut { votes.behind(positions) } else { vec![false; positions.len()] };
-            let lost = Self::clear_behind(splats, &mut given, &voters, &behind)?;
-            if !lost.is_empty() {
-                votes = masks::Votes::new(splats);
-                own(splats, &given, &mut votes)?;
-            }
-            votes.deny(&behind);
-            let beside = if others.is_empty() { vec![] } else { self.beside(&given) };
-            let at = |name: &String| scene.train.iter().position(|view| view.name == *name);
-            let learnt = given.iter().filter_map(|(name, given)| Some((&self.pictures[at(name)?], &given.mask)));
-            let looks = Looks::of(learnt);
-            let carried = carry(&votes.count(positions, &self.colors), &beside, splats)?;
-            // A mask in a view whose camera is wrong would help no other.
-            let helps = |at: &usize| !wrong.contains(scene.train[*at].name.as_str());
-            let thin = others.iter().zip(&carried).filter(|(at, _)| helps(at));
-            let thin: Vec<(f64, usize)> = thin.filter_map(|(at, carried)| Some((carried.thinness()?, *at))).collect();
-            // What the first views miss of the object's other sides the masks of more views have between them.
-            let some = (0..others.len()).into_par_iter().step_by(others.len().div_ceil(outline::VOTERS).max(1));
-            let outlines = some.map(|i| (&scene.train[others[i]], refine(&looks, &carried[i], others[i])));
-            let outlines: Vec<(&View, (GrayImage, bool))> = outlines.collect();
-            let found = outlines.iter().filter(|(view, (_, moved))| !moved && !wrong.contains(view.name.as_str()));
-            let mut votes = masks::Votes::new(splats);
-            for (view, (mask, _)) in found {
-                votes.add(splats, &view.camera, &masks::parts(mask, view.camera.size))?;
-                watch.go_on()?;
-            }
-            votes.deny(&behind);
-            if cuts < CUTS && !others.is_empty() {
+        let (first, mut votes) = loop {
+            let first = self.first(splats, &views, &mut given)?;
+            let votes = self.seen_by_others(splats, &views, &first, watch)?;
+            if cuts < CUTS && !views.others.is_empty() {
                 cuts += 1;
                 let again = self.placed(splats, drawn, Some(&votes))?;
                 if again.iter().any(|(name, again)| iou(&again.mask, &given[name].mask) < SAME) {
@@ -288,22 +354,30 @@ impl<'a> Carrier<'a> {
                     continue;
                 }
             }
-            own(splats, &given, &mut votes)?;
-            votes.deny(&behind);
-            break (lost, thin, carry(&votes.count(positions, &self.colors), &beside, splats)?, looks);
+            break (first, votes);
         };
-        let mut outlines: Vec<(GrayImage, bool)> =
-            others.par_iter().zip(&carried).map(|(at, carried)| refine(&looks, carried, *at)).collect();
-        self.clear(&given, &others, &mut outlines);
+        Self::vote(splats, &views, &given, &mut votes)?;
+        votes.deny(&first.behind);
+        let carried = self.carried(splats, &views, &votes, &first.beside)?;
+        let others = &views.others;
+        let mut outlines: Vec<(GrayImage, bool)> = others
+            .par_iter()
+            .zip(&carried)
+            .map(|(at, carried)| self.refine(first.looks.as_ref(), carried, *at))
+            .collect();
+        self.clear(&given, others, &mut outlines);
         let moved = others.iter().zip(&outlines).filter(|(_, (_, moved))| *moved).map(|(at, _)| *at);
         let moved: Vec<usize> = moved.collect();
-        let names: Vec<&str> = voters.iter().map(|view| view.name.as_str()).collect();
+        let names: Vec<&str> = views.voters.iter().map(|view| view.name.as_str()).collect();
         let masks = self.large(&given, &names, outlines, watch)?;
         let shown = masks.iter().filter(|(mask, _)| mask.as_raw().iter().any(|v| *v != 0)).count();
-        let lost = (!lost.is_empty()).then(|| {
-            let names = abridged(&lost);
+        let lost = (!first.lost.is_empty()).then(|| {
+            let names = abridged(&first.lost);
             format!("what stands behind the object and apart from it is none of it, and was taken out of its mask in {names}")
         });
+        // A mask in a view whose camera is wrong would help no other.
+        let thin = others.iter().zip(&first.carried).filter(|(at, _)| views.helps(scene, **at));
+        let thin: Vec<(f64, usize)> = thin.filter_map(|(at, carried)| Some((carried.thinness()?, *at))).collect();
         let notes = misplaced.into_iter().chain(lost).chain(self.notes(shown, thin, &moved, object)).collect();
         Ok(Carried { masks, shown, notes })
     }
