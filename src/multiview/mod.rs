@@ -103,7 +103,7 @@ struct Round {
 pub struct Stereo {
     /// Points that the photographs add to those of the sparse model; none where no view has neighbours.
     pub points: Vec<Point>,
-    /// Names of train and test views whose photographs agree with the others' next to nowhere: the sparse model has their
+    /// Names of train and test views whose photographs contradict most others, or agree with them next to nowhere: the model has their
     /// cameras in a wrong place. The points are not to be used then: other views were compared with these.
     pub wrong: Vec<String>,
     /// How many points there are, in a line.

@@ -125,6 +125,7 @@ impl Preparation<'_> {
         let files = scene::pictures(&self.folder.root().join(poses::IMAGES))?;
         let mut carrier = Carrier::new(scene, fit, splats, grids, files)?;
         let mut batch = Batch::default();
+        batch.notes.extend(misplaced::said(scene, &carrier.grids));
         let mut union: Vec<Option<(GrayImage, String)>> = vec![None; scene.train.len()];
         for (object, given) in objects {
             let name = several.then_some(object.as_str());

@@ -41,9 +41,23 @@ const BETTER: f32 = 1.5;
 /// The mean of the logarithms from which on a mask lies on the object, whatever is beside it: two thirds of a mask where colours are sure.
 const THERE: f32 = 1.0;
 
-/// Names of the train views that agree with the others next to nowhere.
+/// Names of the train views whose cameras are in a wrong place, by what the others show.
 pub fn wrong<'a>(scene: &'a Scene, grids: &[DepthGrid]) -> BTreeSet<&'a str> {
     scene.train.iter().zip(grids).filter(|(_, grid)| !grid.trusted).map(|(view, _)| view.name.as_str()).collect()
+}
+
+/// A line on the train views whose cameras are in a wrong place, if there are any.
+pub fn said(scene: &Scene, grids: &[DepthGrid]) -> Option<String> {
+    let wrong = wrong(scene, grids);
+    (!wrong.is_empty()).then(|| {
+        format!(
+            "the model has the cameras of {} of {} photographs in a wrong place, by what the others show; nothing is taken from these: {}. \
+             More photographs between them and the others, or all pairs matched (colmap exhaustive_matcher), may mend the model",
+            wrong.len(),
+            scene.train.len(),
+            Vec::from_iter(wrong).join(", ")
+        )
+    })
 }
 
 /// The views whose given masks are carried to the others, and a line on those whose masks are not, being wrong.
@@ -58,7 +72,7 @@ pub fn voters<'a>(
     let masked = scene.train.iter().filter(|view| given.contains_key(&view.name));
     let (lost, voters): (Vec<&View>, Vec<&View>) = masked.partition(|view| wrong.contains(view.name.as_str()));
     let names: Vec<&str> = lost.iter().map(|view| view.name.as_str()).collect();
-    let why = "the model has the camera in a wrong place, for what is seen from there agrees with the other photographs next to nowhere";
+    let why = "the model has the camera in a wrong place, for what is seen from there contradicts most other photographs, or agrees with them next to nowhere";
     match (lost.first(), voters.is_empty()) {
         (None, _) => Ok((voters, None)),
         (Some(_), false) => {

@@ -144,8 +144,8 @@ impl Loaded {
                 break;
             }
             eprintln!(
-                "scene: the photographs of {} of {views} views agree with the others' next to nowhere, so that the model has \
-                 their cameras in a wrong place, and they are left out (scene.leave_out): {}",
+                "scene: the photographs of {} of {views} views contradict most others, or agree with them next to nowhere, so that \
+                 the model has their cameras in a wrong place, and they are left out (scene.leave_out): {}",
                 found.wrong.len(),
                 found.wrong.join(", ")
             );
