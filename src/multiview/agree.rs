@@ -35,8 +35,8 @@ const COMPARED: usize = 300;
 /// Parts of views hang together where they agree at this part of the sites at which they agree or look past what the other has. One is in
 /// a wrong place where it does not hang together with the largest, and has so many of these sites for each of its views.
 ///
-/// Of bonsai-exhaustive three views stand apart, which agree at 0.44; all others agree at 0.98. Of another model of these photographs, which
-/// is torn, the parts of 54 and 30 views agree at 0.46, and at 0.87 to 0.99 within themselves, at any distance.
+/// Three views of bonsai-exhaustive stand apart, which agree at 0.44; all others agree at 0.98. Another model of these photographs is torn:
+/// its parts of 54 and 29 views agree at 0.46, and blocks of six views at 0.87 to 0.99 within each part, at any distance.
 const AGREE: f64 = 0.7;
 const TOLD_FOR_EACH: u64 = 30;
 
@@ -107,7 +107,7 @@ struct Parts {
 }
 
 impl Parts {
-    /// Of one view each.
+    /// Parts of one view each.
     fn new(compared: &[Vec<Compared>]) -> Self {
         let n = compared.len();
         let both = |one: usize, other: usize| {
@@ -118,8 +118,8 @@ impl Parts {
         Self { views: (0..n).map(|view| vec![view]).collect(), told: told.collect() }
     }
 
-    /// Of the parts that hang together those two that agree at most sites: a few that agree by chance come last, when what their parts have of
-    /// each other is known.
+    /// Two parts that hang together, those that agree at most sites: a few that agree by chance come last, when what their parts have of each
+    /// other is known.
     fn nearest(&self) -> Option<(usize, usize)> {
         let there = |part: &usize| !self.views[*part].is_empty();
         let pairs =

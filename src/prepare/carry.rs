@@ -55,11 +55,11 @@ struct Carried {
 
 /// The views of a scene by what they say of an object.
 struct Views<'a> {
-    /// Those whose given masks vote.
+    /// Views whose given masks vote.
     voters: Vec<&'a View>,
     /// Indices of those without a given mask.
     others: Vec<usize>,
-    /// Names of those whose cameras are wrong.
+    /// Names of the views whose cameras are wrong.
     wrong: BTreeSet<&'a str>,
 }
 

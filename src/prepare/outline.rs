@@ -14,7 +14,7 @@ use crate::scene::resample;
 /// Name of the way in which masks are carried: those that were carried in another way are carried anew.
 pub const METHOD: &str = "given masks, drawn ones cut by places in space and planes around a box as well, as far as other views confirm them, by the fit's where what was measured leaves a box half empty, and again by the votes of other views until they stay, without what stands behind in all, and those of other views vote on what shows \
      in them and hangs together, of what is beyond their borders little, of what rises from its plane without asking what lies on it, and of what is on its plane and below it nothing, however small a table is, without what the given masks rule out, moved to where its colours are, refined by the photographs, and \
-     without parts that others show beside it, views that stand apart from all others having no vote";
+     without parts that others show beside it, views that stand apart from all others, and the lesser part of a torn model, having no vote";
 /// Half the width of the band, as a part of the longer side of the object's box.
 const BAND: f64 = 0.10;
 /// How far beyond the cut the carried mask may reach, as a part of the same.

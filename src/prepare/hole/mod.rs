@@ -76,7 +76,7 @@ const FIRST: usize = 24;
 pub const METHOD: &str = "one surface with smooth ends, nothing where others look through it, no colour from a rim that looks like nothing near it, \
      lights joined, doubts left to training, nothing stands on what only crosses the floor, lines go on through holes and to walls behind, \
      what is nearly one plane is one, copies nearly keep their hue, ends are where the first view has them, \
-     nothing from views with the object elsewhere, masks of wrong cameras stay, nothing stands where the first view looks through, surfaces by what they are covered with, \
+     nothing from views with the object elsewhere, nor from the lesser part of a torn model, masks of wrong cameras stay, nothing stands where the first view looks through, surfaces by what they are covered with, \
      straight borders go on, those that end in a hole too, surfaces end at right angles, their fronts and the faces below \
      them go on up to there, grain is kept, floors end at their walls, planes have their materials, which have grain, what is bare of the object refutes nothing, the reference has no shadow, no \
      small piece hangs in a hole, what is guessed is noted, nothing shows through what the object stands on, what is doubtful \
